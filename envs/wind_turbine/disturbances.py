@@ -1,0 +1,204 @@
+"""The exogenous input of the wind turbine: hub-height wind, synthetic or recorded."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
+
+CUT_IN_SPEED = 3.0
+"""Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""
+
+
+class WindModel(Protocol):
+    """Anything that draws wind histories for the turbine."""
+
+    @property
+    def mean(self) -> float:
+        """Mean wind speed [m/s]."""
+        ...
+
+    def draw(
+        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
+    ) -> Float[Tensor, "{batch} {n_steps}"]:
+        """Longitudinal wind speed u [m/s] of ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class KaimalWind:
+    r"""Hub-height longitudinal wind with the IEC Kaimal spectrum, made as TurbSim makes it.
+
+    .. math::
+        u(t) = U + \sum_{k=1}^{\lfloor n/2 \rfloor} \sqrt{2 S(f_k)\,\Delta f}\,\cos(2\pi f_k t + \varphi_k),\quad
+        S(f) = \frac{4\sigma^2 L/U}{(1 + 6fL/U)^{5/3}},\quad f_k = k\,\Delta f,\; \Delta f = \frac1{n\,\Delta t}
+
+    with :math:`\sigma = I U` and phases uniform on [0, 2π). The frequencies are multiples of 1/T up to the Nyquist
+    frequency, so the record is periodic with its length T = n·dt, as TurbSim's is, and its mean is exactly U.
+
+    Args:
+        mean: mean speed U [m/s], positive.
+        intensity: turbulence intensity I = σ/U [-], not negative; 0.16 is the reference value of class A.
+        length_scale: integral scale L [m], positive; 340.2 m = 8.1·42 m, IEC 61400-1 for hubs above 60 m.
+        floor: the wind is cut off below this speed [m/s]; the turbine's cut-in, below which it does not run.
+            ``-math.inf`` switches it off. At 11 m/s and 16 % it lies 4.5 σ under the mean and is hardly ever reached.
+        scale_to_target: rescale every sample, before the floor, so that its own standard deviation (divisor n) is σ:
+            TurbSim's ``ScaleIEC``. Without it a sample holds only the variance inside its band, (0.935 σ)² for 600 s at
+            0.5 s; with it the spectrum lies above S by the reciprocal, 14 % there.
+
+    Raises:
+        ValueError: if an argument is out of its range.
+
+    Source: IEC 61400-1 annex B; Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198.
+    """
+
+    mean: float = 11.0
+    intensity: float = 0.16
+    length_scale: float = 340.2
+    floor: float = CUT_IN_SPEED
+    scale_to_target: bool = True
+
+    def __post_init__(self):
+        for argument, value, unit in (("mean", self.mean, "m/s"), ("length_scale", self.length_scale, "m")):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{argument}={value} {unit} of KaimalWind must be positive and finite.")
+        if not (math.isfinite(self.intensity) and self.intensity >= 0):
+            raise ValueError(
+                f"intensity={self.intensity} of KaimalWind must be a fraction such as 0.16, zero or above."
+            )
+        if not self.floor < self.mean:
+            raise ValueError(
+                f"floor={self.floor} m/s of KaimalWind must be below the mean wind {self.mean} m/s; "
+                "lower it, or pass -math.inf for none."
+            )
+
+    @property
+    def sigma(self) -> float:
+        """Target standard deviation σ = I·U [m/s]."""
+        return self.intensity * self.mean
+
+    def spectrum(self, f: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """One-sided spectral density S(f) [(m/s)²/Hz] at the frequencies f [Hz]; its integral over f > 0 is σ²."""
+        return self.sigma**2 * self._unit_spectrum(f)
+
+    def _unit_spectrum(self, f: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        transit = self.length_scale / self.mean
+        return 4.0 * transit / (1.0 + 6.0 * f * transit) ** (5.0 / 3.0)
+
+    def draw(
+        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
+    ) -> Float[Tensor, "{batch} {n_steps}"]:
+        """Longitudinal wind speed u [m/s] of ``batch`` independent episodes, in float64 on the generator's device.
+
+        Args:
+            batch: number of episodes.
+            n_steps: samples of each, at least 2: a single one has no frequency to draw.
+            dt: sampling interval [s].
+            generator: source of the phases.
+
+        Raises:
+            ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
+        """
+        _check_request(batch, n_steps, dt, least_steps=2)
+        # Drawn with unit variance, so that a wind without turbulence is not scaled by 0/0.
+        fluctuation = self._draw_unit_fluctuation(batch, n_steps, dt, generator)
+        if self.scale_to_target:
+            fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
+        return (self.mean + self.sigma * fluctuation).clamp_min(self.floor)
+
+    def _draw_unit_fluctuation(
+        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
+    ) -> Float[Tensor, "{batch} {n_steps}"]:
+        """The sum of cosines for σ = 1, by an inverse real FFT."""
+        like = {"dtype": torch.float64, "device": generator.device}
+        f = torch.arange(1, n_steps // 2 + 1, **like) / (n_steps * dt)
+        phase = 2.0 * math.pi * torch.rand(batch, len(f), generator=generator, **like)
+        amplitude = torch.sqrt(2.0 * self._unit_spectrum(f) / (n_steps * dt))
+        coefficients = torch.polar((0.5 * n_steps * amplitude).expand_as(phase), phase)
+        if n_steps % 2 == 0:
+            # irfft counts a pair ±f for every bin but the Nyquist bin, which stands alone and whose imaginary part it
+            # drops: there the samples of a·cos(πk + φ) = a·cos φ·(−1)^k need n·a·cos φ. Left as it is, the bin would
+            # carry a quarter of its power.
+            coefficients[:, -1] = 2.0 * coefficients[:, -1].real
+        return torch.fft.irfft(torch.nn.functional.pad(coefficients, (1, 0)), n=n_steps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedWind:
+    """Wind cut at random from records, such as TurbSim's files.
+
+    Every episode takes one record, all equally likely, and a start in it, uniform over those that leave enough wind;
+    the record is interpolated linearly to the times of the episode. That samples the wind at the start of each control
+    interval, over which it is then held; content above the new Nyquist frequency is folded, not filtered out.
+
+    Args:
+        records: at least one :class:`~rt_torchrl.envs.wind_turbine.turbsim.WindRecord`.
+        floor: the wind is cut off below this speed [m/s], the turbine's cut-in; ``-math.inf`` switches it off.
+
+    Raises:
+        ValueError: if there is no record, or ``floor`` is not a number or is infinitely high.
+    """
+
+    records: Sequence[WindRecord]
+    floor: float = CUT_IN_SPEED
+
+    def __post_init__(self):
+        if len(self.records) == 0:
+            raise ValueError("records of RecordedWind is empty; pass at least one, for example from read_wind(path).")
+        if not self.floor < math.inf:
+            raise ValueError(f"floor={self.floor} m/s of RecordedWind must be a speed, or -math.inf for none.")
+
+    @property
+    def mean(self) -> float:
+        """Mean wind speed of all records together [m/s]."""
+        return float(np.concatenate([record.speed for record in self.records]).mean())
+
+    def draw(
+        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
+    ) -> Float[Tensor, "{batch} {n_steps}"]:
+        """Longitudinal wind speed u [m/s] of ``batch`` episodes, in float64 on the generator's device.
+
+        Args:
+            batch: number of episodes.
+            n_steps: samples of each, at least 1.
+            dt: sampling interval [s].
+            generator: source of the choice of record and start.
+
+        Raises:
+            ValueError: if an argument is out of its range, or a record is shorter than (n_steps − 1)·dt.
+        """
+        _check_request(batch, n_steps, dt, least_steps=1)
+        needed = (n_steps - 1) * dt
+        for record in self.records:
+            # Rounding of k·dt must not reject a record of exactly the length needed.
+            if record.duration < needed * (1.0 - 1e-9):
+                raise ValueError(
+                    f"wind record {record.source} is {record.duration:g} s long, but n_steps={n_steps} of dt={dt} s "
+                    f"need {needed:g} s; record more, shorten the episode or leave this record out."
+                )
+        device = generator.device
+        choice = torch.randint(len(self.records), (batch,), generator=generator, device=device).tolist()
+        share = torch.rand(batch, generator=generator, device=device, dtype=torch.float64).tolist()
+        elapsed = dt * np.arange(n_steps)
+        wind = np.empty((batch, n_steps))
+        for row, index, part in zip(wind, choice, share, strict=True):
+            record = self.records[index]
+            start = part * max(0.0, record.duration - needed)
+            # The even grid, not the printed times, which a text file rounds to a millisecond.
+            row[:] = np.interp(start + elapsed, record.step * np.arange(len(record.speed)), record.speed)
+        return torch.from_numpy(wind).to(device).clamp_min(self.floor)
+
+
+def _check_request(batch: int, n_steps: int, dt: float, *, least_steps: int) -> None:
+    if batch < 1:
+        raise ValueError(f"batch={batch} must be at least 1.")
+    if n_steps < least_steps:
+        raise ValueError(f"n_steps={n_steps} must be at least {least_steps}; lengthen the episode or shorten dt.")
+    if not (math.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt={dt} s must be positive and finite.")

@@ -1,0 +1,81 @@
+r"""Closure of the turbine's twin: a law for the power coefficient."""
+
+import csv
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+DATA = Path(__file__).parent / "data"
+NAMES = ("c1", "c2", "c3", "c4", "c5", "c6", "c7", "c8", "c9", "c10", "x")
+
+
+class SaintDrenan(nn.Module):
+    r"""Power coefficient of Saint-Drenan et al. 2020, eq. (c_p_correlation) of the paper.
+
+    .. math::
+        C_p = c_1\Big(\frac{c_2}{\xi} - c_3\beta - c_4\xi\beta - c_5\beta^x - c_6\Big)e^{-c_7/\xi} + c_8\lambda, \qquad
+        \frac1\xi = \frac1{\lambda + c_9\beta} - \frac{c_{10}}{\beta^3 + 1}
+
+    with β in degrees. The trained weights are the coefficients divided by their typical sizes, which differ by 10⁴, and
+    log((x − 1)/0.5) for the exponent, which thereby stays above 1.
+
+    Note: the paper's last term is c8·ξ, its exponent c12 and it has a c11; here c8·λ and x, because with c8·ξ the
+    published sets peak at the wrong height, and no c11 appears in any source. Note: β^x is taken as
+    (β² + 0.01²)^{x/2}, because it has no slope at β = 0.
+
+    Args:
+        coefficients: c1 ... c10 and x, in the order of ``NAMES``.
+        free_c1: train c1 too; it only scales c2 ... c6.
+
+    Raises:
+        ValueError: if there are not eleven finite coefficients, or x is not above 1 (no slope at β = 0 otherwise).
+    """
+
+    # Typical size of c1 ... c10: about the step that changes C_p by some hundredths near the optimum.
+    scales = (0.1, 10.0, 0.1, 0.01, 0.01, 1.0, 2.0, 0.01, 0.05, 0.01)
+    smallest_pitch = 0.01  # ε [deg]
+
+    def __init__(self, coefficients: Float[Tensor, "11"], *, free_c1: bool = False):
+        super().__init__()
+        coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
+        if coefficients.shape != (11,) or not coefficients.isfinite().all():
+            raise ValueError(f"coefficients={coefficients.tolist()} must be 11 finite numbers: {', '.join(NAMES)}.")
+        if not coefficients[-1] > 1.0:
+            raise ValueError(f"x={coefficients[-1].item()} must be above 1; with less, C_p has no slope at β = 0.")
+        self.register_buffer("scale", torch.tensor(self.scales, dtype=torch.float64))
+        scaled = torch.cat([coefficients[:-1] / self.scale, torch.log((coefficients[-1:] - 1.0) / 0.5)])
+        self.register_buffer("fixed", scaled[:0] if free_c1 else scaled[:1].clone())
+        self.scaled = nn.Parameter(scaled.clone() if free_c1 else scaled[1:].clone())
+
+    @classmethod
+    def from_set(cls, name: str, *, free_c1: bool = False) -> "SaintDrenan":
+        """A published set of coefficients; those with c5 = 0 start at c5 = 1e-3 and x = 1.5, or neither could move.
+
+        Raises:
+            ValueError: if there is no set of that name.
+        """
+        with open(DATA / "saint_drenan_2020_cp_sets.csv", encoding="utf-8") as file:
+            rows = {row["set"]: row for row in csv.DictReader(line for line in file if not line.startswith("#"))}
+        if name not in rows:
+            raise ValueError(f"set {name!r} of coefficients does not exist; choose one of {', '.join(rows)}.")
+        coefficients = {key: float(rows[name][key]) for key in NAMES}
+        if coefficients["c5"] == 0.0:
+            coefficients |= {"c5": 1e-3, "x": 1.5}
+        return cls(torch.tensor(list(coefficients.values()), dtype=torch.float64), free_c1=free_c1)
+
+    @property
+    def coefficients(self) -> Float[Tensor, "11"]:
+        """c1 ... c10 and x in their own units."""
+        weights = torch.cat([self.fixed, self.scaled])
+        return torch.cat([weights[:-1] * self.scale, 1.0 + 0.5 * weights[-1:].exp()])
+
+    def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
+        """C_p [-] at tip-speed ratio λ [-] and pitch β [deg]."""
+        lam, beta = features[..., 0], features[..., 1]
+        c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, x = self.coefficients.unbind()
+        inverse_xi = 1.0 / (lam + c9 * beta) - c10 / (beta**3 + 1.0)
+        power = (beta**2 + self.smallest_pitch**2) ** (0.5 * x)
+        bracket = c2 * inverse_xi - c3 * beta - c4 * beta / inverse_xi - c5 * power - c6
+        return (c1 * bracket * torch.exp(-c7 * inverse_xi) + c8 * lam).unsqueeze(-1)

@@ -1,0 +1,297 @@
+r"""The NREL 5-MW rotor as a plant: one rotating mass, its speed filter and its actuators (paper, section 5.1)."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
+from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
+from rt_torchrl.plant import Plant, require_stable_step
+from rt_torchrl.policies import SaturatedAffine
+from rt_torchrl.signal import Signal
+
+DRIVETRAIN_INERTIA = 38_759_228.0 + 534.116 * 97.0**2
+"""Rotor and generator on the low-speed shaft, 43 784 725 kg m² (NREL/TP-500-38060)."""
+HUB_INERTIA = 115_926.0
+"""What the paper prints for J [kg m²]: the hub alone."""
+
+
+class WindTurbine(Plant):
+    r"""Variable-speed, variable-pitch turbine around rated wind speed.
+
+    .. math::
+        J\dot\omega_r = \tau_a - N_g\tau_g, \quad
+        \tau_a = \tfrac12\rho\pi R^3\,\frac{C_p(\lambda, \beta)}{\lambda}\,u^2, \quad \lambda = \omega_rR/u
+
+    ====  =========================  ==============================================  =======  ======================
+    kind  name                       symbol                                          unit     range
+    ====  =========================  ==============================================  =======  ======================
+    s     rotor_speed                :math:`\omega_r`                                rad/s    positive
+    s     filtered_generator_speed   :math:`\hat\omega_g`                            rad/s    positive
+    s     filtered_wind_speed        :math:`\hat u`                                  m/s      positive
+    s     speed_error_integral       :math:`e_2`                                     -        about [-1, 1]
+    s     generator_torque           :math:`\tau_g`, applied in the last interval    N m      0 ... 43 093.55
+    s     blade_pitch                :math:`\beta`, applied in the last interval     deg      0 ... 30
+    a     generator_torque           :math:`\tau_g`                                  N m      0 ... 43 093.55
+    a     blade_pitch                :math:`\beta`                                   deg      0 ... 30
+    z     wind_speed                 :math:`u`                                       m/s      at least 3
+    e     speed_error                :math:`e_1`                                     -        about [-1, 1]
+    e     speed_error_integral       :math:`e_2`                                     -        about [-1, 1]
+    ====  =========================  ==============================================  =======  ======================
+
+    Note: the paper prints J = 115 926 kg m²; here it is that of rotor and generator, because 115 926 is the hub alone,
+    with which the rotor would follow the wind within 44 ms. Pass ``inertia=HUB_INERTIA`` and a step below 0.12 s to see.
+    Note: the paper prints τ_a with C_p/ω_r; here with C_p/λ, the same where both exist, because a braked rotor reaches
+    λ = 0. Note: the paper lets the pitch reach 90 deg; here 30 deg, because the closure is valid up to there.
+
+    Args:
+        dt: control interval [s]; 0.5, or 0.25 (the paper prints both 0.5 s and 4 Hz).
+        horizon: length of an episode T_o [s].
+        closure: C_p(λ, β [deg]) of the real rotor; None for the table of the NREL 5-MW rotor.
+        wind: source of the wind speed.
+        inertia: J [kg m²] of the drivetrain on the low-speed shaft.
+        rate_limits: greatest |dτ_g/dt| [N m/s] and |dβ/dt| [deg/s] of the actuators; None for ideal ones.
+        cost_weights: α1 and α2 of J_a.
+
+    Raises:
+        ValueError: for a non-positive inertia or rate limit, a negative cost weight, or a step that is unstable.
+    """
+
+    name = "wind_turbine"
+
+    radius = 63.0  # R [m]
+    air_density = 1.225  # ρ [kg/m³]
+    gear_ratio = 97.0  # N_g [-]
+    rated_power = 5e6  # P_N [W]; τ_max·ω_rated = 5.297 MW is mechanical, 5 MW is the electrical target of the paper
+    rated_rotor_speed = 1.26711  # [rad/s]
+    rated_wind_speed = 11.4  # [m/s]
+    rated_generator_speed = 122.9096  # [rad/s]
+    minimum_generator_speed = 70.16  # [rad/s]
+    filter_frequency = 0.04  # f_c [Hz]
+    speed_error_scale = 20.0  # γ1 [rad/s]
+    cut_in_generator_speed = 20.0  # middle of the band in which the generator comes in [rad/s]
+    cut_in_band = 10.0  # half width of that band [rad/s]
+    standstill_tip_speed_ratio = 1.0  # λ below which the blades are taken out of the flow [-]
+
+    states = (
+        Signal(symbol=r"\omega_r", name="rotor_speed", unit="rad/s", low=0.0),
+        Signal(symbol=r"\hat\omega_g", name="filtered_generator_speed", unit="rad/s"),
+        Signal(symbol=r"\hat u", name="filtered_wind_speed", unit="m/s"),
+        Signal(symbol="e_2", name="speed_error_integral", unit="-"),
+        Signal(symbol=r"\tau_g", name="generator_torque", unit="N m", low=0.0, high=43_093.55),
+        Signal(symbol=r"\beta", name="blade_pitch", unit="deg", low=0.0, high=30.0),
+    )
+    actions = states[4:]
+    inputs = (Signal(symbol="u", name="wind_speed", unit="m/s", low=3.0),)
+    observations = (
+        Signal(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0),
+        Signal(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0),
+    )
+
+    def __init__(
+        self,
+        *,
+        dt: float = 0.5,
+        horizon: float = 600.0,
+        closure: nn.Module | None = None,
+        wind: WindModel | None = None,
+        inertia: float = DRIVETRAIN_INERTIA,
+        rate_limits: tuple[float, float] | None = (15e3, 8.0),
+        cost_weights: tuple[float, float] = (1.0, 1.0),
+    ):
+        table = PowerCoefficientTable.nrel5mw()
+        super().__init__(dt=dt, horizon=horizon, closure=table if closure is None else closure)
+        if not inertia > 0:
+            raise ValueError(f"inertia={inertia} kg m² must be positive.")
+        if rate_limits is not None and not min(rate_limits) > 0:
+            raise ValueError(f"rate_limits={rate_limits} (N m/s, deg/s) must be positive; None means ideal actuators.")
+        if min(cost_weights) < 0:
+            raise ValueError(f"cost_weights={cost_weights} must not be negative.")
+        self.wind = KaimalWind() if wind is None else wind
+        self.inertia = inertia
+        self.cost_weights = cost_weights
+        self.best_power_coefficient, self.best_tip_speed_ratio, _ = table.maximum()
+        self.optimal_gain = self._optimal_gain()
+        limits = (math.inf, math.inf) if rate_limits is None else rate_limits
+        self.register_buffer("greatest_increment", torch.tensor(limits, dtype=torch.float64) * dt)
+        require_stable_step(
+            self.name,
+            dt,
+            1.0 / self.time_constant(self.rated_wind_speed),
+            mode=f"the rotor of inertia {inertia:.6g} kg m²",
+            remedy=f"the inertia of the whole drivetrain, {DRIVETRAIN_INERTIA:.6g} kg m²",
+        )
+
+    def _optimal_gain(self) -> float:
+        r"""K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared)."""
+        area = math.pi * self.radius**2
+        return (
+            0.5
+            * self.air_density
+            * area
+            * self.radius**3
+            * self.best_power_coefficient
+            / (self.best_tip_speed_ratio * self.gear_ratio) ** 3
+        )
+
+    def time_constant(self, wind_speed: float, pitch: float = 0.0) -> float:
+        r"""−1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and a pitch [deg]."""
+        omega_r = torch.tensor(self.rated_rotor_speed, dtype=torch.float64, requires_grad=True)
+        u, beta = torch.tensor(wind_speed, dtype=torch.float64), torch.tensor(pitch, dtype=torch.float64)
+        torque = self.aerodynamic_torque(omega_r, beta, u, self.closure)
+        (slope,) = torch.autograd.grad(torque, omega_r)
+        return -self.inertia / slope.item()
+
+    # The system
+
+    def vector_field(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch 6"],
+        action: Float[Tensor, "*batch 2"],
+        exogenous: Float[Tensor, "*#batch 1"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch 6"]:
+        r"""Rotor acceleration, paper eqs. (first_order_wt) and (tau_a), with the filters of eq. (etilde) as states.
+
+        .. math::
+            J\dot\omega_r = \tau_a - N_g\,\tau_g\,\sigma(\omega_g), \quad
+            \dot{\hat\omega}_g = 2\pi f_c(N_g\omega_r - \hat\omega_g), \quad
+            \dot{\hat u} = 2\pi f_c(u - \hat u), \quad \dot e_2 = (e_1 - e_2)/T_r
+
+        Note: the paper's recursion uses the unfiltered y(t_{k−1}) and α̂ = 0.98; here ŷ(t_{k−1}), whose continuous form
+        this is, and α̂ = exp(−2π f_c dt), because the printed one is no low-pass and 0.98 fits no dt of the paper.
+        Note: the paper integrates e_1 over exactly one revolution; here over an exponential window of one revolution
+        T_r, because a state of finite memory is what an adjoint can see.
+
+        Args:
+            t: time [s]; unused, the wind enters through ``exogenous``.
+            state: see the class.
+            action: applied generator torque τ_g [N m] and pitch β [deg].
+            exogenous: wind speed u [m/s].
+            closure: C_p(λ, β) [-]; the table in the real plant, the learned law in the twin.
+        """
+        omega_r, omega_hat, u_hat, e2 = state[..., :4].unbind(-1)
+        (tau_g, beta), u = action.unbind(-1), exogenous[..., 0]
+        omega_g = self.gear_ratio * omega_r
+        tau_a = self.aerodynamic_torque(omega_r, beta, u, closure)
+        acceleration = (tau_a - self.gear_ratio * tau_g * self.cut_in(omega_g)) / self.inertia
+        cutoff = 2.0 * math.pi * self.filter_frequency
+        window = 2.0 * math.pi / self.rated_rotor_speed
+        held = torch.zeros_like(acceleration)
+        return torch.stack(
+            [
+                acceleration,
+                cutoff * (omega_g - omega_hat),
+                cutoff * (u - u_hat),
+                (self.speed_error(omega_hat, u_hat) - e2) / window,
+                held,
+                held,
+            ],
+            -1,
+        )
+
+    def aerodynamic_torque(self, omega_r: Tensor, beta: Tensor, u: Tensor, closure: nn.Module) -> Tensor:
+        r"""τ_a = ½ρπR³(C_p/λ)u² [N m], fading to zero over λ < 1 (standstill), where no closure is defined.
+
+        The fade is the plant's, not the closure's: a rotor that hardly turns is in deep stall, in the twin as in fact.
+        """
+        lam = omega_r * self.radius / u
+        fade = smoothstep(lam / self.standstill_tip_speed_ratio)
+        lam = torch.where(lam > 0.5 * self.standstill_tip_speed_ratio, lam, 0.5 * self.standstill_tip_speed_ratio)
+        C_p = closure(torch.stack(torch.broadcast_tensors(lam, beta), -1)).squeeze(-1)
+        return 0.5 * self.air_density * math.pi * self.radius**3 * fade * C_p / lam * u**2
+
+    def cut_in(self, omega_g: Tensor) -> Tensor:
+        """Share of the torque that the generator delivers: it comes in over 10 ... 30 rad/s, since it only brakes."""
+        start = self.cut_in_generator_speed - self.cut_in_band
+        return smoothstep((omega_g - start) / (2.0 * self.cut_in_band))
+
+    def actuate(
+        self, state: Float[Tensor, "*batch 6"], command: Float[Tensor, "*batch 2"]
+    ) -> Float[Tensor, "*batch 2"]:
+        """Rate limits: torque and pitch move by at most their limit times dt from what was applied before."""
+        last = state[..., 4:]
+        change = torch.maximum(torch.minimum(command - last, self.greatest_increment), -self.greatest_increment)
+        return last + change
+
+    def latch(self, state: Float[Tensor, "*batch 6"], applied: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 6"]:
+        """Remember the applied action for the rate limits of the next interval."""
+        return torch.cat([state[..., :4], applied], -1)
+
+    # The control problem
+
+    def speed_error(self, omega_hat: Tensor, u_hat: Tensor) -> Tensor:
+        r"""e_1 = (ω̂_g − ω̃_g)/γ_1 with ω̃_g = N_g λ* û/R between its limits (paper, eq. omega_ref)."""
+        return (omega_hat - self.reference_speed(u_hat)) / self.speed_error_scale
+
+    def reference_speed(self, u_hat: Tensor) -> Tensor:
+        """Generator speed ω̃_g [rad/s] wanted at a filtered wind speed û [m/s]."""
+        best = self.gear_ratio * self.best_tip_speed_ratio * u_hat / self.radius
+        return best.clamp(self.minimum_generator_speed, self.rated_generator_speed)
+
+    def reference_power(self, omega_g: Tensor) -> Tensor:
+        """P̃ = min(P_N, K ω_g³) [W] (paper, eq. P_ref)."""
+        return (self.optimal_gain * omega_g**3).clamp(max=self.rated_power)
+
+    def generator_power(self, state: Float[Tensor, "*batch 6"], applied: Float[Tensor, "*batch 2"]) -> Tensor:
+        """Power at the generator shaft, τ_g ω_g [W]."""
+        omega_g = self.gear_ratio * state[..., 0]
+        return applied[..., 0] * self.cut_in(omega_g) * omega_g
+
+    def observe(
+        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 6"], exogenous: Float[Tensor, "*#batch 1"]
+    ) -> Float[Tensor, "*batch 2"]:
+        return torch.stack([self.speed_error(state[..., 1], state[..., 2]), state[..., 3]], -1)
+
+    def running_cost(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch 6"],
+        applied: Float[Tensor, "*batch 2"],
+        exogenous: Float[Tensor, "*#batch 1"],
+    ) -> Float[Tensor, "*batch"]:
+        r"""½(α_1 e_1² + α_2 e_P²), e_P = (τ_g ω_g − P̃)/P_N (paper, eq. control_functional_mb)."""
+        e1 = self.speed_error(state[..., 1], state[..., 2])
+        reference = self.reference_power(self.gear_ratio * state[..., 0])
+        e_P = (self.generator_power(state, applied) - reference) / self.rated_power
+        return 0.5 * (self.cost_weights[0] * e1**2 + self.cost_weights[1] * e_P**2)
+
+    def discrepancy(
+        self, state: Float[Tensor, "*#batch 6"], measured: Float[Tensor, "*#batch 6"]
+    ) -> Float[Tensor, "*batch"]:
+        """½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
+        return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
+
+    # Randomness
+
+    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 6"]:
+        """Rotor between 70 % and 100 % of rated speed on the torque law K ω_g², blades at 0 deg, filters settled."""
+        share = 0.7 + 0.3 * torch.rand(batch, generator=generator, dtype=torch.float64, device=generator.device)
+        omega_r = share * self.rated_rotor_speed
+        omega_g = self.gear_ratio * omega_r
+        wind = torch.full_like(omega_r, self.wind.mean)
+        zero = torch.zeros_like(omega_r)
+        torque = (self.optimal_gain * omega_g**2).clamp(max=self.actions[0].high)
+        return torch.stack([omega_r, omega_g, wind, zero, torque, zero], -1)
+
+    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 1"]:
+        """Hub-height wind speed u [m/s]."""
+        return self.wind.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1)
+
+    def make_closure(self, generator: torch.Generator) -> nn.Module:
+        """Saint-Drenan's C_p with the coefficients of Dai 2016; draws nothing."""
+        return SaintDrenan.from_set("Dai2016")
+
+    def make_policy(self, generator: torch.Generator) -> nn.Module:
+        """The paper's policy: one bias-free affine law per action through the smooth clip."""
+        return SaturatedAffine(2, self.actions, bias=False, weight_scale=0.5, generator=generator)
+
+
+def smoothstep(x: Tensor) -> Tensor:
+    """0 for x ≤ 0, 1 for x ≥ 1, with continuous slope between: x²(3 − 2x)."""
+    x = x.clamp(0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)

@@ -1,0 +1,238 @@
+r"""Power coefficient C_p(λ, β) of a rotor, from a table: the closure of the real wind turbine."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from torch import Tensor, nn
+
+DATA = Path(__file__).parent / "data"
+STALL_KNOT = 0.5
+"""Where the two pieces of the stall element meet, as a fraction of the table's least λ."""
+STALL_SHARE = 0.2
+"""C_p there, as a fraction of C_p at the table's least λ; it keeps C_p positive on the rotors of this folder."""
+
+
+class PowerCoefficientTable(nn.Module):
+    r"""C_p(λ, β) as one piecewise bicubic polynomial, defined for every λ and β.
+
+    .. math:: C_p(\lambda, \beta) = \sum_{m,n=0}^{3} c_{ij,mn} (\lambda-\lambda_i)^m (\beta-\beta_j)^n
+
+    - *Table*: the not-a-knot tensor-product cubic spline through the values, twice continuously differentiable.
+    - *Stall*, λ below the first row λ_1: C_p goes to zero like λ², so that the torque ½ρπR³(C_p/λ)u² vanishes at
+      standstill. With :math:`\lambda_0 = \lambda_1/2`, it is :math:`C_p = 0.2\,C_p(\lambda_1,\beta)(\lambda/\lambda_0)^2`
+      up to λ_0, then the cubic that meets value and slope at both ends. One cubic :math:`\lambda^2(a + b\lambda)`
+      would do with fewer pieces, but on a steep table (slope above three times C_p/λ_1) it has a < 0: the wind would
+      brake a slow rotor and hold it at standstill for good. Below λ = 0, C_p = 0.
+    - *Extrapolation*, λ above the last row and β on either side: linear, with value and slope of the table's edge. An
+      overspeeding rotor is braked (C_p falls below zero); no value is clipped.
+
+    C_p is continuously differentiable everywhere. The extensions are cells of the same polynomial, so that an
+    evaluation is a search, a gather and Horner's rule, with no case distinction.
+
+    Args:
+        tip_speed_ratio: rows λ = ω_r R/u [-], positive and increasing, at least four.
+        pitch: columns β [deg], increasing, at least four.
+        values: C_p [-], one row per tip-speed ratio, one column per pitch.
+
+    Raises:
+        ValueError: if an axis is too short, not finite, not increasing or (λ) not positive, or if the values do not
+            match the axes or are not finite.
+
+    Source: C. de Boor, *A Practical Guide to Splines*, chapters IV and XVII.
+    """
+
+    def __init__(self, tip_speed_ratio: Sequence[float], pitch: Sequence[float], values: Sequence[Sequence[float]]):
+        super().__init__()
+        lam = _checked_axis("tip_speed_ratio", "-", tip_speed_ratio)
+        beta = _checked_axis("pitch", "deg", pitch)
+        if lam[0] <= 0:
+            raise ValueError(
+                f"tip_speed_ratio starts at {lam[0]}; it must be positive, because the stall element covers λ from 0 "
+                "to the first row. Drop the rows with λ <= 0."
+            )
+        cp = _checked_values(values, len(lam), len(beta))
+        rows, lam_knots = _add_stall(_spline_cells(lam, cp), lam)
+        cells = _spline_cells(beta, np.moveaxis(rows, -1, 0))  # [cell of β, power of β, cell of λ, power of λ]
+        for name, array in (
+            ("tip_speed_ratio", lam),
+            ("pitch", beta),
+            ("values", cp),
+            ("_lam_knots", lam_knots),
+            ("_lam_origins", _origins(lam_knots)),
+            ("_beta_origins", _origins(beta)),
+            ("_coefficients", cells.transpose(2, 0, 3, 1)),
+        ):
+            self.register_buffer(name, torch.tensor(array, dtype=torch.float64))
+
+    @classmethod
+    def from_csv(cls, path: str | Path) -> "PowerCoefficientTable":
+        """Read a table: a header with the pitch angles [deg] after one label, then rows of λ and C_p; ``#`` comments.
+
+        Raises:
+            ValueError: if an entry is no number or the rows differ in length, with the path.
+        """
+        header, *rows = csv_rows(path)
+        try:
+            pitch = [float(entry) for entry in header[1:]]
+            body = [[float(entry) for entry in row] for row in rows]
+        except ValueError as error:
+            raise ValueError(f"path={str(path)!r}: {error}; after its header every row must hold numbers.") from error
+        lengths = {len(row) for row in body}
+        if lengths != {len(header)}:
+            raise ValueError(
+                f"path={str(path)!r} has rows of {sorted(lengths)} entries under a header of {len(header)}; every row "
+                "must hold λ and one C_p per pitch angle. Complete or remove the others."
+            )
+        return cls([row[0] for row in body], pitch, [row[1:] for row in body])
+
+    @classmethod
+    def nrel5mw(cls) -> "PowerCoefficientTable":
+        """The NREL 5-MW rotor, λ 2…14.5 and β -5…30 deg, by blade-element momentum; source in ``data/NOTICE.md``."""
+        return cls.from_csv(DATA / "nrel5mw_Cp_table_rosco.csv")
+
+    def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
+        """C_p [-] at tip-speed ratio λ [-] and pitch β [deg], the two features, of the module's dtype (float64)."""
+        lam, beta = features[..., 0].contiguous(), features[..., 1].contiguous()
+        i = torch.bucketize(lam, self._lam_knots, right=True)
+        j = torch.bucketize(beta, self.pitch, right=True)
+        c = self._coefficients[i, j]
+        x = (lam - self._lam_origins[i]).unsqueeze(-1)
+        y = (beta - self._beta_origins[j]).unsqueeze(-1)
+        in_lam = ((c[..., 3] * y + c[..., 2]) * y + c[..., 1]) * y + c[..., 0]
+        c0, c1, c2, c3 = in_lam.split(1, dim=-1)
+        return ((c3 * x + c2) * x + c1) * x + c0
+
+    @torch.no_grad()
+    def maximum(self, pitch: float | None = 0.0) -> tuple[float, float, float]:
+        """Highest C_p of the table's range and where it is.
+
+        Args:
+            pitch: search along this pitch angle [deg], fine pitch unless told; None searches all pitch angles.
+
+        Returns:
+            C_p,max [-], λ* [-], β* [deg]; λ* and β* to about 1e-7, the square root of the rounding error.
+
+        Raises:
+            ValueError: if ``pitch`` lies outside the table.
+        """
+        beta_range = (self.pitch[0].item(), self.pitch[-1].item())
+        if pitch is not None and not beta_range[0] <= pitch <= beta_range[1]:
+            raise ValueError(
+                f"pitch={pitch} deg lies outside the table; choose {beta_range[0]}…{beta_range[1]} deg, or None."
+            )
+        lam, beta = self.tip_speed_ratio, self.pitch if pitch is None else self.pitch.new_tensor([pitch])
+        lam_axis, beta_axis = _subdivided(lam, 8), _subdivided(beta, 8)
+        for _ in range(9):  # each pass narrows the box to a tenth: to 1e-8 of a table cell
+            grid = torch.cartesian_prod(lam_axis, beta_axis).reshape(-1, 2)
+            values = self(grid).squeeze(-1)
+            best = values.argmax()
+            lam_axis, beta_axis = (
+                _subdivided(_neighbours(axis, at), 10)
+                for axis, at in ((lam_axis, grid[best, 0]), (beta_axis, grid[best, 1]))
+            )
+        return values[best].item(), grid[best, 0].item(), grid[best, 1].item()
+
+    def extra_repr(self) -> str:
+        lam, beta = self.tip_speed_ratio, self.pitch
+        return f"λ={lam[0]:g}…{lam[-1]:g} ({len(lam)} rows), β={beta[0]:g}…{beta[-1]:g} deg ({len(beta)} columns)"
+
+
+def csv_rows(path: str | Path) -> list[list[str]]:
+    """Rows of a comma-separated file, header first, without blank lines and ``#`` comments.
+
+    Raises:
+        ValueError: if there is no row below the header.
+    """
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.reader(line for line in file if line.strip() and not line.startswith("#"))]
+    if len(rows) < 2:
+        raise ValueError(
+            f"path={str(path)!r} holds {len(rows)} rows; it needs a header and at least one row of numbers."
+        )
+    return rows
+
+
+def _spline_cells(
+    knots: Float[np.ndarray, " n"], values: Float[np.ndarray, "n *rest"]
+) -> Float[np.ndarray, "cells 4 *rest"]:
+    """Coefficients, lowest power first, of the n − 1 cells of a not-a-knot spline and of a linear cell on either side.
+
+    Each cell's origin is its left knot; the cell to the left of all knots takes the first knot.
+    """
+    spline = CubicSpline(knots, values, axis=0, bc_type="not-a-knot")
+    inner = np.moveaxis(spline.c[::-1], 0, 1)
+    ends = [np.stack([spline(k), spline(k, 1), 0 * spline(k), 0 * spline(k)]) for k in (knots[0], knots[-1])]
+    return np.concatenate([ends[:1], inner, ends[1:]])
+
+
+def _add_stall(
+    rows: Float[np.ndarray, "cells 4 n_beta"], lam: Float[np.ndarray, " n_lam"]
+) -> tuple[Float[np.ndarray, "more 4 n_beta"], Float[np.ndarray, " knots"]]:
+    """Replace the linear cell below the first row by zero (λ < 0), a parabola and a cubic; return cells and knots."""
+    value, slope, zero = rows[0, 0], rows[0, 1], 0 * rows[0, 0]
+    lam_0 = STALL_KNOT * lam[0]
+    curvature = STALL_SHARE * value / lam_0**2
+    low, low_slope, h = STALL_SHARE * value, 2 * curvature * lam_0, lam[0] - lam_0
+    secant = (value - low) / h
+    quadratic = (3 * secant - 2 * low_slope - slope) / h
+    cubic = (low_slope + slope - 2 * secant) / h**2
+    stall = [[zero] * 4, [zero, zero, curvature, zero], [low, low_slope, quadratic, cubic]]
+    return np.concatenate([np.array(stall), rows[1:]]), np.concatenate([[0.0, lam_0], lam])
+
+
+def _origins(knots: Float[np.ndarray, " n"]) -> Float[np.ndarray, " cells"]:
+    """Origin of the local coordinate in each cell, outer ones included."""
+    return np.concatenate([knots[:1], knots])
+
+
+def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
+    """The axis with each interval cut into equal parts."""
+    steps = torch.arange(parts, dtype=axis.dtype) / parts
+    return torch.cat([(axis[:-1, None] + steps * axis.diff()[:, None]).flatten(), axis[-1:]])
+
+
+def _neighbours(axis: Float[Tensor, " n"], at: Float[Tensor, ""]) -> Float[Tensor, " m"]:
+    """The points of an axis around one of them; three on either side, since a slanting ridge moves the best point."""
+    index = int(torch.searchsorted(axis, at))
+    return axis[max(index - 3, 0) : index + 4]
+
+
+def _checked_axis(name: str, unit: str, axis: Sequence[float]) -> Float[np.ndarray, " n"]:
+    array = np.asarray(axis, dtype=np.float64)
+    if array.ndim != 1 or len(array) < 4:
+        raise ValueError(
+            f"{name} has shape {array.shape}; a cubic spline needs one dimension with at least 4 entries. Add points."
+        )
+    if not np.isfinite(array).all():
+        at = int(np.argmin(np.isfinite(array)))
+        raise ValueError(f"{name}[{at}]={array[at]} {unit} must be finite; correct or remove the entry.")
+    if (np.diff(array) <= 0).any():
+        at = int(np.argmax(np.diff(array) <= 0))
+        raise ValueError(
+            f"{name} goes from {array[at]} to {array[at + 1]} {unit} at entry {at + 1}; it must increase strictly. "
+            "Sort it together with the values and drop duplicates."
+        )
+    return array
+
+
+def _checked_values(values: Sequence[Sequence[float]], n_lam: int, n_beta: int) -> Float[np.ndarray, "n_lam n_beta"]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (n_lam, n_beta):
+        hint = "; transpose it" if array.shape == (n_beta, n_lam) else ""
+        raise ValueError(
+            f"values has shape {array.shape}, the axes ask for ({n_lam}, {n_beta}): a row per tip-speed ratio, a "
+            f"column per pitch angle{hint}."
+        )
+    if not np.isfinite(array).all():
+        i, j = (int(k) for k in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"values[{i}, {j}]={array[i, j]} must be finite; replace it or drop its row.")
+    if array.max() > 16 / 27:
+        raise ValueError(
+            f"values reaches {array.max()}, but C_p cannot exceed Betz's 16/27; if it is in per cent, divide it by 100."
+        )
+    return array

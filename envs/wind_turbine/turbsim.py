@@ -1,0 +1,279 @@
+"""Readers of TurbSim's wind files: hub-height text (``.hh``) and binary full field (``.bts``)."""
+
+import math
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+PRINTED_TIME_RESOLUTION = 1e-3
+"""Resolution of the times in a ``.hh`` file [s]; TurbSim prints them as F8.3."""
+
+
+@dataclass(frozen=True, eq=False)
+class WindRecord:
+    """Longitudinal wind at the hub at evenly spaced times; the arrays are copied and made read-only.
+
+    Args:
+        time: sample times [s], a vector of n, increasing by equal steps to within the 1 ms that TurbSim prints.
+        speed: longitudinal wind speed u [m/s], a vector of n, not negative.
+        source: where the record comes from, such as the path of the file; named in every error.
+
+    Raises:
+        ValueError: if there are fewer than two samples, the lengths differ, a value is NaN or infinite, a time does not
+            increase, samples are missing, steps are unequal, or a speed is negative.
+    """
+
+    time: np.ndarray
+    speed: np.ndarray
+    source: str
+
+    def __post_init__(self):
+        for field in ("time", "speed"):
+            array = np.array(getattr(self, field), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
+        self._check_shapes()
+        self._check_speed()
+        self._check_time()
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def step(self) -> float:
+        """Sampling interval [s], the mean one: it averages out the rounding of printed times."""
+        return self.duration / (len(self.time) - 1)
+
+    def _check_shapes(self) -> None:
+        if self.time.ndim != 1 or self.time.shape != self.speed.shape:
+            raise ValueError(
+                f"{self.source}: time has shape {self.time.shape} and speed {self.speed.shape}; "
+                "pass two vectors of equal length."
+            )
+        if len(self.time) < 2:
+            raise ValueError(
+                f"{self.source}: holds {len(self.time)} wind samples, at least 2 are needed; "
+                "check that the file was written to its end."
+            )
+
+    def _check_speed(self) -> None:
+        if (bad := np.flatnonzero(~np.isfinite(self.time))).size:
+            raise ValueError(
+                f"{self.source}: time of sample {bad[0]} is {self.time[bad[0]]}; all must be finite. "
+                "Write the file again."
+            )
+        if (bad := np.flatnonzero(~np.isfinite(self.speed))).size:
+            raise ValueError(
+                f"{self.source}: wind speed at t = {self.time[bad[0]]:g} s is {self.speed[bad[0]]} "
+                f"({bad.size} such samples); all must be finite. Fill the gap by interpolation or cut the record there."
+            )
+        if (bad := np.flatnonzero(self.speed < 0)).size:
+            raise ValueError(
+                f"{self.source}: wind speed at t = {self.time[bad[0]]:g} s is {self.speed[bad[0]]:g} m/s; it must "
+                "not be negative. Check its sign and the wind direction, which is 0 deg along the rotor axis."
+            )
+
+    def _check_time(self) -> None:
+        steps = np.diff(self.time)
+        if (bad := np.flatnonzero(steps <= 0)).size:
+            raise ValueError(
+                f"{self.source}: time goes from {self.time[bad[0]]:g} s to {self.time[bad[0] + 1]:g} s; it must "
+                "increase. Sort the samples and drop repeated ones."
+            )
+        step = float(np.median(steps))
+        # Two times rounded to 1 ms give a step off by up to 1 ms; below 2 ms that would hide a missing sample.
+        tolerance = min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
+        if not (bad := np.flatnonzero(np.abs(steps - step) > tolerance)).size:
+            return
+        where, found = self.time[bad[0]], steps[bad[0]]
+        if found > 1.5 * step:
+            raise ValueError(
+                f"{self.source}: gap after t = {where:g} s, where {round(found / step) - 1} samples are missing (step "
+                f"{found:g} s instead of {step:g} s). Fill it by interpolation or cut the record there."
+            )
+        raise ValueError(
+            f"{self.source}: unequal time step after t = {where:g} s, {found:g} s instead of {step:g} s. "
+            "Resample the record to equal steps."
+        )
+
+
+def read_wind(path: str | os.PathLike) -> WindRecord:
+    """Wind at the hub from a TurbSim file of either kind, told apart by the suffix.
+
+    Args:
+        path: a ``.hh`` file, see :func:`read_hh`, or a ``.bts`` file, see :func:`read_bts`.
+
+    Raises:
+        ValueError: if the suffix is another, or the file is malformed.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".hh":
+        return read_hh(path)
+    if suffix == ".bts":
+        return read_bts(path)
+    raise ValueError(
+        f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' (WrADHH) "
+        "or binary full field '.bts' (WrADFF). A file in the .hh format under another name can go to read_hh."
+    )
+
+
+def read_hh(path: str | os.PathLike) -> WindRecord:
+    r"""Longitudinal wind at the hub from hub-height text, TurbSim's ``.hh`` (``WrADHH``).
+
+    Comment lines hold ``!``, ``#`` or ``%``; every other line holds Time [s], HorSpd [m/s], WndDir [deg], VerSpd
+    [m/s], HorShr [-], VerShr [-], LnVShr [-], GstSpd [m/s] and, in later versions of the format, Upflow [deg]. At the
+    hub the shears vanish, and the component along the rotor axis is
+
+    .. math:: u = (V_{hor} + V_{gust}) \cos\delta
+
+    The horizontal speed alone contains the lateral turbulence and is larger than u by 1 % at 16 % turbulence; with the
+    direction, u is the one of the ``.bts`` file of the same run.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: with the line, if one has too few columns or a value that is no finite number; otherwise as
+            :class:`WindRecord`.
+
+    Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198; OpenFAST InflowWind, uniform wind.
+    """
+    rows = []
+    with open(path, encoding="utf-8", errors="replace") as lines:
+        for number, line in enumerate(lines, start=1):
+            if line.strip() and not any(mark in line for mark in "!#%"):
+                rows.append(_parse_hh_line(line, f"{path}, line {number}"))
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    speed = (columns[:, 1] + columns[:, 7]) * np.cos(np.deg2rad(columns[:, 2]))
+    return WindRecord(columns[:, 0], speed, str(path))
+
+
+def _parse_hh_line(line: str, where: str) -> list[float]:
+    # Fortran's list-directed input separates by blanks or commas.
+    fields = line.replace(",", " ").split()
+    if len(fields) < 8:
+        raise ValueError(
+            f"{where}: {len(fields)} columns, but 8 are needed: Time HorSpd WndDir VerSpd HorShr VerShr LnVShr GstSpd. "
+            "Complete the line, or begin it with '!' if it is a comment."
+        )
+    try:
+        values = [float(field) for field in fields[:8]]
+    except ValueError as error:
+        raise ValueError(
+            f"{where}: {error}; 8 numbers are needed. Correct the line, or begin it with '!' if it is a comment."
+        ) from None
+    for field, value in zip(fields, values, strict=False):
+        if not math.isfinite(value):
+            raise ValueError(
+                f"{where}: value {field!r} is not finite. Fill the gap by interpolation or cut the record there."
+            )
+    return values
+
+
+class _FieldHeader(NamedTuple):
+    """The fixed part of a ``.bts`` file, in the order in which it is written."""
+
+    identifier: int
+    n_z: int
+    n_y: int
+    n_tower: int
+    n_t: int
+    dz: float
+    dy: float
+    dt: float
+    mean_speed: float
+    hub_height: float
+    bottom: float
+    u_slope: float
+    u_offset: float
+    v_slope: float
+    v_offset: float
+    w_slope: float
+    w_offset: float
+    n_description: int
+
+
+_HEADER = struct.Struct("<h4i12fi")
+
+
+def read_bts(path: str | os.PathLike) -> WindRecord:
+    r"""Longitudinal wind at the hub from a binary full field, TurbSim's ``.bts`` (``WrADFF``).
+
+    The file is little endian: a header (:class:`_FieldHeader`), a description, then for every time step 16-bit
+    integers, the components u, v, w fastest, y next, z slowest, and last the points of the tower. A velocity is
+    :math:`v = (\mathrm{raw} - \mathrm{offset})/\mathrm{slope}`. The hub, on the middle of the grid's width, need not be
+    a grid point: u is interpolated bilinearly between the four around it.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: if the file is not of this format, its length is not the one its header implies, or the hub lies
+            outside the grid; otherwise as :class:`WindRecord`.
+
+    Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198, appendix on binary full-field files.
+    """
+    header = _read_header(path)
+    n_grid = header.n_z * header.n_y
+    start = _HEADER.size + header.n_description
+    shape = (header.n_t, n_grid + header.n_tower, 3)
+    expected, found = start + 2 * math.prod(shape), os.path.getsize(path)
+    if found != expected:
+        state = "is truncated" if found < expected else "is too long"
+        raise ValueError(
+            f"{path}: {state}, it holds {found} bytes, but its header ({header.n_t} steps of "
+            f"{header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies {expected} bytes. "
+            "Copy the file again, in binary mode, or run TurbSim again."
+        )
+    # Mapped, not read: a field is hundreds of megabytes, of which four columns are needed.
+    raw = np.memmap(path, dtype="<i2", mode="r", offset=start, shape=shape)
+    z = _interpolation(path, (header.hub_height - header.bottom) / header.dz, header.n_z, "height")
+    y = _interpolation(path, 0.5 * (header.n_y - 1), header.n_y, "width")
+    hub = sum(a * b * raw[:, i * header.n_y + j, 0].astype(np.float64) for i, a in z for j, b in y)
+    # The interval is stored in single precision: its shortest decimal is the number that was asked for.
+    dt = float(str(np.float32(header.dt)))
+    return WindRecord(dt * np.arange(header.n_t), (hub - header.u_offset) / header.u_slope, str(path))
+
+
+def _read_header(path: str | os.PathLike) -> _FieldHeader:
+    with open(path, "rb") as file:
+        head = file.read(_HEADER.size)
+    if len(head) < _HEADER.size:
+        raise ValueError(
+            f"{path}: is truncated, it holds {len(head)} bytes, but the header alone takes {_HEADER.size} bytes. "
+            "Copy the file again or run TurbSim again."
+        )
+    header = _FieldHeader._make(_HEADER.unpack(head))
+    if header.identifier not in (7, 8):
+        raise ValueError(
+            f"{path}: begins with the number {header.identifier}, but a TurbSim full field begins with 7 or 8 "
+            "(periodic). Is it another format, such as Bladed's .wnd? Run TurbSim with WrADFF."
+        )
+    counts_right = min(header.n_z, header.n_y, header.n_t) >= 1 and min(header.n_tower, header.n_description) >= 0
+    scales = (header.dz, header.dy, header.dt, header.u_slope)
+    if not (counts_right and min(scales) > 0 and all(math.isfinite(value) for value in header)):
+        raise ValueError(
+            f"{path}: header is corrupt, {header}; counts and spacings must be positive and all values finite. "
+            "Copy the file again, in binary mode, or run TurbSim again."
+        )
+    return header
+
+
+def _interpolation(path: str | os.PathLike, position: float, n: int, side: str) -> list[tuple[int, float]]:
+    """Grid points around a position counted in grid spacings, with their linear weights."""
+    # A hub on the grid's edge may be off by the single precision of the heights.
+    if not -1e-3 <= position <= n - 1 + 1e-3:
+        raise ValueError(
+            f"{path}: the hub lies outside the {side} of the grid, {position:g} spacings from its first point, which "
+            f"has {n} points; run TurbSim with a grid around the hub."
+        )
+    position = min(max(position, 0.0), n - 1.0)
+    below = min(int(position), max(n - 2, 0))
+    weight = position - below
+    return [(below, 1.0 - weight), (below + 1, weight)] if weight > 0 else [(below, 1.0)]

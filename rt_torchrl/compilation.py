@@ -1,0 +1,48 @@
+"""Compiled or eager, decided in one place."""
+
+import shutil
+import sysconfig
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import torch
+from hoptorch.scan import ensure_scan_backward
+from torch._inductor import config as inductor_config
+
+
+def compiled_if(compiled: bool, function: Callable, eager: Callable | None = None) -> Callable:
+    """``torch.compile(function)`` if ``compiled``, otherwise ``eager`` (by default ``function`` itself).
+
+    Raises:
+        RuntimeError: if ``compiled`` and this machine has no compiler; the message says what to install.
+    """
+    if not compiled:
+        return function if eager is None else eager
+    missing = missing_for_compilation()
+    if missing:
+        raise RuntimeError(
+            f"compiled=True needs {missing}, which this machine lacks. Install it (Debian: apt-get install g++ "
+            "python3-dev) or choose compiled=False; a recipe takes --no-compiled."
+        )
+    _prepare()
+    return torch.compile(function, fullgraph=True)
+
+
+def missing_for_compilation() -> str | None:
+    """What torch.compile lacks on this machine's CPU, in words; None if nothing."""
+    candidates = [c for c in inductor_config.cpp.cxx if c] if isinstance(inductor_config.cpp.cxx, tuple) else ["g++"]
+    if not any(shutil.which(str(candidate)) for candidate in candidates):
+        return "a C++ compiler"
+    if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
+        return "the headers of Python"
+    return None
+
+
+@cache
+def _prepare() -> None:
+    # The scan's backward must have been probed before it is traced.
+    ensure_scan_backward("cuda" if torch.cuda.is_available() else "cpu")
+    # One function is compiled once per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
+    torch._dynamo.config.recompile_limit = 256
+    torch._dynamo.config.accumulated_recompile_limit = 4096

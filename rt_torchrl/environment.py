@@ -1,0 +1,147 @@
+"""The real system in simulation: any plant as a TorchRL environment."""
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.compilation import compiled_if
+from rt_torchrl.plant import Plant, Transition
+from rt_torchrl.trajectory import DivergenceError
+
+
+class PlantEnv(EnvBase):
+    r"""A plant with its true closure, stepped by commands.
+
+    Entries of its TensorDict, each with the batch size in front:
+
+    =====================================  ======  ===================================================================
+    ``observation``                        n_o     the tracking errors e_k
+    ``state``, ``exogenous``               n_s, z  what a record needs beside the actions, s_k and z_k
+    ``action``                             n_a     the command, within the ranges of the plant's actions
+    ``("next", "applied")``                n_a     the action that the actuators applied
+    ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k)
+    ``("next", "truncated")``, ``"done"``  1       true at the horizon; ``terminated`` is never true
+    =====================================  ======  ===================================================================
+
+    Args:
+        plant: the plant; its own closure is the true one.
+        batch_size: number of episodes that run side by side.
+        seed: of the generator that draws initial states and exogenous inputs.
+        device: where it runs.
+        compiled: compile the step.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        batch_size: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        compiled: bool = False,
+    ):
+        if batch_size < 1:
+            raise ValueError(f"batch_size={batch_size} must be at least 1.")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([batch_size]))
+        self.plant = plant.to(device)
+        self._transition = compiled_if(compiled, _transition)
+        self._generator = torch.Generator(device=device)
+        self._generator.manual_seed(seed)
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        plant, batch = self.plant, self.batch_size
+
+        def unbounded(n: int) -> Unbounded:
+            return Unbounded(shape=(*batch, n), dtype=torch.float64, device=self.device)
+
+        n_o, n_s, n_a, n_z = map(len, (plant.observations, plant.states, plant.actions, plant.inputs))
+        self.observation_spec = Composite(
+            observation=unbounded(n_o),
+            state=unbounded(n_s),
+            exogenous=unbounded(n_z),
+            applied=unbounded(n_a),
+            shape=batch,
+            device=self.device,
+        )
+        low, high = (
+            torch.tensor([getattr(a, bound) for a in plant.actions], dtype=torch.float64, device=self.device)
+            for bound in ("low", "high")
+        )
+        self.action_spec = Bounded(
+            low=low.expand(*batch, n_a), high=high.expand(*batch, n_a), shape=(*batch, n_a), dtype=torch.float64
+        ).to(self.device)
+        self.reward_spec = unbounded(1)
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=self.device)
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=self.device
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._generator.manual_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        batch = self.batch_size[0]
+        state = self.plant.draw_initial_state(batch, self._generator)
+        exogenous = self.plant.draw_exogenous(batch, self._generator)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or mask.all():
+            self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
+            self._state, self._exogenous = state, exogenous
+        else:
+            again = mask.reshape(batch)
+            self._step_count = torch.where(again, 0, self._step_count)
+            self._state = torch.where(again[:, None], state, self._state)
+            self._exogenous = torch.where(again[:, None, None], exogenous, self._exogenous)
+        applied = torch.zeros(batch, len(self.plant.actions), dtype=torch.float64, device=self.device)
+        false = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
+        return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        t, exogenous = self._time(), self._now()
+        command = tensordict["action"]
+        transition, cost = self._transition(self.plant, t, self._state, command, exogenous)
+        if not cost.isfinite().all() or not transition.state.isfinite().all():
+            raise DivergenceError(
+                f"plant {self.plant.name!r} diverged at t = {t.max().item():g} s: state {self._state.tolist()}, "
+                f"command {command.tolist()}, exogenous input {exogenous.tolist()}."
+            )
+        # A compiled step may reuse its output buffer.
+        self._state = transition.state.clone()
+        self._step_count = self._step_count + 1
+        truncated = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        return self._observed(
+            {
+                "applied": transition.applied.clone(),
+                "reward": -cost.unsqueeze(-1),
+                "done": truncated,
+                "terminated": torch.zeros_like(truncated),
+                "truncated": truncated.clone(),
+            }
+        )
+
+    def _observed(self, entries: dict[str, Tensor]) -> TensorDict:
+        exogenous = self._now()
+        observation = self.plant.observe(self._time(), self._state, exogenous)
+        entries |= {"observation": observation, "state": self._state, "exogenous": exogenous}
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _time(self) -> Float[Tensor, "batch"]:
+        return self._step_count * self.plant.dt
+
+    def _now(self) -> Float[Tensor, "batch n_z"]:
+        """The input of this interval; after the last one, still that of the last."""
+        k = self._step_count.clamp(max=self.plant.n_steps - 1)
+        return self._exogenous[torch.arange(len(k), device=self.device), k]
+
+
+def _transition(
+    plant: Plant, t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor
+) -> tuple[Transition, Tensor]:
+    transition = plant.step(t, state, command, exogenous, plant.closure)
+    return transition, plant.running_cost(t, state, transition.applied, exogenous)

@@ -1,0 +1,36 @@
+"""One scalar of a plant: its symbol, unit and range."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """A component of a state, action, exogenous input or observation.
+
+    Args:
+        symbol: the letter of the formulas, as matplotlib mathtext without the dollars (``r"\\omega_r"``).
+        name: the word of the interfaces, a valid identifier (``"rotor_speed"``).
+        unit: SI unit, or the unit a correlation is defined in (``"rad/s"``, ``"deg"``, ``"-"``).
+        low: least admissible value in ``unit``.
+        high: greatest admissible value in ``unit``.
+    """
+
+    symbol: str
+    name: str
+    unit: str
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self):
+        if not self.name.isidentifier():
+            raise ValueError(f"Signal name={self.name!r} must be an identifier such as 'rotor_speed'; rename it.")
+        if not self.low < self.high:
+            raise ValueError(
+                f"Signal {self.name!r} has low={self.low}, high={self.high} [{self.unit}]; low must be below high."
+            )
+
+    @property
+    def label(self) -> str:
+        """Axis label, such as ``rotor speed $\\omega_r$ [rad/s]``."""
+        return f"{self.name.replace('_', ' ')} ${self.symbol}$ [{self.unit}]"

@@ -1,0 +1,93 @@
+r"""The oracle plant: linear dynamics and quadratic costs, so that rollouts, costs and optimal gains have closed forms.
+
+.. math:: \dot s = A s + B a + z + p, \qquad L_a = s^\top Q s + a^\top R a, \qquad p = C s
+
+with the closure C the unknown part of the dynamics. With A and B in real-Jordan form nothing here is shared with the
+library's solvers: the tests compute matrix exponentials and Riccati solutions with scipy.
+"""
+
+import torch
+from torch import nn
+
+from rt_torchrl.plant import Plant
+from rt_torchrl.policies import SaturatedAffine  # noqa: F401  (re-exported for the tests)
+from rt_torchrl.signal import Signal
+
+
+class LinearClosure(nn.Module):
+    """p = C s."""
+
+    def __init__(self, matrix):
+        super().__init__()
+        self.matrix = nn.Parameter(torch.as_tensor(matrix, dtype=torch.float64))
+
+    def forward(self, features):
+        return (features.unsqueeze(-2) * self.matrix).sum(-1)
+
+
+class LinearGain(nn.Module):
+    """a = −K e."""
+
+    def __init__(self, gain):
+        super().__init__()
+        self.gain = nn.Parameter(torch.as_tensor(gain, dtype=torch.float64))
+
+    def forward(self, observation):
+        return -(observation.unsqueeze(-2) * self.gain).sum(-1)
+
+
+class LinearQuadratic(Plant):
+    """A damped oscillator with one force; see the module's docstring."""
+
+    name = "linear_quadratic"
+    states = (
+        Signal(symbol="x", name="position", unit="m"),
+        Signal(symbol="v", name="velocity", unit="m/s"),
+    )
+    actions = (Signal(symbol="a", name="force", unit="N", low=-2.0, high=2.0),)
+    inputs = (Signal(symbol="d", name="disturbance", unit="m/s^2"),)
+    observations = (
+        Signal(symbol="e_1", name="position_error", unit="-"),
+        Signal(symbol="e_2", name="velocity_error", unit="-"),
+    )
+
+    A = ((0.0, 1.0), (-1.0, -0.3))
+    B = ((0.0,), (1.0,))
+    Q = ((1.0, 0.0), (0.0, 0.5))
+    R = ((0.1,),)
+    true_closure = ((0.0, 0.0), (-0.2, 0.1))
+
+    def __init__(self, *, dt=0.1, horizon=5.0, noise=0.05):
+        super().__init__(dt=dt, horizon=horizon, closure=LinearClosure(self.true_closure))
+        self.noise = noise
+        for name in "ABQR":
+            self.register_buffer(f"_{name}", torch.tensor(getattr(self, name), dtype=torch.float64))
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        force = torch.cat([torch.zeros_like(exogenous), exogenous], -1)
+        return (
+            (state.unsqueeze(-2) * self._A).sum(-1) + (action.unsqueeze(-2) * self._B).sum(-1) + force + closure(state)
+        )
+
+    def observe(self, t, state, exogenous):
+        return state
+
+    def running_cost(self, t, state, applied, exogenous):
+        quadratic = (state.unsqueeze(-2) * self._Q).sum(-1) * state
+        return quadratic.sum(-1) + ((applied.unsqueeze(-2) * self._R).sum(-1) * applied).sum(-1)
+
+    def discrepancy(self, state, measured):
+        return 0.5 * ((state - measured) ** 2).sum(-1)
+
+    def draw_initial_state(self, batch, generator):
+        return torch.randn(batch, 2, generator=generator, dtype=torch.float64)
+
+    def draw_exogenous(self, batch, generator):
+        return self.noise * torch.randn(batch, self.n_steps, 1, generator=generator, dtype=torch.float64)
+
+    def make_closure(self, generator):
+        start = torch.tensor(self.true_closure, dtype=torch.float64)
+        return LinearClosure(start + 0.3 * torch.randn(2, 2, generator=generator, dtype=torch.float64))
+
+    def make_policy(self, generator):
+        return LinearGain(0.1 * torch.randn(1, 2, generator=generator, dtype=torch.float64))
