@@ -25,8 +25,7 @@ def compiled_if(compiled: bool, function: Callable, eager: Callable | None = Non
             f"compiled=True needs {missing}, which this machine lacks. Install it (Debian: apt-get install g++ "
             "python3-dev) or choose compiled=False; a recipe takes --no-compiled."
         )
-    _prepare()
-    return torch.compile(function, fullgraph=True)
+    return _compile(function)
 
 
 def missing_for_compilation() -> str | None:
@@ -40,9 +39,16 @@ def missing_for_compilation() -> str | None:
 
 
 @cache
+def _compile(function: Callable) -> Callable:
+    # Cached, so that every user of a function shares its graphs.
+    _prepare()
+    return torch.compile(function, fullgraph=True)
+
+
+@cache
 def _prepare() -> None:
     # The scan's backward must have been probed before it is traced.
     ensure_scan_backward("cuda" if torch.cuda.is_available() else "cpu")
-    # One function is compiled once per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
+    # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
     torch._dynamo.config.recompile_limit = 256
     torch._dynamo.config.accumulated_recompile_limit = 4096

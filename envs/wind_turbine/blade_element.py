@@ -15,7 +15,7 @@ Wind Energy 17 (2014) 1327-1345; M. L. Buhl, *A new empirical relationship betwe
 factor for the turbulent windmill state*, NREL/TP-500-36834, 2005.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rt_torchrl.envs.wind_turbine.polars import Blade, Polar
-from rt_torchrl.envs.wind_turbine.power_coefficient import DATA, PowerCoefficientTable
+from rt_torchrl.envs.wind_turbine.power_coefficient import DATA, Axis, PowerCoefficientTable
 
 EDGE = 1e-6
 """Distance of the brackets from φ = 0 and φ = π, where the residual is singular [rad]."""
@@ -140,7 +140,7 @@ class _Sections(NamedTuple):
         return cl, cd
 
 
-def solve_inflow(rotor: Rotor, tip_speed_ratio: Float[np.ndarray, " lam"], pitch: Float[np.ndarray, " beta"]) -> Inflow:
+def solve_inflow(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) -> Inflow:
     """Balance every element of the rotor at every pair of tip-speed ratio [-] and pitch [deg]; see the module.
 
     Raises:
@@ -167,12 +167,11 @@ def solve_inflow(rotor: Rotor, tip_speed_ratio: Float[np.ndarray, " lam"], pitch
     return Inflow(phi, a, a_tangential, loss, force * c_n, force * c_t)
 
 
-def power_coefficients(
-    rotor: Rotor, tip_speed_ratio: Float[np.ndarray, " lam"], pitch: Float[np.ndarray, " beta"]
-) -> Float[np.ndarray, "lam beta"]:
-    r"""C_p [-] of the rotor, :math:`C_p = \lambda\,Q / (\tfrac12\rho\pi R^3 U^2)` with the torque Q averaged over azimuth.
+def power_coefficients(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) -> Float[np.ndarray, "lam beta"]:
+    r"""Map of the rotor, :math:`C_p = \lambda\,Q / (\tfrac12\rho\pi R^3 U^2)` [-], Q the torque averaged over azimuth.
 
-    R is the radius of the swept disc, tip_radius·cos(precone), in C_p as in λ.
+    R is the radius of the swept disc, tip_radius·cos(precone), in C_p as in λ. The loads of an element hold over its
+    length dr.
 
     Raises:
         ValueError: as :func:`solve_inflow`.
@@ -183,9 +182,7 @@ def power_coefficients(
     return lam[:, None] * torque / (np.pi * (rotor.tip_radius * np.cos(cone)) ** 3)
 
 
-def power_coefficient_table(
-    rotor: Rotor, tip_speed_ratio: Sequence[float], pitch: Sequence[float]
-) -> PowerCoefficientTable:
+def power_coefficient_table(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) -> PowerCoefficientTable:
     """The rotor's map as the closure of a wind turbine.
 
     Args:
@@ -241,7 +238,7 @@ def _prandtl(factor: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]
 def _axial_induction(
     kappa: Float[np.ndarray, "*batch"], loss: Float[np.ndarray, "*batch"], windmill: np.ndarray
 ) -> Float[np.ndarray, "*batch"]:
-    r"""Axial induction a from κ: momentum theory up to κ = 2/3, above it Buhl's parabola, for φ < 0 the propeller brake.
+    r"""Axial induction a from κ: momentum theory up to κ = 2/3, Buhl's parabola above, propeller brake for φ < 0.
 
     Buhl: :math:`C_T = \tfrac89 + (4F - \tfrac{40}9)a + (\tfrac{50}9 - 4F)a^2`, and the blade gives
     :math:`C_T = 4F\kappa(1-a)^2`.

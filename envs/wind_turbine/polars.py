@@ -16,8 +16,8 @@ class Polar:
     """Lift and drag coefficients of a section; between the entries monotone cubic (PCHIP), which does not overshoot.
 
     Args:
-        alpha: angles of attack [deg], increasing from -180 to 180: a rotor at standstill or at a large pitch angle
-            sees all of them.
+        alpha: array of angles of attack [deg], increasing from -180 to 180: a rotor at standstill or at a large pitch
+            angle sees all of them.
         cl: lift coefficients [-].
         cd: drag coefficients [-], not negative.
 
@@ -28,9 +28,9 @@ class Polar:
     Source: F. N. Fritsch, J. Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300-304.
     """
 
-    alpha: Float[np.ndarray, " n"]
-    cl: Float[np.ndarray, " n"]
-    cd: Float[np.ndarray, " n"]
+    alpha: np.ndarray
+    cl: np.ndarray
+    cd: np.ndarray
 
     def __post_init__(self):
         columns = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("alpha", "cl", "cd")}
@@ -59,8 +59,8 @@ class Polar:
         if not np.allclose((alpha[0], alpha[-1]), (-180.0, 180.0)):
             radians = " These look like radians: convert them." if np.abs(alpha).max() < 3.2 else ""
             raise ValueError(
-                f"alpha covers {alpha[0]}…{alpha[-1]} deg; a rotor needs -180…180 deg. Extend the polar, for instance by "
-                f"Viterna's method.{radians}"
+                f"alpha covers {alpha[0]}…{alpha[-1]} deg; a rotor needs -180…180 deg. Extend the polar, for instance "
+                f"by Viterna's method.{radians}"
             )
         if cd.min() < 0:
             raise ValueError(f"cd reaches {cd.min()}; drag cannot be negative. Check the columns' order and sign.")
@@ -101,7 +101,7 @@ class Blade:
     """A blade as elements; each carries the loads of its mid-point.
 
     Args:
-        r: distance of the mid-points from the rotor axis along the blade [m], increasing.
+        r: array of distances of the mid-points from the rotor axis along the blade [m], increasing.
         dr: lengths of the elements [m].
         chord: [m].
         twist: angle of the section to the plane of rotation, towards feather positive [deg].
@@ -112,10 +112,10 @@ class Blade:
             or look like another unit.
     """
 
-    r: Float[np.ndarray, " n"]
-    dr: Float[np.ndarray, " n"]
-    chord: Float[np.ndarray, " n"]
-    twist: Float[np.ndarray, " n"]
+    r: np.ndarray
+    dr: np.ndarray
+    chord: np.ndarray
+    twist: np.ndarray
     airfoil: Sequence[str]
 
     def __post_init__(self):
@@ -123,8 +123,8 @@ class Blade:
             column = np.asarray(getattr(self, name), dtype=np.float64)
             if column.shape != (len(self.airfoil),) or len(self.airfoil) < 2:
                 raise ValueError(
-                    f"{name} has shape {column.shape}, airfoil {len(self.airfoil)} names; give one of each per element, "
-                    "two elements or more."
+                    f"{name} has shape {column.shape}, airfoil {len(self.airfoil)} names; give one of each per "
+                    "element, two elements or more."
                 )
             bad = ~np.isfinite(column) | ((column <= 0) & (name != "twist"))
             if bad.any():
@@ -140,8 +140,8 @@ class Blade:
         if (np.diff(self.r) <= 0).any():
             at = int(np.argmax(np.diff(self.r) <= 0))
             raise ValueError(
-                f"r goes from {self.r[at]} to {self.r[at + 1]} m at element {at + 1}; it must increase from root to tip. "
-                "Sort the elements by radius."
+                f"r goes from {self.r[at]} to {self.r[at + 1]} m at element {at + 1}; it must increase from root to "
+                "tip. Sort the elements by radius."
             )
         largest = np.abs(self.twist).max()
         if 0 < largest < 0.6:

@@ -10,6 +10,8 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
+Axis = Sequence[float] | np.ndarray
+Rows = Sequence[Sequence[float]] | np.ndarray
 DATA = Path(__file__).parent / "data"
 STALL_KNOT = 0.5
 """Where the two pieces of the stall element meet, as a fraction of the table's least λ."""
@@ -24,10 +26,11 @@ class PowerCoefficientTable(nn.Module):
 
     - *Table*: the not-a-knot tensor-product cubic spline through the values, twice continuously differentiable.
     - *Stall*, λ below the first row λ_1: C_p goes to zero like λ², so that the torque ½ρπR³(C_p/λ)u² vanishes at
-      standstill. With :math:`\lambda_0 = \lambda_1/2`, it is :math:`C_p = 0.2\,C_p(\lambda_1,\beta)(\lambda/\lambda_0)^2`
-      up to λ_0, then the cubic that meets value and slope at both ends. One cubic :math:`\lambda^2(a + b\lambda)`
-      would do with fewer pieces, but on a steep table (slope above three times C_p/λ_1) it has a < 0: the wind would
-      brake a slow rotor and hold it at standstill for good. Below λ = 0, C_p = 0.
+      standstill. With :math:`\lambda_0 = \lambda_1/2`, it is
+      :math:`C_p = 0.2\,C_p(\lambda_1,\beta)(\lambda/\lambda_0)^2` up to λ_0, then the cubic that meets value and slope
+      at both ends. One cubic :math:`\lambda^2(a + b\lambda)` would take one cell less, but on a steep table (slope
+      above three times C_p/λ_1, as on the NREL 5-MW at fine pitch) it has a < 0: the wind would brake a slow rotor and
+      hold it at standstill for good, which blade-element momentum theory contradicts. Below λ = 0, C_p = 0.
     - *Extrapolation*, λ above the last row and β on either side: linear, with value and slope of the table's edge. An
       overspeeding rotor is braked (C_p falls below zero); no value is clipped.
 
@@ -46,7 +49,12 @@ class PowerCoefficientTable(nn.Module):
     Source: C. de Boor, *A Practical Guide to Splines*, chapters IV and XVII.
     """
 
-    def __init__(self, tip_speed_ratio: Sequence[float], pitch: Sequence[float], values: Sequence[Sequence[float]]):
+    def __init__(
+        self,
+        tip_speed_ratio: Axis,
+        pitch: Axis,
+        values: Rows,
+    ):
         super().__init__()
         lam = _checked_axis("tip_speed_ratio", "-", tip_speed_ratio)
         beta = _checked_axis("pitch", "deg", pitch)
@@ -97,7 +105,8 @@ class PowerCoefficientTable(nn.Module):
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
         """C_p [-] at tip-speed ratio λ [-] and pitch β [deg], the two features, of the module's dtype (float64)."""
-        lam, beta = features[..., 0].contiguous(), features[..., 1].contiguous()
+        # The search wants contiguous memory; Tensor.contiguous would not see the batch dimension of torch.func.vmap.
+        lam, beta = (features[..., k].clone(memory_format=torch.contiguous_format) for k in (0, 1))
         i = torch.bucketize(lam, self._lam_knots, right=True)
         j = torch.bucketize(beta, self.pitch, right=True)
         c = self._coefficients[i, j]
@@ -149,7 +158,7 @@ def csv_rows(path: str | Path) -> list[list[str]]:
         ValueError: if there is no row below the header.
     """
     with Path(path).open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.reader(line for line in file if line.strip() and not line.startswith("#"))]
+        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
     if len(rows) < 2:
         raise ValueError(
             f"path={str(path)!r} holds {len(rows)} rows; it needs a header and at least one row of numbers."
@@ -202,7 +211,7 @@ def _neighbours(axis: Float[Tensor, " n"], at: Float[Tensor, ""]) -> Float[Tenso
     return axis[max(index - 3, 0) : index + 4]
 
 
-def _checked_axis(name: str, unit: str, axis: Sequence[float]) -> Float[np.ndarray, " n"]:
+def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:
     array = np.asarray(axis, dtype=np.float64)
     if array.ndim != 1 or len(array) < 4:
         raise ValueError(
@@ -220,7 +229,7 @@ def _checked_axis(name: str, unit: str, axis: Sequence[float]) -> Float[np.ndarr
     return array
 
 
-def _checked_values(values: Sequence[Sequence[float]], n_lam: int, n_beta: int) -> Float[np.ndarray, "n_lam n_beta"]:
+def _checked_values(values: Rows, n_lam: int, n_beta: int) -> Float[np.ndarray, "n_lam n_beta"]:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (n_lam, n_beta):
         hint = "; transpose it" if array.shape == (n_beta, n_lam) else ""

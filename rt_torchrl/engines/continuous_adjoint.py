@@ -1,4 +1,4 @@
-"""Engine ``odeint_adjoint``: the continuous adjoint of the paper (eqs. lambda_p and lambda_a) as torchdiffeq solves it."""
+"""Engine ``odeint_adjoint``: the paper's continuous adjoint (eqs. lambda_p and lambda_a), solved by torchdiffeq."""
 
 import torch
 from torch import Tensor, nn

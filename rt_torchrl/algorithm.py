@@ -1,0 +1,211 @@
+r"""Reinforcement Twinning: the six steps of the paper's algorithm, one method each.
+
+Two policies of the same observation live side by side, π_mf (model-free) and π_mb (model-based). One is live: it acts
+on the real system. The other is idle, learns beside it and can take over.
+"""
+
+import time
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+
+from rt_torchrl.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess
+from rt_torchrl.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, ShortTermMemory
+from rt_torchrl.model_based import ModelBased, ModelBasedConfig
+from rt_torchrl.model_free import ModelFree, ModelFreeConfig
+from rt_torchrl.switching import PolicySwitch, Role, SwitchConfig
+from rt_torchrl.trajectory import control_cost
+from rt_torchrl.twin import DigitalTwin
+
+TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
+Arm = Literal["twinning", "model_free", "model_based"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinningConfig:
+    """Hyper-parameters of the algorithm, by step.
+
+    Args:
+        arm: ``twinning``, or one of its halves alone: ``model_free`` makes steps 1 and 2, ``model_based`` 1 and 3 to 5.
+        realisations: N_z, samples of the exogenous process per record in steps 4 and 5.
+        records: n_S, real episodes that steps 3 to 5 look back on.
+        virtual_episodes: N, over which step 6 compares the policies.
+        exploration: step 1.
+        long_term: the memory of step 2.
+        model_free: step 2.
+        exogenous: step 3.
+        assimilation: step 4.
+        model_based: step 5.
+        switch: step 6.
+    """
+
+    arm: Arm = "twinning"
+    realisations: int = 5
+    records: int = 1
+    virtual_episodes: int = 10
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    long_term: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
+    model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
+    exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)
+    assimilation: AssimilationConfig = field(default_factory=AssimilationConfig)
+    model_based: ModelBasedConfig = field(default_factory=ModelBasedConfig)
+    switch: SwitchConfig = field(default_factory=SwitchConfig)
+
+    def __post_init__(self):
+        for argument in ("realisations", "records", "virtual_episodes"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+
+
+class ReinforcementTwinning:
+    """The algorithm; call :meth:`episode` once per real episode.
+
+    Args:
+        env: the real system; a :class:`PlantEnv` of batch size 1, or any TorchRL environment with its entries.
+        twin: the digital twin, whose closure is trained in place.
+        model_free: π_mf, trained in place; starts live.
+        model_based: π_mb, trained in place.
+        config: see :class:`TwinningConfig`.
+        generator: source of everything random except what the real system draws itself.
+
+    Raises:
+        ValueError: if the weights of the two policies differ in shape: step 6 could not clone one into the other.
+    """
+
+    def __init__(
+        self,
+        env: PlantEnv,
+        twin: DigitalTwin,
+        *,
+        model_free: nn.Module,
+        model_based: nn.Module,
+        config: TwinningConfig,
+        generator: torch.Generator,
+    ):
+        self.twin, self.config, self.generator = twin, config, generator
+        self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
+        require_clonable(model_free, model_based)
+        self.model_free = ModelFree(twin.plant, model_free, config.model_free, generator=generator)
+        self.assimilation = Assimilation(twin, config.assimilation)
+        self.model_based = ModelBased(twin, model_based, config.model_based)
+        self.long_term = LongTermMemory(config.long_term, generator=generator)
+        self.short_term = ShortTermMemory(config.records)
+        self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
+        self.actor = LivePolicy(
+            twin.plant, self.policies[self.switch.live], spread=config.exploration.spread, generator=generator
+        )
+        self.collector = Collector(
+            env,
+            TensorDictModule(self.actor, in_keys=["observation"], out_keys=["action"]),
+            frames_per_batch=twin.plant.n_steps,
+            total_frames=-1,
+            reset_at_each_iter=True,
+        )
+        self.episodes_done = 0
+
+    def episode(self) -> TensorDict:
+        """One real episode and all that is learned from it: the six steps of the paper, in order.
+
+        Returns:
+            ``real_cost``, the reports of the steps that were made, and ``seconds`` of each step.
+        """
+        arm, report, seconds = self.config.arm, TensorDict(), TensorDict()
+        steps = [self.interact]
+        steps += [self.update_model_free] if arm != "model_based" else []
+        steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
+        steps += [self.switch_policies] if arm == "twinning" else []
+        for step in steps:
+            start = time.perf_counter()
+            report.update(step())
+            seconds[step.__name__] = time.perf_counter() - start
+        self.episodes_done += 1
+        return report.update({"seconds": seconds})
+
+    def interact(self) -> TensorDict:
+        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
+        self.actor.policy = self.policies[self.switch.live]
+        self.actor.strength = self.config.exploration.strength(self.episodes_done)
+        episode = next(iter(self.collector))[0]
+        # What is learned from is the action that was applied.
+        episode["action"] = episode["next", "applied"]
+        transitions = episode.select(*TRANSITION)
+        self.long_term.store(transitions, self.model_free.td_errors(transitions))
+        states = torch.cat([episode["state"], episode["next", "state"][-1:]])
+        self.short_term.append(Record(states, episode["exogenous"], episode["action"]))
+        return TensorDict({"real_cost": -episode["next", "reward"].mean(), "exploration": self.actor.strength})
+
+    def update_model_free(self) -> TensorDict:
+        """Step 2: n_Q updates of the critic, then n_A of π_mf."""
+        self._earlier_weights = {role: weight_vector(policy) for role, policy in self.policies.items()}
+        return self.model_free.update(self.long_term, self.twin.plant.n_steps)
+
+    def fit_exogenous(self) -> TensorDict:
+        """Step 3: a Gaussian process of the exogenous input for each record in D_S."""
+        plant, config = self.twin.plant, self.config.exogenous
+        self.processes = [
+            ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=config)
+            for record in self.short_term
+        ]
+        return TensorDict()
+
+    def assimilate(self) -> TensorDict:
+        """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
+        found = self.assimilation.update(self.short_term, self.processes, self.config.realisations, self.generator)
+        return TensorDict({"J_p_before": found.start, "J_p": found.best, "closure_gradient": found.gradient})
+
+    def plan(self) -> TensorDict:
+        """Step 5: n_mb gradient steps on J_a over virtual trajectories under π_mb, on the twin with w_p*."""
+        found = self.model_based.update(self.processes, self.config.realisations, self.generator)
+        return TensorDict({"J_a_plan_before": found.start, "J_a_plan": found.best, "policy_gradient": found.gradient})
+
+    @torch.no_grad()
+    def switch_policies(self) -> TensorDict:
+        """Step 6: mean J_a of both policies over the same N virtual episodes, then the decision tree."""
+        costs = self.virtual_costs()
+        idle = self.switch.idle
+        now = weight_vector(self.policies[idle])
+        change = (now - self._earlier_weights[idle]).norm() / now.norm()
+        event = self.switch.decide(costs[self.switch.live].item(), costs[idle].item(), change.item())
+        if event == "clone":
+            self.policies[idle].load_state_dict(self.policies[self.switch.live].state_dict())
+            (self.model_free if idle == "model_free" else self.model_based).restart()
+        report = TensorDict({f"J_a_{role}": cost for role, cost in costs.items()})
+        return report.set("weight_change", change).set_non_tensor("event", event)
+
+    def virtual_costs(self) -> dict[Role, Tensor]:
+        """Mean J_a of each policy over N virtual episodes with random initial states and disturbances."""
+        plant, n = self.twin.plant, self.config.virtual_episodes
+        initial_state = plant.draw_initial_state(n, self.generator)
+        share = [n // len(self.processes) + (k < n % len(self.processes)) for k in range(len(self.processes))]
+        exogenous = torch.cat(
+            [process.sample(count, self.generator) for process, count in zip(self.processes, share, strict=True)]
+        )
+        flown = {role: self.twin.control(policy, initial_state, exogenous) for role, policy in self.policies.items()}
+        return {role: control_cost(plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+
+
+def weight_vector(module: nn.Module) -> Tensor:
+    """All weights of a module, detached, in one vector."""
+    return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
+
+
+def require_clonable(first: nn.Module, second: nn.Module) -> None:
+    """Refuse two policies whose weights do not fit each other.
+
+    Raises:
+        ValueError: with the shapes of both.
+    """
+    shapes = [{name: tuple(value.shape) for name, value in m.state_dict().items()} for m in (first, second)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"model_free and model_based have weights of shapes {shapes[0]} and {shapes[1]}; step 6 copies one into "
+            "the other, so give both the same architecture."
+        )

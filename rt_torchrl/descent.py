@@ -1,0 +1,146 @@
+"""Gradient descent as steps 4 and 5 share it: a few steps a time, the best weights kept."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor, nn
+
+Optimiser = Literal["adam", "lbfgs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescentConfig:
+    r"""How weights descend a cost that is deterministic within an episode.
+
+    Adam's second moment forgets within about ten steps (β₂ = 0.9), because the gradient of a policy that starts in
+    saturation or stall is hundreds of times larger than later ones: with the usual 0.999 that first gradient keeps the
+    steps near zero for the rest of a training of some hundred steps.
+
+    Args:
+        optimiser: ``adam``, or ``lbfgs`` with a strong-Wolfe line search, every trial point counting as an iteration.
+        rate: learning rate of Adam; first step length of L-BFGS.
+        gradient_limit: greatest norm of the gradient that Adam sees; L-BFGS has its line search instead.
+        second_moment: β₂ of Adam.
+    """
+
+    optimiser: Optimiser = "adam"
+    rate: float = 0.1
+    gradient_limit: float = 1.0
+    second_moment: float = 0.9
+
+    def __post_init__(self):
+        if self.optimiser not in get_args(Optimiser):
+            raise ValueError(
+                f"optimiser={self.optimiser!r} does not exist; choose one of {', '.join(get_args(Optimiser))}."
+            )
+        for argument in ("rate", "gradient_limit"):
+            if not getattr(self, argument) > 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+        if not 0.0 <= self.second_moment < 1.0:
+            raise ValueError(f"second_moment={self.second_moment} must lie in [0, 1).")
+
+
+class Descended(NamedTuple):
+    """Cost at the start and at the best weights, norm of the first gradient, iterations made."""
+
+    start: float
+    best: float
+    gradient: float
+    iterations: int
+
+
+class Descent:
+    """Updates the weights of a module in place and leaves the best ones seen in it.
+
+    Args:
+        module: holds the weights.
+        config: see :class:`DescentConfig`.
+    """
+
+    def __init__(self, module: nn.Module, config: DescentConfig):
+        self.module, self.config = module, config
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the optimiser's state, because the weights have jumped."""
+        weights = [w for w in self.module.parameters() if w.requires_grad]
+        if self.config.optimiser == "adam":
+            self._optimiser = torch.optim.Adam(weights, lr=self.config.rate, betas=(0.9, self.config.second_moment))
+        else:
+            self._optimiser = torch.optim.LBFGS(weights, lr=self.config.rate, line_search_fn="strong_wolfe")
+
+    def run(self, cost: Callable[[], Tensor], iterations: int, *, stop_below: float = 0.0) -> Descended:
+        """Take ``iterations`` gradients of ``cost`` and keep the best weights.
+
+        Args:
+            cost: scalar cost at the module's present weights; the same function throughout.
+            iterations: number of gradients; 0 does nothing.
+            stop_below: stop early once the cost is below this share of its start; 0 never does.
+        """
+        seen = _Seen(self.module, cost, self.config, iterations, stop_below)
+        try:
+            if self.config.optimiser == "lbfgs":
+                # Another episode has another cost: curvature of the last one would mislead the line search.
+                self.restart()
+                self._optimiser.param_groups[0].update(max_iter=iterations, max_eval=iterations)
+                self._optimiser.step(seen)
+            else:
+                for _ in range(iterations):
+                    self._optimiser.step(seen)
+            seen.note_last()
+        except _Finished:
+            pass
+        self.module.load_state_dict(seen.best_weights)
+        return Descended(seen.start, seen.best, seen.gradient, seen.count)
+
+    def state_dict(self) -> dict[str, Any]:
+        return self._optimiser.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._optimiser.load_state_dict(state)
+
+
+class _Finished(Exception):
+    """Leaves an optimiser that would go on."""
+
+
+class _Seen:
+    """The closure an optimiser calls: cost and gradient at the present weights, with a memory of the best."""
+
+    def __init__(self, module, cost, config, iterations, stop_below):
+        self._module, self._cost, self._config = module, cost, config
+        self._iterations, self._stop_below = iterations, stop_below
+        self.start = self.best = float("nan")
+        self.gradient, self.count = float("nan"), 0
+        self.best_weights = copy.deepcopy(module.state_dict())
+
+    def __call__(self) -> Tensor:
+        if self.count == self._iterations:
+            raise _Finished
+        with torch.enable_grad():
+            self._module.zero_grad(set_to_none=True)
+            cost = self._cost()
+            cost.backward()
+        weights = [w for w in self._module.parameters() if w.grad is not None]
+        limit = self._config.gradient_limit if self._config.optimiser == "adam" else float("inf")
+        norm = nn.utils.clip_grad_norm_(weights, limit).item()
+        if self.count == 0:
+            self.start, self.gradient = cost.item(), norm
+        self._note(cost.item())
+        self.count += 1
+        return cost
+
+    def note_last(self) -> None:
+        """Consider the weights of the last step too; the optimiser has not evaluated them."""
+        if self.count:
+            with torch.no_grad():
+                self._note(self._cost().item())
+
+    def _note(self, cost: float) -> None:
+        if not cost >= self.best:
+            self.best, self.best_weights = cost, copy.deepcopy(self._module.state_dict())
+        if cost < self._stop_below * self.start:
+            raise _Finished

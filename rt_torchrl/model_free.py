@@ -1,0 +1,171 @@
+"""Step 2: critic and model-free policy by DDPG, from TorchRL's parts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import ValueOperator
+from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
+
+from rt_torchrl.memory import LongTermMemory
+from rt_torchrl.plant import Plant
+from rt_torchrl.policies import mlp
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelFreeConfig:
+    """Parameters of step 2.
+
+    Args:
+        critic_iterations: n_Q.
+        actor_iterations: n_A.
+        batch_size: n_b; at most n_t transitions are sampled.
+        discount: γ per control interval.
+        target_rate: τ of the target critic.
+        critic_rate: learning rate of the critic (Adam).
+        actor_rate: learning rate of the policy (Adam).
+        gradient_limit: greatest norm of the policy's gradient.
+        critic_hidden: widths of the critic's hidden layers.
+    """
+
+    critic_iterations: int = 500
+    actor_iterations: int = 1000
+    batch_size: int = 128
+    discount: float = 0.98
+    target_rate: float = 0.01
+    critic_rate: float = 1e-3
+    actor_rate: float = 2e-3
+    gradient_limit: float = 1.0
+    critic_hidden: Sequence[int] = field(default=(64, 64))
+
+    def __post_init__(self):
+        for argument in ("critic_iterations", "actor_iterations"):
+            if getattr(self, argument) < 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
+        if self.batch_size < 1:
+            raise ValueError(f"batch_size={self.batch_size} must be at least 1.")
+        if not 0.0 <= self.discount < 1.0:
+            raise ValueError(f"discount={self.discount} must lie in [0, 1); the critic bootstraps through truncation.")
+        for argument in ("target_rate", "critic_rate", "actor_rate", "gradient_limit"):
+            if not getattr(self, argument) > 0.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+
+
+class Critic(nn.Module):
+    """q(e, a): a perceptron of the observation and of the action scaled from its range to [−1, 1].
+
+    Args:
+        plant: gives the number of observations and the ranges of the actions.
+        hidden: widths of the hidden layers.
+        generator: source of the initial weights.
+    """
+
+    def __init__(self, plant: Plant, hidden: Sequence[int], *, generator: torch.Generator):
+        super().__init__()
+        low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("half_range", 0.5 * (high - low))
+        self.network = mlp(
+            len(plant.observations) + len(plant.actions), hidden, 1, generator=generator, activation=nn.SiLU
+        )
+
+    def forward(
+        self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
+    ) -> Float[Tensor, "*batch 1"]:
+        return self.network(torch.cat([observation, (action - self.middle) / self.half_range], -1))
+
+
+class ModelFree:
+    r"""Deep deterministic policy gradient with prioritised replay (paper, section 4.1).
+
+    .. math::
+        y_k = r_k + \gamma\,q'(e_{k+1}, \pi(e_{k+1})), \quad \delta_k = y_k - q(e_k, a_k), \quad
+        J_q = \mathbb E[w_k\delta_k^2], \quad \frac{dR}{dw_a} = \mathbb E\Big[\frac{dq}{da}\frac{d\pi}{dw_a}\Big]
+
+    with the target critic q′ and the importance weights w of the sampling.
+
+    Args:
+        plant: see :class:`Critic`.
+        policy: π_mf, updated in place.
+        config: see :class:`ModelFreeConfig`.
+        generator: source of the critic's initial weights.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        policy: nn.Module,
+        config: ModelFreeConfig,
+        *,
+        generator: torch.Generator,
+    ):
+        self.config, self.policy = config, policy
+        self.critic = Critic(plant, config.critic_hidden, generator=generator).to(generator.device)
+        self.loss = DDPGLoss(
+            TensorDictModule(policy, in_keys=["observation"], out_keys=["action"]),
+            ValueOperator(self.critic, in_keys=["observation", "action"]),
+            loss_function="l2",
+            delay_actor=False,
+            delay_value=True,
+        )
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
+        self.target = SoftUpdate(self.loss, tau=config.target_rate)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_rate)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the state of the policy's optimiser, because its weights have jumped."""
+        self.actor_optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.config.actor_rate)
+
+    @torch.no_grad()
+    def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
+        """|δ| of transitions under the critic and target critic as they are."""
+        return _critic_loss(self.loss, transitions.copy())[1]
+
+    def update(self, memory: LongTermMemory, episode_length: int) -> TensorDict:
+        """n_Q critic iterations, then n_A policy iterations.
+
+        Args:
+            memory: D_L; the TD errors of what is sampled are refreshed.
+            episode_length: n_t.
+
+        Returns:
+            Means over the iterations of ``critic_loss``, ``td_error``, ``value`` and both gradient norms.
+        """
+        size = min(self.config.batch_size, episode_length)
+        found = {key: [] for key in ("critic_loss", "td_error", "critic_gradient", "value", "actor_gradient")}
+        for _ in range(self.config.critic_iterations):
+            batch = memory.sample(size)
+            loss, td_error = _critic_loss(self.loss, batch)
+            self.critic_optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            norm = nn.utils.get_total_norm([w.grad for w in self.critic.parameters()])
+            self.critic_optimiser.step()
+            self.target.step()
+            memory.refresh(batch["index"], td_error)
+            for key, value in zip(found, (loss.detach(), td_error.mean(), norm), strict=False):
+                found[key].append(value)
+        for _ in range(self.config.actor_iterations):
+            loss = _actor_loss(self.loss, memory.sample(size))
+            self.actor_optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.gradient_limit)
+            self.actor_optimiser.step()
+            found["value"].append(-loss.detach())
+            found["actor_gradient"].append(norm)
+        return TensorDict({key: torch.stack(values).mean() for key, values in found.items() if values})
+
+
+def _critic_loss(loss: DDPGLoss, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """J_q and |δ| of each transition; TorchRL reports δ²."""
+    value, metadata = loss.loss_value(batch)
+    return value, metadata["td_error"].sqrt()
+
+
+def _actor_loss(loss: DDPGLoss, batch: TensorDictBase) -> Tensor:
+    """−E[q(e, π(e))], with the critic's weights detached."""
+    return loss.loss_actor(batch)[0]

@@ -1,0 +1,41 @@
+"""The digital twin: a plant's vector field and step under a learned closure."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plant import Plant
+from rt_torchrl.trajectory import Engine, Rollout, Trajectory
+
+
+class DigitalTwin:
+    """Flies virtual episodes of a plant whose true closure it does not know.
+
+    Args:
+        plant: shared with the real system in simulation; its own closure is never used here.
+        closure: the learned closure g(·; w_p).
+        engine: gradient engine, see :mod:`rt_torchrl.trajectory`.
+        compiled: compile the engine.
+    """
+
+    def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "parallel", compiled: bool = False):
+        self.plant, self.closure = plant, closure
+        self._engine, self._compiled = engine, compiled
+        self._replay = self._rollout(None)
+
+    def _rollout(self, policy: nn.Module | None) -> Rollout:
+        return Rollout(self.plant, self.closure, policy, engine=self._engine, compiled=self._compiled)
+
+    def replay(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        actions: Float[Tensor, "batch n n_a"],
+    ) -> Trajectory:
+        """Virtual episodes under recorded actions; see :meth:`Rollout.__call__` for shapes and errors."""
+        return self._replay(initial_state, exogenous, actions)
+
+    def control(
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+    ) -> Trajectory:
+        """Virtual episodes under a policy; see :meth:`Rollout.__call__` for shapes and errors."""
+        return self._rollout(policy)(initial_state, exogenous)
