@@ -5,6 +5,7 @@ on the real system. The other is idle, learns beside it and can take over.
 """
 
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,7 +17,7 @@ from torchrl.collectors import Collector
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess
+from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, ShortTermMemory
 from rt_torchrl.model_based import ModelBased, ModelBasedConfig
@@ -90,7 +91,7 @@ class ReinforcementTwinning:
         config: TwinningConfig,
         generator: torch.Generator,
     ):
-        self.twin, self.config, self.generator = twin, config, generator
+        self.env, self.twin, self.config, self.generator = env, twin, config, generator
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
         require_clonable(model_free, model_based)
         self.model_free = ModelFree(twin.plant, model_free, config.model_free, generator=generator)
@@ -98,6 +99,7 @@ class ReinforcementTwinning:
         self.model_based = ModelBased(twin, model_based, config.model_based)
         self.long_term = LongTermMemory(config.long_term, generator=generator)
         self.short_term = ShortTermMemory(config.records)
+        self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
         self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
         self.actor = LivePolicy(
             twin.plant, self.policies[self.switch.live], spread=config.exploration.spread, generator=generator
@@ -108,6 +110,7 @@ class ReinforcementTwinning:
             frames_per_batch=twin.plant.n_steps,
             total_frames=-1,
             reset_at_each_iter=True,
+            auto_register_policy_transforms=False,
         )
         self.episodes_done = 0
 
@@ -140,7 +143,8 @@ class ReinforcementTwinning:
         self.long_term.store(transitions, self.model_free.td_errors(transitions))
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
         self.short_term.append(Record(states, episode["exogenous"], episode["action"]))
-        return TensorDict({"real_cost": -episode["next", "reward"].mean(), "exploration": self.actor.strength})
+        reward = episode["next", "reward"].mean()
+        return TensorDict({"real_cost": -reward, "reward": reward, "exploration": self.actor.strength})
 
     def update_model_free(self) -> TensorDict:
         """Step 2: n_Q updates of the critic, then n_A of π_mf."""
@@ -148,23 +152,33 @@ class ReinforcementTwinning:
         return self.model_free.update(self.long_term, self.twin.plant.n_steps)
 
     def fit_exogenous(self) -> TensorDict:
-        """Step 3: a Gaussian process of the exogenous input for each record in D_S."""
-        plant, config = self.twin.plant, self.config.exogenous
-        self.processes = [
-            ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=config)
-            for record in self.short_term
-        ]
+        """Step 3: a Gaussian process of the exogenous input of this episode."""
+        plant, record = self.twin.plant, self.short_term[-1]
+        self.processes.append(
+            ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=self.config.exogenous)
+        )
         return TensorDict()
 
     def assimilate(self) -> TensorDict:
         """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
-        found = self.assimilation.update(self.short_term, self.processes, self.config.realisations, self.generator)
+        processes = list(self.processes)[-len(self.short_term) :]
+        found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
         return TensorDict({"J_p_before": found.start, "J_p": found.best, "closure_gradient": found.gradient})
 
     def plan(self) -> TensorDict:
-        """Step 5: n_mb gradient steps on J_a over virtual trajectories under π_mb, on the twin with w_p*."""
-        found = self.model_based.update(self.processes, self.config.realisations, self.generator)
+        """Step 5: n_mb gradient steps on J_a over N_z virtual trajectories under π_mb, on the twin with w_p*."""
+        found = self.model_based.update(*self.draw_virtual_episodes(self.config.realisations))
         return TensorDict({"J_a_plan_before": found.start, "J_a_plan": found.best, "policy_gradient": found.gradient})
+
+    def draw_virtual_episodes(self, count: int) -> tuple[Tensor, Tensor]:
+        """Random initial states, and exogenous inputs from the processes of the episodes so far.
+
+        Note: the paper plans from the initial state and with the disturbances of the last episode alone; here from
+        random ones and with those of all episodes (``experience``), because a policy that is optimal for one wind can
+        lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in one wind of twenty.
+        """
+        initial_state = self.twin.plant.draw_initial_state(count, self.generator)
+        return initial_state, sample_experience(self.processes, count, self.generator)
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
@@ -182,14 +196,9 @@ class ReinforcementTwinning:
 
     def virtual_costs(self) -> dict[Role, Tensor]:
         """Mean J_a of each policy over N virtual episodes with random initial states and disturbances."""
-        plant, n = self.twin.plant, self.config.virtual_episodes
-        initial_state = plant.draw_initial_state(n, self.generator)
-        share = [n // len(self.processes) + (k < n % len(self.processes)) for k in range(len(self.processes))]
-        exogenous = torch.cat(
-            [process.sample(count, self.generator) for process, count in zip(self.processes, share, strict=True)]
-        )
+        initial_state, exogenous = self.draw_virtual_episodes(self.config.virtual_episodes)
         flown = {role: self.twin.control(policy, initial_state, exogenous) for role, policy in self.policies.items()}
-        return {role: control_cost(plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+        return {role: control_cost(self.twin.plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
 
 
 def weight_vector(module: nn.Module) -> Tensor:

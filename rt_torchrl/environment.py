@@ -84,6 +84,13 @@ class PlantEnv(EnvBase):
         if seed is not None:
             self._generator.manual_seed(seed)
 
+    def state_dict(self, *args, **kwargs) -> dict:
+        """Everything the next reset depends on."""
+        return {"generator": self._generator.get_state()}
+
+    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+        self._generator.set_state(state["generator"])
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         batch = self.batch_size[0]
         state = self.plant.draw_initial_state(batch, self._generator)

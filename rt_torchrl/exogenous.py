@@ -92,6 +92,16 @@ class ExogenousProcess:
         return (self.mean + small).clamp(self._low, self._high)
 
 
+def sample_experience(
+    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
+) -> Float[Tensor, "{count} n n_z"]:
+    """Realisations drawn from the processes of several episodes: each episode once, at random, before any again."""
+    rounds = -(-count // len(processes))
+    order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
+    chosen = torch.cat(order)[:count].tolist()
+    return torch.cat([processes[k].sample(1, generator) for k in chosen])
+
+
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
     """d̃ at every sample, from a regression on block means; time is counted in knot spacings."""
     spread = values.std()

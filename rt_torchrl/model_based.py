@@ -1,13 +1,11 @@
 """Step 5: the model-based policy is planned on the twin."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.descent import Descended, Descent, DescentConfig
-from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
@@ -18,15 +16,19 @@ class ModelBasedConfig:
 
     Args:
         iterations: n_mb, gradients per episode.
+        experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         descent: how the policy's weights descend J_a.
     """
 
     iterations: int = 10
+    experience: int = 100
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self):
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
+        if self.experience < 1:
+            raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")
 
 
 class ModelBased:
@@ -46,24 +48,11 @@ class ModelBased:
         """Forget the state of the optimiser, because the policy's weights have jumped."""
         self.descent.restart()
 
-    def update(self, processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator) -> Descended:
-        """One episode's gradient steps.
-
-        Note: the paper starts all virtual trajectories in the initial state of the record; here they start in random
-        ones, because a policy planned from one start alone steps over cliffs that it does not see (a turbine that
-        stalls when it starts slower), and because step 6 judges it from random ones.
-
-        Args:
-            processes: the exogenous process of each record in D_S.
-            count: N_z, realisations of each.
-            generator: source of the realisations and the initial states.
-        """
-        exogenous = torch.cat([process.sample(count, generator) for process in processes])
-        initial_state = self.twin.plant.draw_initial_state(len(exogenous), generator)
+    def update(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> Descended:
+        """One episode's gradient steps over the given virtual episodes."""
 
         def cost() -> Tensor:
             flown = self.twin.control(self.policy, initial_state, exogenous)
             return control_cost(self.twin.plant, flown, exogenous).mean()
 
         return self.descent.run(cost, self.config.iterations)
-

@@ -71,6 +71,10 @@ class SaintDrenan(nn.Module):
         weights = torch.cat([self.fixed, self.scaled])
         return torch.cat([weights[:-1] * self.scale, 1.0 + 0.5 * weights[-1:].exp()])
 
+    def named_coefficients(self) -> dict[str, Tensor]:
+        """c1 ... c10 and x by name, in their own units."""
+        return dict(zip(NAMES, self.coefficients.unbind(), strict=True))
+
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
         """C_p [-] at tip-speed ratio λ [-] and pitch β [deg]."""
         lam, beta = features[..., 0], features[..., 1]

@@ -43,7 +43,7 @@ class WindTurbine(Plant):
     ====  =========================  ==============================================  =======  ======================
 
     Note: the paper prints J = 115 926 kg m²; here it is that of rotor and generator, because 115 926 is the hub alone,
-    with which the rotor would follow the wind within 44 ms. Pass ``inertia=HUB_INERTIA`` and a step below 0.12 s to see.
+    with which the rotor would follow the wind within 44 ms. ``inertia=HUB_INERTIA`` with a step below 0.12 s shows it.
     Note: the paper prints τ_a with C_p/ω_r; here with C_p/λ, the same where both exist, because a braked rotor reaches
     λ = 0. Note: the paper lets the pitch reach 90 deg; here 30 deg, because the closure is valid up to there.
 

@@ -1,0 +1,69 @@
+"""Reinforcement twinning of the NREL 5-MW wind turbine (paper, sections 5.1 and 6.2)."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import nn
+
+from rt_torchrl.algorithm import TwinningConfig
+from rt_torchrl.descent import DescentConfig
+from rt_torchrl.envs.wind_turbine import figures
+from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.turbsim import read_wind
+from rt_torchrl.model_based import ModelBasedConfig
+from rt_torchrl.policies import SaturatedAffine, SaturatedMLP
+from rt_torchrl.runner import Run, RunConfig, main_of
+
+PAPER = TwinningConfig(
+    # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.
+    model_based=ModelBasedConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunConfig):
+    """Train twin and controllers on the wind turbine.
+
+    Args:
+        policy: paper (affine in e1 and e2, no bias, 4 weights), bias (the same with bias, 6) or mlp.
+        hidden: widths of the hidden layers of an mlp policy.
+        dt: control interval [s]; 0.5 or 0.25.
+        horizon: length of an episode T_o [s].
+        mean_wind: mean wind speed U [m/s].
+        turbulence: turbulence intensity σ/U [-].
+        wind_files: TurbSim files (.hh or .bts) to draw the wind from instead.
+    """
+
+    policy: Literal["paper", "bias", "mlp"] = "paper"
+    hidden: tuple[int, ...] = (32, 32)
+    dt: float = 0.5
+    horizon: float = 600.0
+    mean_wind: float = 11.0
+    turbulence: float = 0.16
+    wind_files: tuple[Path, ...] = ()
+    twinning: TwinningConfig = field(default_factory=lambda: PAPER)
+
+    def plant(self) -> WindTurbine:
+        wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
+        if self.wind_files:
+            wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
+        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind)
+
+    def make_policy(self, generator: torch.Generator) -> nn.Module:
+        plant = WindTurbine
+        if self.policy == "mlp":
+            return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
+        return SaturatedAffine(
+            len(plant.observations), plant.actions, bias=self.policy == "bias", weight_scale=0.5, generator=generator
+        )
+
+
+def main(config: Config) -> None:
+    Run(config, config.plant(), make_policy=config.make_policy, plant_figures=figures.figures_of).train()
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,64 @@
+"""TensorBoard: one scalar per quantity and episode, and the figures."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+
+TAGS = {
+    "real_cost": "cost/real episode (live policy)",
+    "J_a_model_based": "cost/J_a model-based (twin)",
+    "J_a_model_free": "cost/J_a model-free (twin)",
+    "J_a_plan_before": "cost/J_a before planning (twin)",
+    "J_a_plan": "cost/J_a after planning (twin)",
+    "J_p_before": "twin/J_p before assimilation",
+    "J_p": "twin/J_p after assimilation",
+    "closure_gradient": "gradient norm/closure (J_p)",
+    "policy_gradient": "gradient norm/model-based policy (J_a)",
+    "actor_gradient": "gradient norm/model-free policy",
+    "critic_gradient": "gradient norm/critic",
+    "reward": "model-free/mean reward",
+    "td_error": "model-free/mean absolute TD error",
+    "critic_loss": "model-free/critic loss",
+    "value": "model-free/mean value of the policy",
+    "exploration": "model-free/exploration strength",
+    "weight_change": "switch/relative weight change of the idle policy",
+}
+"""Tag of each entry of an episode's record; entries without one are not scalars."""
+
+
+class Dashboard:
+    """Writes TensorBoard events.
+
+    Args:
+        folder: where the event file goes.
+    """
+
+    def __init__(self, folder: Path):
+        self._writer = SummaryWriter(str(folder))
+
+    def episode(self, record: Mapping[str, Any]) -> None:
+        """The scalars of one episode, from its record in ``metrics.json``."""
+        step = record["episode"]
+        for key, tag in TAGS.items():
+            if key in record:
+                self._writer.add_scalar(tag, record[key], step)
+        self._writer.add_scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
+        for event in ("swap", "clone"):
+            self._writer.add_scalar(f"switch/{event}", float(record.get("event") == event), step)
+        for name, seconds in record["seconds"].items():
+            self._writer.add_scalar(f"seconds/{name}", seconds, step)
+
+    def figures(self, figures: Mapping[str, Figure], step: int) -> None:
+        """Figures as they are after an episode."""
+        for name, figure in figures.items():
+            self._writer.add_figure(name, figure, step, close=False)
+
+    def scalar(self, tag: str, value: float) -> None:
+        """A figure of the run as a whole."""
+        self._writer.add_scalar(tag, value, 0)
+
+    def close(self) -> None:
+        self._writer.close()

@@ -1,0 +1,115 @@
+"""How good twin and policies are on episodes they were never trained on."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.stats import bootstrap
+from torch import Tensor, nn
+
+from rt_torchrl.descent import Descent, DescentConfig
+from rt_torchrl.plant import Plant
+from rt_torchrl.trajectory import Rollout, Trajectory, control_cost, identification_cost
+
+UNSEEN_SEED = 1_000_000
+"""Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
+
+
+class UnseenEpisodes:
+    """Real episodes with initial states and disturbances that no training has drawn.
+
+    Args:
+        plant: the real system.
+        count: number of episodes, at least 2.
+        compiled: compile the rollouts.
+        device: where they run.
+        seed: of their draws.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        count: int = 20,
+        *,
+        compiled: bool = False,
+        device: torch.device | str = "cpu",
+        seed: int = UNSEEN_SEED,
+    ):
+        if count < 2:
+            raise ValueError(f"count={count} of unseen episodes must be at least 2 for a confidence interval.")
+        generator = torch.Generator(device=device).manual_seed(seed)
+        self.plant, self._compiled = plant, compiled
+        self.initial_state = plant.draw_initial_state(count, generator)
+        self.exogenous = plant.draw_exogenous(count, generator)
+
+    @torch.no_grad()
+    def fly(self, policy: nn.Module) -> Trajectory:
+        """The episodes under a policy, on the real system."""
+        rollout = Rollout(self.plant, self.plant.closure, policy, compiled=self._compiled)
+        return rollout(self.initial_state, self.exogenous)
+
+    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+        """J_a of each episode."""
+        return control_cost(self.plant, self.fly(policy), self.exogenous)
+
+    @torch.no_grad()
+    def identification_costs(self, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
+        """J_p of each episode: a twin with this closure replays what was flown, under the true disturbances."""
+        rollout = Rollout(self.plant, closure, compiled=self._compiled)
+        replayed = rollout(self.initial_state, self.exogenous, flown.actions)
+        return identification_cost(self.plant, replayed, flown.states)
+
+
+class Optimum(NamedTuple):
+    """Best mean J_a found, the policy that has it, and the cost reached from every start."""
+
+    cost: float
+    policy: nn.Module
+    costs: list[float]
+
+
+def exact_optimum(
+    unseen: UnseenEpisodes,
+    make_policy: Callable[[torch.Generator], nn.Module],
+    *,
+    starts: int = 3,
+    iterations: int = 80,
+    seed: int = UNSEEN_SEED,
+) -> Optimum:
+    """The best a class of policies can do: exact gradients on the *true* plant, on the episodes it is judged on.
+
+    Args:
+        unseen: the episodes.
+        make_policy: draws a policy of the class.
+        starts: number of initial weights.
+        iterations: gradients from each.
+        seed: of the initial weights.
+    """
+    generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
+    found: list[tuple[float, nn.Module]] = []
+    for _ in range(starts):
+        policy = make_policy(generator).to(unseen.initial_state.device)
+        rollout = Rollout(unseen.plant, unseen.plant.closure, policy, compiled=unseen._compiled)
+
+        def cost(rollout: Rollout = rollout) -> Tensor:
+            flown = rollout(unseen.initial_state, unseen.exogenous)
+            return control_cost(unseen.plant, flown, unseen.exogenous).mean()
+
+        descended = Descent(policy, DescentConfig(optimiser="lbfgs", rate=1.0)).run(cost, iterations)
+        found.append((descended.best, policy))
+    best = min(found, key=lambda pair: pair[0])
+    return Optimum(*best, [value for value, _ in found])
+
+
+def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:
+    """Mean and percentile-bootstrap confidence interval (2000 resamples), as it is written into ``metrics.json``."""
+    numbers = values.detach().cpu().numpy().astype(np.float64)
+    mean = float(numbers.mean())
+    if np.ptp(numbers) == 0.0:
+        return {"mean": mean, "confidence_interval": [mean, mean]}
+    interval = bootstrap(
+        (numbers,), np.mean, n_resamples=2000, confidence_level=level, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    return {"mean": mean, "confidence_interval": [float(interval.low), float(interval.high)]}

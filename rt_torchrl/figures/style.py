@@ -1,0 +1,91 @@
+"""How every figure looks: colours with one meaning each, bare panels with their label on top, a time axis.
+
+The colours are those of Okabe and Ito (2008), which colour-blind readers can tell apart. Figures are made without
+pyplot: they need no backend or display, and are freed with their last reference.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from rt_torchrl.plant import Plant
+from rt_torchrl.signal import Signal
+from rt_torchrl.switching import Role
+
+REAL, TWIN, REFERENCE, LARGE_SCALE = "#222222", "#D55E00", "#009E73", "#D55E00"
+FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"
+ROLES: dict[Role, str] = {"model_based": "#0072B2", "model_free": "#E69F00"}
+SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#222222")
+
+LIMIT_LINE = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
+REFERENCE_LINE = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
+
+
+def panels(
+    rows: int, columns: int = 1, *, title: str, size: tuple[float, float], **layout
+) -> tuple[Figure, np.ndarray]:
+    """A titled figure of ``size`` inches at 100 dpi and its axes, ``rows`` by ``columns``; ``layout`` of subplots."""
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    figure.suptitle(title, fontsize=12)
+    axes = figure.subplots(rows, columns, squeeze=False, **layout)
+    for ax in axes.flat:
+        ax.grid(True, color="0.9", linewidth=0.6)
+        ax.set_axisbelow(True)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=9)
+    return figure, axes
+
+
+def caption(ax: Axes, label: str, note: str = "") -> None:
+    """What a panel shows, with its unit, above it on the left, where no height is too small for it; a note right."""
+    ax.set_title(label, loc="left", fontsize=9.5)
+    ax.set_title(note, loc="right", fontsize=9, color="0.35")
+
+
+def legend_above(ax: Axes) -> None:
+    """A legend above the panel on the right, clear of its curves."""
+    columns = len(ax.get_legend_handles_labels()[1])
+    ax.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns, fontsize=9, frameon=False, borderaxespad=0.1
+    )
+
+
+def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
+    """One legend for all panels, under them; a label that several share appears once."""
+    entries = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(
+        entries.values(), entries, loc="outside lower center", ncols=len(entries), fontsize=9.5, frameon=False
+    )
+
+
+def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
+    """The finite ends of a signal's range, in ``scale`` of its unit, dashed."""
+    for bound in filter(np.isfinite, (signal.low, signal.high)):
+        ax.axhline(bound * scale, label="limits", **LIMIT_LINE)
+
+
+def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
+    """Times of the samples in s, min or h, whichever is read best, and the axis label."""
+    horizon = plant.dt * samples
+    unit, length = ("s", 1.0) if horizon <= 1500.0 else ("min", 60.0) if horizon <= 10_800.0 else ("h", 3600.0)
+    return plant.dt / length * np.arange(samples), f"time [{unit}]"
+
+
+def with_unit(value: float, unit: str) -> str:
+    """A number to two digits with its unit, which is left out when there is none."""
+    return f"{value:.2g}" if unit == "-" else f"{value:.2g} {unit}"
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """A tensor as matplotlib reads it."""
+    return tensor.detach().cpu().numpy()
+
+
+def role_name(role: Role) -> str:
+    return role.replace("_", "-")

@@ -1,0 +1,137 @@
+"""The results of a run in numbers: the records of ``metrics.json``, the progress line and the table at the end."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.evaluation import Optimum, UnseenEpisodes, mean_with_confidence
+
+ROLES = ("model_based", "model_free")
+
+
+def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, Any]:
+    """One entry of ``episodes``: what :meth:`ReinforcementTwinning.episode` found, as plain numbers.
+
+    Args:
+        found: its return value.
+        episode: number of the episode, from 0.
+        live: role that acted on the real system in it.
+    """
+    record: dict[str, Any] = {"episode": episode, "live": live, "event": "keep"}
+    for key, value in found.items():
+        if key == "seconds":
+            record["seconds"] = {step: float(seconds) for step, seconds in value.items()}
+        else:
+            record[key] = value if isinstance(value, str) else float(value)
+    return record
+
+
+def progress(record: dict[str, Any]) -> str:
+    """The part of the progress line behind the bar."""
+    costs = [(name, record.get(key)) for name, key in (("J_p", "J_p"), ("J_a mb", "J_a_model_based"))]
+    costs += [("J_a mf", record.get("J_a_model_free")), ("real", record["real_cost"])]
+    shown = [f"{name} {value:.3g}" for name, value in costs if value is not None]
+    return ", ".join([*shown, f"live {record['live'].replace('_', '-')}"])
+
+
+@torch.no_grad()
+def summary(
+    algorithm: ReinforcementTwinning,
+    unseen: UnseenEpisodes,
+    initial_policy: nn.Module,
+    initial_closure: nn.Module,
+    episodes: list[dict[str, Any]],
+    optimum: Optimum | None,
+) -> dict[str, Any]:
+    """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
+
+    J_p before and after are of the same episodes, flown by the final live policy.
+    """
+    closure, live = algorithm.twin.closure, algorithm.policies[algorithm.switch.live]
+    before = unseen.control_costs(initial_policy)
+    after = {role: unseen.control_costs(algorithm.policies[role]) for role in ROLES}
+    flown = unseen.fly(live)
+    J_p = {name: unseen.identification_costs(c, flown) for name, c in (("before", initial_closure), ("after", closure))}
+    better = min(ROLES, key=lambda role: after[role].mean().item())
+    found = {
+        "J_p_ratio": (J_p["after"].mean() / J_p["before"].mean()).item(),
+        **{f"J_a_ratio_{role}": (after[role].mean() / before.mean()).item() for role in ROLES},
+        "unseen": {
+            "episodes": len(before),
+            "J_p": mean_with_confidence(J_p["after"]),
+            "J_p_before": mean_with_confidence(J_p["before"]),
+            **{f"J_a_{role}": mean_with_confidence(after[role]) for role in ROLES},
+            "J_a_before": mean_with_confidence(before),
+        },
+        "live": algorithm.switch.live,
+        "better": better,
+        "closure": {
+            "found": named_weights(closure),
+            "true": named_weights(unseen.plant.closure),
+            "start": named_weights(initial_closure),
+        },
+        "seconds": seconds_per_step(episodes),
+    }
+    if optimum is not None:
+        found["reference"] = {
+            "J_a": optimum.cost,
+            "J_a_of_each_start": optimum.costs,
+            "better_over_reference": after[better].mean().item() / optimum.cost,
+        }
+    return found
+
+
+def named_weights(closure: nn.Module) -> dict[str, Any] | None:
+    """Weights of a closure, in physical units where it has ``named_coefficients``; None if it has no weights."""
+    if hasattr(closure, "named_coefficients"):
+        return {name: float(value) for name, value in closure.named_coefficients().items()}
+    return {name: weight.tolist() for name, weight in closure.named_parameters()} or None
+
+
+def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
+    """Wall time of each step over all episodes [s]."""
+    total: dict[str, float] = {}
+    for record in episodes:
+        for step, seconds in record["seconds"].items():
+            total[step] = total.get(step, 0.0) + seconds
+    return total
+
+
+def table(metrics: dict[str, Any]) -> str:
+    """The results for the terminal."""
+    found = metrics["summary"]
+    unseen, n = found["unseen"], found["unseen"]["episodes"]
+    lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones"]
+    lines.append(f"  {'cost':<22}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
+    rows = [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
+    rows += [
+        (f"J_a {role.replace('_', '-')}", "J_a_before", f"J_a_{role}", found[f"J_a_ratio_{role}"]) for role in ROLES
+    ]
+    for name, before, after, ratio in rows:
+        low, high = unseen[after]["confidence_interval"]
+        interval = f"[{low:.4g}, {high:.4g}]"
+        lines.append(
+            f"  {name:<22}{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}   {interval:<24}{ratio:>10.3g}"
+        )
+    if "reference" in found:
+        best, share = found["reference"]["J_a"], found["reference"]["better_over_reference"]
+        lines.append(f"  exact gradients on the true plant: J_a {best:.5g}; the better policy is at {share:.3f} of it")
+    lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
+    lines += closure_lines(found["closure"])
+    lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
+    return "\n".join(lines)
+
+
+def closure_lines(closure: dict[str, Any]) -> list[str]:
+    """Weights found, beside the true ones where the real plant has the same closure."""
+    if not closure["found"] or not all(isinstance(value, float) for value in closure["found"].values()):
+        return []
+    true = closure["true"] or {}
+    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}{'true':>12}"]
+    for name, value in closure["found"].items():
+        known = f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"
+        lines.append(f"  {name:<22}{closure['start'][name]:>12.5g}{value:>12.5g}{known}")
+    return lines
