@@ -11,6 +11,7 @@ from rt_torchrl.algorithm import TwinningConfig
 from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.wind_turbine import figures
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.model_based import ModelBasedConfig
@@ -62,7 +63,14 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
-    Run(config, config.plant(), make_policy=config.make_policy, plant_figures=figures.figures_of).train()
+    plant = config.plant()
+    Run(
+        config,
+        plant,
+        make_policy=config.make_policy,
+        plant_figures=figures.figures_of,
+        baselines={"Jonkman": JonkmanController(plant).fly},
+    ).train()
 
 
 if __name__ == "__main__":

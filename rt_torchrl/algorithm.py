@@ -20,7 +20,7 @@ from rt_torchrl.environment import PlantEnv
 from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, ShortTermMemory
-from rt_torchrl.model_based import ModelBased, ModelBasedConfig
+from rt_torchrl.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
 from rt_torchrl.model_free import ModelFree, ModelFreeConfig
 from rt_torchrl.switching import PolicySwitch, Role, SwitchConfig
 from rt_torchrl.trajectory import control_cost
@@ -38,7 +38,7 @@ class TwinningConfig:
         arm: ``twinning``, or one of its halves alone: ``model_free`` makes steps 1 and 2, ``model_based`` 1 and 3 to 5.
         realisations: N_z, samples of the exogenous process per record in steps 4 and 5.
         records: n_S, real episodes that steps 3 to 5 look back on.
-        virtual_episodes: N, over which step 6 compares the policies.
+        virtual_episodes: N, over which step 5 judges a plan and step 6 compares the policies.
         exploration: step 1.
         long_term: the memory of step 2.
         model_free: step 2.
@@ -51,7 +51,7 @@ class TwinningConfig:
     arm: Arm = "twinning"
     realisations: int = 5
     records: int = 1
-    virtual_episodes: int = 10
+    virtual_episodes: int = 20
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     long_term: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
     model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
@@ -120,7 +120,7 @@ class ReinforcementTwinning:
         Returns:
             ``real_cost``, the reports of the steps that were made, and ``seconds`` of each step.
         """
-        arm, report, seconds = self.config.arm, TensorDict(), TensorDict()
+        arm, report, seconds = self.config.arm, findings(), {}
         steps = [self.interact]
         steps += [self.update_model_free] if arm != "model_based" else []
         steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
@@ -130,7 +130,7 @@ class ReinforcementTwinning:
             report.update(step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
-        return report.update({"seconds": seconds})
+        return report.update({"seconds": findings(**seconds)})
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
@@ -144,7 +144,7 @@ class ReinforcementTwinning:
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
         self.short_term.append(Record(states, episode["exogenous"], episode["action"]))
         reward = episode["next", "reward"].mean()
-        return TensorDict({"real_cost": -reward, "reward": reward, "exploration": self.actor.strength})
+        return findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
 
     def update_model_free(self) -> TensorDict:
         """Step 2: n_Q updates of the critic, then n_A of π_mf."""
@@ -157,20 +157,28 @@ class ReinforcementTwinning:
         self.processes.append(
             ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=self.config.exogenous)
         )
-        return TensorDict()
+        return findings()
 
     def assimilate(self) -> TensorDict:
         """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
         processes = list(self.processes)[-len(self.short_term) :]
         found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
-        return TensorDict({"J_p_before": found.start, "J_p": found.best, "closure_gradient": found.gradient})
+        return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient)
 
     def plan(self) -> TensorDict:
         """Step 5: n_mb gradient steps on J_a over N_z virtual trajectories under π_mb, on the twin with w_p*."""
-        found = self.model_based.update(*self.draw_virtual_episodes(self.config.realisations))
-        return TensorDict({"J_a_plan_before": found.start, "J_a_plan": found.best, "policy_gradient": found.gradient})
+        planned_on, judged_on = map(
+            self.draw_virtual_episodes, (self.config.realisations, self.config.virtual_episodes)
+        )
+        found, accepted = self.model_based.update(planned_on, judged_on)
+        return findings(
+            J_a_plan_before=found.start,
+            J_a_plan=found.best,
+            policy_gradient=found.gradient,
+            plan_accepted=float(accepted),
+        )
 
-    def draw_virtual_episodes(self, count: int) -> tuple[Tensor, Tensor]:
+    def draw_virtual_episodes(self, count: int) -> VirtualEpisodes:
         """Random initial states, and exogenous inputs from the processes of the episodes so far.
 
         Note: the paper plans from the initial state and with the disturbances of the last episode alone; here from
@@ -178,7 +186,7 @@ class ReinforcementTwinning:
         lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in one wind of twenty.
         """
         initial_state = self.twin.plant.draw_initial_state(count, self.generator)
-        return initial_state, sample_experience(self.processes, count, self.generator)
+        return VirtualEpisodes(initial_state, sample_experience(self.processes, count, self.generator))
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
@@ -191,14 +199,19 @@ class ReinforcementTwinning:
         if event == "clone":
             self.policies[idle].load_state_dict(self.policies[self.switch.live].state_dict())
             (self.model_free if idle == "model_free" else self.model_based).restart()
-        report = TensorDict({f"J_a_{role}": cost for role, cost in costs.items()})
-        return report.set("weight_change", change).set_non_tensor("event", event)
+        report = findings(**{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
+        return report.set_non_tensor("event", event)
 
     def virtual_costs(self) -> dict[Role, Tensor]:
         """Mean J_a of each policy over N virtual episodes with random initial states and disturbances."""
         initial_state, exogenous = self.draw_virtual_episodes(self.config.virtual_episodes)
         flown = {role: self.twin.control(policy, initial_state, exogenous) for role, policy in self.policies.items()}
         return {role: control_cost(self.twin.plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+
+
+def findings(**values: float | Tensor) -> TensorDict:
+    """Scalars in double precision."""
+    return TensorDict({key: torch.as_tensor(value, dtype=torch.float64).detach() for key, value in values.items()})
 
 
 def weight_vector(module: nn.Module) -> Tensor:

@@ -38,8 +38,7 @@ class Assimilation:
     r"""Minimises :math:`J_p = \mathbb E\int L_p(s, \check s)\,dt` over the closure's weights (paper, eq. J_p).
 
     The expectation is over the records in D_S and, for each, realisations of its exogenous process; all are driven by
-    the *stored* actions. The cost is divided by its value at the start of the episode, so that learning rates do not
-    depend on the plant's units.
+    the *stored* actions.
 
     Args:
         twin: its closure is updated in place, and holds the best weights seen, w_p*, afterwards.

@@ -46,7 +46,7 @@ def restore(algorithm: ReinforcementTwinning, state: dict[str, Any]) -> None:
             policy.load_state_dict(state["policies"][role])
         algorithm.twin.closure.load_state_dict(state["closure"])
         algorithm.model_free.loss.load_state_dict(state["loss"])
-    except RuntimeError as error:
+    except (RuntimeError, KeyError, ValueError) as error:  # of torch and of tensordict
         raise ValueError(
             f"the checkpoint's weights do not fit this training of {name!r}; start with the options it was started "
             f"with (see its config.json). {error}"

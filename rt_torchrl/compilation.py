@@ -52,3 +52,5 @@ def _prepare() -> None:
     # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
     torch._dynamo.config.recompile_limit = 256
     torch._dynamo.config.accumulated_recompile_limit = 4096
+    # The dt of a second plant would otherwise become a symbol, which a scan cannot capture.
+    torch._dynamo.config.specialize_float = True

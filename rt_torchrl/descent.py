@@ -15,6 +15,8 @@ Optimiser = Literal["adam", "lbfgs"]
 class DescentConfig:
     r"""How weights descend a cost that is deterministic within an episode.
 
+    The cost is divided by its value at the start of the episode, so that no parameter depends on a plant's units.
+
     Adam's second moment forgets within about ten steps (β₂ = 0.9), because the gradient of a policy that starts in
     saturation or stall is hundreds of times larger than later ones: with the usual 0.999 that first gradient keeps the
     steps near zero for the rest of a training of some hundred steps.
@@ -22,7 +24,7 @@ class DescentConfig:
     Args:
         optimiser: ``adam``, or ``lbfgs`` with a strong-Wolfe line search, every trial point counting as an iteration.
         rate: learning rate of Adam; first step length of L-BFGS.
-        gradient_limit: greatest norm of the gradient that Adam sees; L-BFGS has its line search instead.
+        gradient_limit: greatest norm of the (relative) gradient that Adam sees; L-BFGS has its line search instead.
         second_moment: β₂ of Adam.
     """
 
@@ -44,7 +46,7 @@ class DescentConfig:
 
 
 class Descended(NamedTuple):
-    """Cost at the start and at the best weights, norm of the first gradient, iterations made."""
+    """Cost at the start and at the best weights, norm of its first gradient (not relative), iterations made."""
 
     start: float
     best: float
@@ -123,15 +125,19 @@ class _Seen:
         with torch.enable_grad():
             self._module.zero_grad(set_to_none=True)
             cost = self._cost()
-            cost.backward()
+            if self.count == 0:
+                self.start = cost.item()
+            # A cost that starts at zero is at its minimum; its gradient is zero too.
+            relative = cost / (abs(self.start) or 1.0)
+            relative.backward()
         weights = [w for w in self._module.parameters() if w.grad is not None]
         limit = self._config.gradient_limit if self._config.optimiser == "adam" else float("inf")
         norm = nn.utils.clip_grad_norm_(weights, limit).item()
         if self.count == 0:
-            self.start, self.gradient = cost.item(), norm
+            self.gradient = norm * (abs(self.start) or 1.0)
         self._note(cost.item())
         self.count += 1
-        return cost
+        return relative
 
     def note_last(self) -> None:
         """Consider the weights of the last step too; the optimiser has not evaluated them."""

@@ -138,8 +138,9 @@ class PlantEnv(EnvBase):
         entries |= {"observation": observation, "state": self._state, "exogenous": exogenous}
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
-    def _time(self) -> Float[Tensor, "batch"]:
-        return self._step_count * self.plant.dt
+    def _time(self) -> Float[Tensor, " batch"]:
+        # An integer times a float would be single precision.
+        return self._step_count.double() * self.plant.dt
 
     def _now(self) -> Float[Tensor, "batch n_z"]:
         """The input of this interval; after the last one, still that of the last."""

@@ -54,12 +54,23 @@ class UnseenEpisodes:
         """J_a of each episode."""
         return control_cost(self.plant, self.fly(policy), self.exogenous)
 
+    def merit(self, flown: Trajectory) -> dict[str, dict[str, Any]]:
+        """The plant's own quantities of the episodes as flown: mean with confidence interval, and median."""
+        found = self.plant.merit(flown.states, flown.actions, self.exogenous)
+        return {
+            name: mean_with_confidence(values) | {"median": values.median().item()} for name, values in found.items()
+        }
+
     @torch.no_grad()
     def identification_costs(self, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
         """J_p of each episode: a twin with this closure replays what was flown, under the true disturbances."""
         rollout = Rollout(self.plant, closure, compiled=self._compiled)
         replayed = rollout(self.initial_state, self.exogenous, flown.actions)
         return identification_cost(self.plant, replayed, flown.states)
+
+
+Baseline = Callable[[Tensor, Tensor], Trajectory]
+"""A classical controller: flies real episodes from initial states and exogenous inputs."""
 
 
 class Optimum(NamedTuple):

@@ -5,23 +5,22 @@ from torch import Tensor, nn
 
 from rt_torchrl.evaluation import UnseenEpisodes
 from rt_torchrl.trajectory import Engine, Rollout, control_cost
-from rt_torchrl.twin import DigitalTwin
 
 STEPS = 40
 
 
-def engine_gap(twin: DigitalTwin, policy: nn.Module, unseen: UnseenEpisodes) -> float:
+def engine_gap(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes) -> float:
     """Relative gap ‖g_parallel − g_odeint_adjoint‖/‖g_odeint_adjoint‖ of dJ_a over closure and policy weights.
 
     Over a short horizon and two episodes, eager, so that it costs seconds and not minutes.
     """
-    fast, reference = (_gradient(twin, policy, unseen, engine) for engine in ("parallel", "odeint_adjoint"))
+    fast, reference = (_gradient(closure, policy, unseen, engine) for engine in ("parallel", "odeint_adjoint"))
     return ((fast - reference).norm() / reference.norm()).item()
 
 
-def _gradient(twin: DigitalTwin, policy: nn.Module, unseen: UnseenEpisodes, engine: Engine) -> Tensor:
+def _gradient(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes, engine: Engine) -> Tensor:
     initial_state, exogenous = unseen.initial_state[:2], unseen.exogenous[:2, :STEPS]
-    flown = Rollout(twin.plant, twin.closure, policy, engine=engine)(initial_state, exogenous)
-    weights = [*twin.closure.parameters(), *policy.parameters()]
-    gradient = torch.autograd.grad(control_cost(twin.plant, flown, exogenous).mean(), weights)
+    flown = Rollout(unseen.plant, closure, policy, engine=engine)(initial_state, exogenous)
+    weights = [*closure.parameters(), *policy.parameters()]
+    gradient = torch.autograd.grad(control_cost(unseen.plant, flown, exogenous).mean(), weights)
     return torch.cat([part.flatten() for part in gradient])

@@ -73,6 +73,7 @@ class LongTermMemory:
             sampler=self.sampler,
             writer=LeastPriorityWriter(self.sampler),
         )
+        self._generator = generator
         self._buffer.set_rng(generator)
 
     def __len__(self) -> int:
@@ -97,12 +98,14 @@ class LongTermMemory:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._buffer.load_state_dict(state)
+        # Loading gives the buffer a generator of its own; the shared one has its own place in a checkpoint.
+        self._buffer.set_rng(self._generator)
 
 
 class PriorityReader(PrioritizedSampler):
     """A prioritised sampler that tells the priorities it samples by."""
 
-    def priorities(self, count: int) -> Float[Tensor, "{count}"]:
+    def priorities(self, count: int) -> Float[Tensor, " {count}"]:
         """(|δ_i| + tol)^α* of the first ``count`` transitions."""
         return torch.as_tensor(self._sum_tree[torch.arange(count)])
 

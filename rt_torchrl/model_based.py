@@ -1,6 +1,8 @@
 """Step 5: the model-based policy is planned on the twin."""
 
+import copy
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -31,6 +33,20 @@ class ModelBasedConfig:
             raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")
 
 
+class VirtualEpisodes(NamedTuple):
+    """Initial states and exogenous inputs to fly on the twin."""
+
+    initial_state: Float[Tensor, "batch n_s"]
+    exogenous: Float[Tensor, "batch n n_z"]
+
+
+class Plan(NamedTuple):
+    """What the gradient steps found, and whether it was kept."""
+
+    descended: Descended
+    accepted: bool
+
+
 class ModelBased:
     r"""Minimises :math:`J_a = \mathbb E\frac1{T_o}\int L_a\,dt` over the weights of π_mb, on the twin (paper, eq. J_a).
 
@@ -48,11 +64,21 @@ class ModelBased:
         """Forget the state of the optimiser, because the policy's weights have jumped."""
         self.descent.restart()
 
-    def update(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> Descended:
-        """One episode's gradient steps over the given virtual episodes."""
+    def update(self, planned_on: VirtualEpisodes, judged_on: VirtualEpisodes) -> Plan:
+        """One episode's gradient steps; the new plan is kept only if it is better on episodes it was not made on.
 
-        def cost() -> Tensor:
-            flown = self.twin.control(self.policy, initial_state, exogenous)
-            return control_cost(self.twin.plant, flown, exogenous).mean()
+        Note: the paper keeps every plan; here a plan made on N_z winds is compared with the one before on N others,
+        because the best policy for a few winds can lie just beyond a cliff of another one.
+        """
+        before = copy.deepcopy(self.policy.state_dict())
+        incumbent = self._cost(judged_on)
+        descended = self.descent.run(lambda: self._cost(planned_on), self.config.iterations)
+        accepted = self._cost(judged_on).item() <= incumbent.item()
+        if not accepted:
+            self.policy.load_state_dict(before)
+            self.restart()
+        return Plan(descended, accepted)
 
-        return self.descent.run(cost, self.config.iterations)
+    def _cost(self, episodes: VirtualEpisodes) -> Tensor:
+        flown = self.twin.control(self.policy, episodes.initial_state, episodes.exogenous)
+        return control_cost(self.twin.plant, flown, episodes.exogenous).mean()

@@ -145,6 +145,15 @@ class Plant(nn.Module, ABC):
     ) -> Float[Tensor, "*batch"]:
         r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`."""
 
+    def merit(
+        self,
+        states: Float[Tensor, "batch samples n_s"],
+        applied: Float[Tensor, "batch n n_a"],
+        exogenous: Float[Tensor, "batch n n_z"],
+    ) -> dict[str, Float[Tensor, " batch"]]:
+        """Physical quantities an engineer judges whole episodes by, named with their unit; here none."""
+        return {}
+
     # Randomness, always from the generator that is passed in
 
     @abstractmethod
@@ -184,5 +193,6 @@ def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy
         raise ValueError(
             f"dt={dt} s makes plant {plant!r} unstable: {mode} decays at {rate:.4g} 1/s, so dt·rate = {dt * rate:.3g} "
             f"exceeds the limit {RK4_REAL_STABILITY} of an explicit fourth-order Runge-Kutta step. "
-            f"Use dt <= {RK4_REAL_STABILITY / rate:.3g} s, or {remedy}."
+            # The share keeps the rounded advice below the limit.
+            f"Use dt <= {0.995 * RK4_REAL_STABILITY / rate:.3g} s, or {remedy}."
         )

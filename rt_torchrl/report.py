@@ -7,7 +7,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation import Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.evaluation import Baseline, Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.trajectory import control_cost
 
 ROLES = ("model_based", "model_free")
 
@@ -21,7 +22,8 @@ def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, A
         live: role that acted on the real system in it.
     """
     record: dict[str, Any] = {"episode": episode, "live": live, "event": "keep"}
-    for key, value in found.items():
+    for key in found.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
+        value = found[key]
         if key == "seconds":
             record["seconds"] = {step: float(seconds) for step, seconds in value.items()}
         else:
@@ -45,6 +47,7 @@ def summary(
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
     optimum: Optimum | None,
+    baselines: dict[str, Baseline],
 ) -> dict[str, Any]:
     """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
 
@@ -65,6 +68,8 @@ def summary(
             "J_p_before": mean_with_confidence(J_p["before"]),
             **{f"J_a_{role}": mean_with_confidence(after[role]) for role in ROLES},
             "J_a_before": mean_with_confidence(before),
+            "merit": {role: unseen.merit(unseen.fly(algorithm.policies[role])) for role in ROLES},
+            "baselines": {name: judged(unseen, fly) for name, fly in baselines.items()},
         },
         "live": algorithm.switch.live,
         "better": better,
@@ -82,6 +87,13 @@ def summary(
             "better_over_reference": after[better].mean().item() / optimum.cost,
         }
     return found
+
+
+def judged(unseen: UnseenEpisodes, fly: Baseline) -> dict[str, Any]:
+    """J_a and the plant's own quantities of a classical controller on the unseen episodes."""
+    flown = fly(unseen.initial_state, unseen.exogenous)
+    costs = control_cost(unseen.plant, flown, unseen.exogenous)
+    return {"J_a": mean_with_confidence(costs), "merit": unseen.merit(flown)}
 
 
 def named_weights(closure: nn.Module) -> dict[str, Any] | None:
@@ -111,18 +123,36 @@ def table(metrics: dict[str, Any]) -> str:
         (f"J_a {role.replace('_', '-')}", "J_a_before", f"J_a_{role}", found[f"J_a_ratio_{role}"]) for role in ROLES
     ]
     for name, before, after, ratio in rows:
-        low, high = unseen[after]["confidence_interval"]
-        interval = f"[{low:.4g}, {high:.4g}]"
-        lines.append(
-            f"  {name:<22}{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}   {interval:<24}{ratio:>10.3g}"
-        )
+        means = f"{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}"
+        lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{ratio:>10.3g}")
     if "reference" in found:
         best, share = found["reference"]["J_a"], found["reference"]["better_over_reference"]
         lines.append(f"  exact gradients on the true plant: J_a {best:.5g}; the better policy is at {share:.3f} of it")
+    for name, baseline in unseen["baselines"].items():
+        lines.append(f"  {f'J_a {name}':<22}{'':>12}{baseline['J_a']['mean']:>12.5g}   {_interval(baseline['J_a'])}")
+    lines += merit_lines(unseen)
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += closure_lines(found["closure"])
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
+
+
+def _interval(found: dict[str, Any]) -> str:
+    return "[{:.4g}, {:.4g}]".format(*found["confidence_interval"])
+
+
+def merit_lines(unseen: dict[str, Any]) -> list[str]:
+    """The plant's own quantities, mean and median, of both policies and the classical controllers."""
+    columns = {role.replace("_", "-"): unseen["merit"][role] for role in ROLES}
+    columns |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
+    if not columns["model-based"]:
+        return []
+    lines = [f"  {'mean (median)':<28}" + "".join(f"{name:>20}" for name in columns)]
+    for name in columns["model-based"]:
+        found = [merit[name] for merit in columns.values()]
+        values = (f"{value['mean']:.4g} ({value['median']:.4g})" for value in found)
+        lines.append(f"  {name:<28}" + "".join(f"{value:>20}" for value in values))
+    return lines
 
 
 def closure_lines(closure: dict[str, Any]) -> list[str]:

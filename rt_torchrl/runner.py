@@ -22,7 +22,7 @@ from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.dashboard import Dashboard
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.evaluation import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation import Baseline, UnseenEpisodes, exact_optimum
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
 from rt_torchrl.snapshot import Snapshot
@@ -101,6 +101,8 @@ class Run:
         plant: the real system in simulation, and the twin's physics.
         make_policy: draws the initial weights of both policies; by default the plant's own policy.
         plant_figures: figures only this plant has.
+        baselines: classical controllers to judge beside the policies, by name.
+        animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
         ValueError: before any work, if the device does not exist, the run folder cannot be written or is taken, or the
@@ -114,14 +116,14 @@ class Run:
         *,
         make_policy: Callable[[torch.Generator], nn.Module] | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
+        baselines: dict[str, Baseline] | None = None,
+        animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
-        self.asked, self.config, self.plant_figures = config, config.effective(), plant_figures
+        self.asked, self.config = config, config.effective()
+        self.plant_figures, self.baselines, self.animate = plant_figures, baselines or {}, animate
         device = require_device(config.device)
-        if config.compiled and device.type == "cpu" and (missing := missing_for_compilation()):
-            raise ValueError(
-                f"compiled=True needs {missing}, which this machine lacks; install it or use --no-compiled."
-            )
+        compiled = can_compile(device) if config.compiled is None else config.compiled
         if config.threads:
             torch.set_num_threads(config.threads)
         logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -154,7 +156,7 @@ class Run:
         settings = dataclasses.asdict(self.asked) | {"plant": self.algorithm.twin.plant.name}
         (self.folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
         dashboard = Dashboard(self.folder)
-        gap = engine_gap(self.algorithm.twin, self.initial_policy, self.unseen)
+        gap = engine_gap(self.initial_closure, self.initial_policy, self.unseen)
         dashboard.scalar("gradient/relative gap of parallel to odeint_adjoint, short horizon", gap)
         with tqdm(total=self.config.episodes, initial=len(self.episodes), unit="episode", dynamic_ncols=True) as bar:
             try:
@@ -182,7 +184,7 @@ class Run:
         dashboard.episode(record)
         every = self.config.figures_every
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
-            dashboard.figures(self._figures(), len(self.episodes))
+            dashboard.figures(self._figures(self._snapshot()), len(self.episodes) - 1)
 
     def _drop_half_an_episode(self) -> None:
         """After an interrupt, go back to the end of the last whole episode."""
@@ -192,7 +194,13 @@ class Run:
     def _results(self, gap: float) -> dict[str, Any]:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
         summary = report.summary(
-            self.algorithm, self.unseen, self.initial_policy, self.initial_closure, self.episodes, optimum
+            self.algorithm,
+            self.unseen,
+            self.initial_policy,
+            self.initial_closure,
+            self.episodes,
+            optimum,
+            self.baselines,
         )
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
@@ -202,16 +210,21 @@ class Run:
         torch.save(weights | {"closure": self.algorithm.twin.closure.state_dict()}, self.folder / "weights.pt")
         return metrics
 
-    def _figures(self) -> dict[str, Figure]:
-        snapshot = Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
+    def _snapshot(self) -> Snapshot:
+        return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
+
+    def _figures(self, snapshot: Snapshot) -> dict[str, Figure]:
         return figures.figures_of(snapshot) | self.plant_figures(snapshot)
 
     def _draw(self, dashboard: Dashboard) -> None:
-        drawn = self._figures()
+        snapshot = self._snapshot()
+        drawn = self._figures(snapshot)
         (self.folder / "figures").mkdir(exist_ok=True)
         for name, figure in drawn.items():
             figure.savefig(self.folder / "figures" / f"{name}.png", dpi=120)
-        dashboard.figures(drawn, len(self.episodes))
+        dashboard.figures(drawn, len(self.episodes) - 1)
+        if self.animate:
+            self.animate(snapshot, self.folder / "figures" / "animation.gif")
 
 
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:

@@ -36,7 +36,7 @@ class Snapshot:
     policies: dict[Role, nn.Module]
     live: Role
     record: Record
-    replay: Float[Tensor, "n+1 n_s"]
+    replay: Float[Tensor, "samples n_s"]
     large_scale: Float[Tensor, "n n_z"] | None
     realisations: Float[Tensor, "k n n_z"] | None
     episodes: list[dict[str, Any]]

@@ -90,6 +90,8 @@ class Rollout:
         t = start + self.plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
         commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()
         drive = Drive(t, exogenous.transpose(0, 1).contiguous(), commands)
+        for tensor, dimension in ((initial_state, 0), (drive.exogenous, 1), (drive.command, 1)):
+            torch._dynamo.maybe_mark_dynamic(tensor, dimension)  # one compiled graph for all batch sizes
         ends = self._engine.end_states(self.interval, initial_state.contiguous(), drive)
         self._require_finite(ends, start)
         states = torch.cat([initial_state.unsqueeze(0), ends])
@@ -149,7 +151,7 @@ def require_double(role: str, module: nn.Module | None) -> None:
 
 def control_cost(
     plant: Plant, trajectory: Trajectory, exogenous: Float[Tensor, "batch n n_z"], *, start: float = 0.0
-) -> Float[Tensor, "batch"]:
+) -> Float[Tensor, " batch"]:
     r"""J_a of each realisation, :math:`\frac1{T_o}\int L_a\,dt` as the mean of the samples t_0 ... t_{n−1}."""
     n = exogenous.shape[1]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device)
@@ -157,7 +159,7 @@ def control_cost(
 
 
 def identification_cost(
-    plant: Plant, trajectory: Trajectory, measured: Float[Tensor, "batch n+1 n_s"]
-) -> Float[Tensor, "batch"]:
+    plant: Plant, trajectory: Trajectory, measured: Float[Tensor, "batch samples n_s"]
+) -> Float[Tensor, " batch"]:
     r"""J_p of each realisation, :math:`\int L_p(s, \check s)\,dt` over the samples t_1 ... t_n."""
     return plant.dt * plant.discrepancy(trajectory.states[:, 1:], measured[:, 1:]).sum(-1)

@@ -4,21 +4,24 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from torch import Tensor, nn
 
 from rt_torchrl.figures.style import (
+    CLOSURE_LINES,
     FILTERED,
     LIMITS,
     REAL,
     REFERENCE_LINE,
-    SERIES,
     TWIN,
     array,
     caption,
+    closures,
+    last_episode,
     legend_above,
+    legend_below,
     limits,
     panels,
     time_axis,
@@ -27,7 +30,9 @@ from rt_torchrl.snapshot import Snapshot
 
 PITCHES = (0.0, 5.0, 10.0, 15.0)
 """Pitch angles at which C_p is drawn [deg]."""
-CURVES = {"true": "-", "twin": (0, (5, 2)), "initial twin": (0, (1, 1.5))}
+PITCH_COLOURS = colormaps["viridis"]([0.0, 0.35, 0.65, 0.9])
+LEAST_SHOWN = -0.25
+"""C_p below which operating points are only counted: an overspeeding rotor brakes with up to some -1."""
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -45,7 +50,7 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     state = record.states[:-1]
     time, label = time_axis(plant, len(state))
     omega_g = plant.gear_ratio * state[:, 0]
-    figure, axes = panels(5, title=f"Power and speed, episode {len(snapshot.episodes)}", size=(8.5, 9.5), sharex=True)
+    figure, axes = panels(5, title=f"Power and speed, episode {last_episode(snapshot)}", size=(8.5, 9.5), sharex=True)
     wind, speed, power, torque, pitch = axes.flat
 
     def draw(ax: Axes, values: Tensor, label: str, **style) -> None:
@@ -73,31 +78,29 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
         caption(ax, name)
         legend_above(ax)
     pitch.set_xlabel(label)
-    pitch.set_xlim(time[0], time[-1])
+    pitch.set_xlim(0.0, time[-1] + time[1])
     return figure
 
 
 def power_coefficient(snapshot: Snapshot) -> Figure:
     """C_p over λ at four pitch angles, and in the last episode over the wind speed (paper, fig. 14b).
 
-    Left: the true table, the learned law and the law that the training started from. Each tick at the bottom is a λ
+    Left: the true table, the learned law and the law that the training started from. Each tick at the top is a λ
     of the episode, in the colour of the pitch angle within 2.5 deg of its own: a twin can only know what was visited.
     """
     visited = _Visited.of(snapshot)
-    rms = {name: np.sqrt(np.mean((visited.C_p[name] - visited.C_p["true"]) ** 2)) for name in ("twin", "initial twin")}
+    true, learned, initial = visited.C_p.values()
+    rms, rms_initial = (np.sqrt(np.mean((C_p - true) ** 2)) for C_p in (learned, initial))
     figure, ((left, right),) = panels(
         1,
         2,
-        title=f"Power coefficient: RMS error at the visited points {rms['twin']:.2g}, at first {rms['initial twin']:.2g}",
+        title=f"Power coefficient, RMS error where visited: {rms:.2g}, initial twin {rms_initial:.2g}",
         size=(11.0, 4.8),
         width_ratios=(1.25, 1.0),
     )
     _draw_curves(left, snapshot, visited)
-    right.plot(visited.wind, visited.C_p["true"], "o", color=REAL, markersize=4, alpha=0.5, label="true")
-    right.plot(visited.wind, visited.C_p["twin"], ".", color=TWIN, markersize=3, alpha=0.8, label="twin")
-    caption(right, "$C_p$ [-] in the last episode")
-    legend_above(right)
-    right.set_xlabel("wind speed $u$ [m/s]")
+    _draw_over_wind(right, visited)
+    legend_below(figure, [left])
     return figure
 
 
@@ -130,13 +133,8 @@ class _Visited(NamedTuple):
         record = snapshot.record
         wind, beta = record.exogenous[:, 0], record.actions[:, 1]
         lam = record.states[:-1, 0] * snapshot.plant.radius / wind
-        C_p = {name: _evaluate(closure, lam, beta) for name, closure in _closures(snapshot).items()}
+        C_p = {name: _evaluate(closure, lam, beta) for name, closure in closures(snapshot).items()}
         return cls(array(lam), array(beta), array(wind), C_p)
-
-
-def _closures(snapshot: Snapshot) -> dict[str, nn.Module]:
-    closures = (snapshot.plant.closure, snapshot.closure, snapshot.initial_closure)
-    return dict(zip(CURVES, closures, strict=True))
 
 
 @torch.no_grad()
@@ -147,17 +145,29 @@ def _evaluate(closure: nn.Module, lam: Tensor, beta: Tensor) -> np.ndarray:
 def _draw_curves(ax: Axes, snapshot: Snapshot, visited: _Visited) -> None:
     lam = torch.linspace(2.0, max(13.0, visited.lam.max()), 200, dtype=torch.float64)
     lam = lam.to(snapshot.record.states.device)
-    for k, (pitch, colour) in enumerate(zip(PITCHES, SERIES, strict=False)):
-        for (name, style), closure in zip(CURVES.items(), _closures(snapshot).values(), strict=True):
+    for k, (pitch, colour) in enumerate(zip(PITCHES, PITCH_COLOURS, strict=True)):
+        for (name, style), closure in zip(CLOSURE_LINES.items(), closures(snapshot).values(), strict=True):
             values = _evaluate(closure, lam, torch.full_like(lam, pitch))
-            ax.plot(array(lam), values, color=colour, linestyle=style, linewidth=1.6, label=f"{name}, {pitch:g} deg")
+            ax.plot(array(lam), values, color=colour, linestyle=style, linewidth=1.6, gid=f"{name}, {pitch:g} deg")
         near = visited.lam[np.abs(visited.beta - pitch) <= 2.5]
-        ax.plot(near, np.full_like(near, -0.025 - 0.02 * k), "|", color=colour, markersize=6, alpha=0.6)
-    ax.axhline(0.0, color="0.8", linewidth=0.8, zorder=0)
-    ax.set_ylim(-0.11, 0.55)
+        ax.plot(near, np.full_like(near, 0.585 - 0.02 * k), "|", color=colour, markersize=6, alpha=0.6)
+        ax.plot([], [], color=colour, label=rf"$\beta$ = {pitch:g} deg")
+    for name, style in CLOSURE_LINES.items():
+        ax.plot([], [], color=REAL, linestyle=style, label=name)
+    ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=0)
+    ax.set_ylim(-0.1, 0.6)
     ax.set_xlim(lam[0].item(), lam[-1].item())
-    caption(ax, "$C_p$ [-], visited at the bottom")
+    caption(ax, "$C_p$ [-] at four pitch angles", r"ticks: visited $\lambda$, $\beta$ within 2.5 deg")
     ax.set_xlabel(r"tip-speed ratio $\lambda$ [-]")
-    pitches = [Line2D([], [], color=SERIES[k], label=rf"$\beta$ = {pitch:g} deg") for k, pitch in enumerate(PITCHES)]
-    kinds = [Line2D([], [], color=REAL, linestyle=style, label=name) for name, style in CURVES.items()]
-    ax.legend(handles=pitches + kinds, loc="upper right", fontsize=8.5, frameon=True, framealpha=0.9)
+
+
+def _draw_over_wind(ax: Axes, visited: _Visited) -> None:
+    ax.plot(visited.wind, visited.C_p["true"], "o", color=REAL, markersize=4, alpha=0.5, label="true")
+    ax.plot(visited.wind, visited.C_p["twin"], ".", color=TWIN, markersize=3, alpha=0.8, label="twin")
+    hidden = (visited.C_p["true"] < LEAST_SHOWN).mean()
+    least = min(visited.C_p["true"].min(), visited.C_p["twin"].min()) - 0.03
+    ax.set_ylim(bottom=max(least, LEAST_SHOWN))
+    caption(ax, "$C_p$ [-] in the last episode")
+    legend_above(ax)
+    note = f" ({hidden:.0%} of the true points lie below)" if hidden else ""
+    ax.set_xlabel(f"wind speed $u$ [m/s]{note}")

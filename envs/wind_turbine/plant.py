@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
+from rt_torchrl.envs.wind_turbine.merit import merit
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
 from rt_torchrl.plant import Plant, require_stable_step
@@ -127,15 +128,8 @@ class WindTurbine(Plant):
 
     def _optimal_gain(self) -> float:
         r"""K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared)."""
-        area = math.pi * self.radius**2
-        return (
-            0.5
-            * self.air_density
-            * area
-            * self.radius**3
-            * self.best_power_coefficient
-            / (self.best_tip_speed_ratio * self.gear_ratio) ** 3
-        )
+        power = 0.5 * self.air_density * math.pi * self.radius**5 * self.best_power_coefficient
+        return power / (self.best_tip_speed_ratio * self.gear_ratio) ** 3
 
     def time_constant(self, wind_speed: float, pitch: float = 0.0) -> float:
         r"""−1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and a pitch [deg]."""
@@ -265,6 +259,9 @@ class WindTurbine(Plant):
     ) -> Float[Tensor, "*batch"]:
         """½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
         return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
+
+    def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
+        return merit(self, states, applied, exogenous)
 
     # Randomness
 

@@ -167,8 +167,8 @@ def csv_rows(path: str | Path) -> list[list[str]]:
 
 
 def _spline_cells(
-    knots: Float[np.ndarray, " n"], values: Float[np.ndarray, "n *rest"]
-) -> Float[np.ndarray, "cells 4 *rest"]:
+    knots: Float[np.ndarray, " n"], values: Float[np.ndarray, "n ..."]
+) -> Float[np.ndarray, "cells 4 ..."]:
     """Coefficients, lowest power first, of the n − 1 cells of a not-a-knot spline and of a linear cell on either side.
 
     Each cell's origin is its left knot; the cell to the left of all knots takes the first knot.

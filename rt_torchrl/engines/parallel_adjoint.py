@@ -103,6 +103,7 @@ def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
         costate = ((transition * costate.unsqueeze(-1)).sum(-2) + source).contiguous()
         return costate, costate.clone()
 
-    last = cost_gradient[-1].contiguous()
+    # A slice with a batch of one counts as contiguous whatever its strides are; a copy has the ones scan wants.
+    last = cost_gradient[-1].clone(memory_format=torch.contiguous_format)
     earlier = scan(body, last, (jacobians.flip(0), cost_gradient[:-1].flip(0)))[1]
     return torch.cat([earlier.flip(0), last.unsqueeze(0)])

@@ -24,4 +24,6 @@ def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Te
         state = interval(state, Drive(*x)).contiguous()
         return state, state.clone()
 
-    return scan(body, initial_state, tuple(drive))[1]
+    # A slice with a batch of one counts as contiguous whatever its strides are; a copy has the ones scan wants.
+    start = initial_state.clone(memory_format=torch.contiguous_format)
+    return scan(body, start, tuple(drive))[1]

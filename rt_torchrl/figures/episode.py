@@ -11,12 +11,13 @@ from rt_torchrl.figures.style import (
     TWIN,
     array,
     caption,
-    legend_above,
+    last_episode,
     legend_below,
     limits,
     panels,
     role_name,
     time_axis,
+    twin_label,
     with_unit,
 )
 from rt_torchrl.snapshot import Snapshot
@@ -32,14 +33,13 @@ def states(snapshot: Snapshot) -> Figure:
     figure, axes = panels(
         rows,
         columns,
-        title=f"Real and twin states, {_episode_name(snapshot)}",
-        size=(6.0 + 4.0 * (columns - 1), 1.0 + 1.9 * rows),
+        title=f"Real and twin states, episode {last_episode(snapshot)}",
+        size=(7.5 + 3.5 * (columns - 1), 1.0 + 1.9 * rows),
         sharex=True,
     )
-    twin_label = "twin" if snapshot.large_scale is not None else "twin, not trained in this arm"
     for k, (ax, signal) in enumerate(zip(axes.flat, signals, strict=False)):
-        ax.plot(time, real[:, k], color=REAL, linewidth=2.4, label="real")
-        ax.plot(time, twin[:, k], color=TWIN, linewidth=1.1, label=twin_label)
+        ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label="real")
+        ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=twin_label(snapshot))
         rms = np.sqrt(np.mean((twin[:, k] - real[:, k]) ** 2))
         rms = rms if rms > 1e-10 * np.abs(real[:, k]).max() else 0.0
         caption(ax, signal.label, f"RMS {with_unit(rms, signal.unit)}")
@@ -61,17 +61,17 @@ def actions(snapshot: Snapshot) -> Figure:
     actor = _actor(snapshot)
     figure, axes = panels(
         len(signals),
-        title=f"Applied actions, {_episode_name(snapshot)}",
+        title=f"Applied actions, episode {last_episode(snapshot)}",
         size=(7.5, 1.2 + 2.0 * len(signals)),
         sharex=True,
     )
     for k, (ax, signal) in enumerate(zip(axes.flat, signals, strict=True)):
-        ax.step(time, applied[:, k], where="post", color=ROLES[actor], linewidth=1.5, label=f"{role_name(actor)}, live")
+        ax.step(time, applied[:, k], where="post", color=ROLES[actor], linewidth=1.3, label=f"{role_name(actor)}, live")
         limits(ax, signal)
         caption(ax, signal.label)
     axes[-1, 0].set_xlabel(label)
-    axes[-1, 0].set_xlim(time[0], time[-1])
-    legend_below(figure, axes.flat)
+    axes[-1, 0].set_xlim(0.0, time[-1] + time[1])
+    legend_below(figure, tuple(axes.flat))
     return figure
 
 
@@ -86,7 +86,7 @@ def exogenous(snapshot: Snapshot) -> Figure:
     figure, axes = panels(
         rows,
         len(signals),
-        title=f"Exogenous input, {_episode_name(snapshot)}",
+        title=f"Exogenous input, episode {last_episode(snapshot)}",
         size=(max(7.5, 5.0 * len(signals)), 0.9 + 2.4 * rows),
         sharex=True,
         sharey="col",
@@ -102,16 +102,12 @@ def exogenous(snapshot: Snapshot) -> Figure:
                 ax.plot(time, mean[:, k], color=LARGE_SCALE, linewidth=2.2, label="large scale (SVR)")
         for ax in axes[:, k]:
             caption(ax, signal.label)
-            legend_above(ax)
         axes[-1, k].set_xlabel(label)
-        axes[-1, k].set_xlim(time[0], time[-1])
+        axes[-1, k].set_xlim(0.0, time[-1] + time[1])
+    legend_below(figure, tuple(axes[:, 0]))
     return figure
 
 
 def _actor(snapshot: Snapshot) -> Role:
     """Who acted in the record; the live policy of the snapshot may have changed after it."""
     return (snapshot.episodes[-1].get("live") if snapshot.episodes else None) or snapshot.live
-
-
-def _episode_name(snapshot: Snapshot) -> str:
-    return f"episode {len(snapshot.episodes)}"

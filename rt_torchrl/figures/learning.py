@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogFormatterSciNotation, MaxNLocator
 
-from rt_torchrl.figures.style import REAL, ROLES, SERIES, TWIN, caption, legend_above, panels, role_name
+from rt_torchrl.figures.style import REAL, ROLES, STEPS, TWIN, caption, legend_above, panels, role_name
 from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.switching import Role
 
@@ -49,9 +49,9 @@ def learning_curves(snapshot: Snapshot) -> Figure:
     )
     for (name, curves), ax in zip(shown, axes.flat, strict=False):
         _draw_costs(ax, episodes, curves)
+        legend_above(ax)
         _draw_events(ax, episodes)
         caption(ax, name)
-        legend_above(ax)
     _draw_timeline(axes[-1, 0], episodes, snapshot.live)
     return figure
 
@@ -61,15 +61,15 @@ def seconds(snapshot: Snapshot) -> Figure:
     spent = [episode.get("seconds") or {} for episode in snapshot.episodes]
     steps = list(dict.fromkeys(step for episode in spent for step in episode))
     figure, ((ax,),) = panels(1, title="Computing time per episode", size=(8.5, 4.2))
-    number, base = np.arange(1, len(spent) + 1), np.zeros(len(spent))
-    for k, step in enumerate(steps):
+    number, base = np.arange(len(spent)), np.zeros(len(spent))
+    for step in steps:
         height = np.array([float(episode.get(step, 0.0)) for episode in spent])
-        ax.bar(number, height, bottom=base, width=0.8, color=SERIES[k % len(SERIES)], label=step.replace("_", " "))
+        ax.bar(number, height, bottom=base, width=0.8, color=STEPS.get(step, "#F0E442"), label=step.replace("_", " "))
         base += height
     caption(ax, "wall-clock time [s]")
     ax.set_xlabel("episode")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlim(0.5, len(spent) + 0.5)
+    ax.set_xlim(-0.5, len(spent) - 0.5)
     # Reversed, so that the legend is stacked as the bars are.
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles[::-1], labels[::-1], loc="outside right upper", fontsize=9.5, frameon=False)
@@ -83,7 +83,7 @@ def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
 
 
 def _draw_costs(ax: Axes, episodes: list[dict[str, Any]], curves: dict[str, dict[str, str]]) -> None:
-    number = np.arange(1, len(episodes) + 1)
+    number = np.arange(len(episodes))
     columns = {key: _column(episodes, key) for key in curves}
     columns = {key: column for key, column in columns.items() if np.isfinite(column).any()}
     for key, column in columns.items():
@@ -91,11 +91,15 @@ def _draw_costs(ax: Axes, episodes: list[dict[str, Any]], curves: dict[str, dict
     # A plant may have costs that are not positive, which a logarithm would hide.
     if all((column[np.isfinite(column)] > 0).all() for column in columns.values()):
         ax.set_yscale("log")
+        # A decade or so needs numbers between the powers of ten.
+        ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
+        ax.grid(True, which="minor", axis="y", color="0.95", linewidth=0.5)
+        ax.tick_params(which="minor", labelsize=8)
 
 
 def _draw_events(ax: Axes, episodes: list[dict[str, Any]]) -> None:
     drawn = set()
-    for number, episode in enumerate(episodes, start=1):
+    for number, episode in enumerate(episodes):
         event = episode.get("event")
         if event in EVENTS:
             line = ax.axvline(number + 0.5, zorder=1, **EVENTS[event])
@@ -108,13 +112,14 @@ def _draw_timeline(ax: Axes, episodes: list[dict[str, Any]], live: Role) -> None
     acted = [episode.get("live") or live for episode in episodes]
     for row, role in enumerate(reversed(ROLES)):
         for is_live, alpha in ((True, 1.0), (False, 0.15)):
-            spans = [(k + 0.5, 1.0) for k, actor in enumerate(acted, start=0) if (actor == role) == is_live]
+            spans = [(k - 0.5, 1.0) for k, actor in enumerate(acted) if (actor == role) == is_live]
             ax.broken_barh(spans, (row - 0.4, 0.8), facecolors=ROLES[role], alpha=alpha, linewidth=0)
     _draw_events(ax, episodes)
     ax.set_yticks(range(len(ROLES)), [role_name(role) for role in reversed(ROLES)])
     ax.set_ylim(-0.55, len(ROLES) - 0.45)
     ax.grid(False)
     caption(ax, "live (filled) and idle (pale)")
+    legend_above(ax)
     ax.set_xlabel("episode")
-    ax.set_xlim(0.5, len(episodes) + 0.5)
+    ax.set_xlim(-0.5, len(episodes) - 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,6 +1,7 @@
 """Both policies as functions of what they observe."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from rt_torchrl.figures.style import ROLES, array, caption, legend_below, limits, panels, role_name
+from rt_torchrl.figures.style import ROLES, array, caption, last_episode, legend_below, limits, panels, role_name
 from rt_torchrl.signal import Signal
 from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.switching import Role
@@ -42,7 +43,12 @@ def visited_observations(snapshot: Snapshot) -> Float[Tensor, "n n_o"]:
 def _curves(snapshot: Snapshot) -> Figure:
     plant, seen = snapshot.plant, visited_observations(snapshot)
     axis = _axis(plant.observations[0], seen[:, 0])
-    figure, axes = panels(len(plant.actions), title="Policies", size=(6.5, 1.2 + 2.4 * len(plant.actions)), sharex=True)
+    figure, axes = panels(
+        len(plant.actions),
+        title=f"Policies after episode {last_episode(snapshot)}",
+        size=(6.5, 1.2 + 2.4 * len(plant.actions)),
+        sharex=True,
+    )
     for role in ROLES:
         values = _evaluate(snapshot, role, axis[:, None])
         for k, ax in enumerate(axes.flat):
@@ -55,34 +61,68 @@ def _curves(snapshot: Snapshot) -> Figure:
         caption(ax, action.label)
     axes[-1, 0].set_xlabel(plant.observations[0].label)
     axes[-1, 0].set_xlim(axis[0].item(), axis[-1].item())
-    legend_below(figure, axes.flat)
+    legend_below(figure, tuple(axes.flat))
     return figure
 
 
 def _contours(snapshot: Snapshot) -> Figure:
-    plant, seen = snapshot.plant, visited_observations(snapshot)
-    x, y = (_axis(signal, seen[:, k]) for k, signal in enumerate(plant.observations[:2]))
-    plane = torch.cartesian_prod(x, y)
-    points = torch.cat([plane, seen[:, 2:].mean(0).expand(len(plane), -1)], -1)
-    others = "" if seen.shape[1] == 2 else "\nother observations at their mean in the last episode"
+    plant, mean = snapshot.plant, visited_observations(snapshot).mean(0)
+    others = "" if len(mean) == 2 else "\nother observations at their mean in the last episode"
     rows = len(plant.actions)
-    figure, axes = panels(rows, 2, title=f"Policies{others}", size=(9.5, 1.0 + 2.9 * rows), sharex=True, sharey=True)
-    values = {role: _evaluate(snapshot, role, points).reshape(RESOLUTION, RESOLUTION, -1) for role in ROLES}
-    for k, action in enumerate(plant.actions):
-        levels = _levels([field[..., k] for field in values.values()])
-        for role, ax in zip(ROLES, axes[k], strict=True):
-            filled = ax.contourf(array(x), array(y), values[role][..., k].T, levels=levels, cmap="viridis")
-            _scatter(ax, array(seen))
-            caption(ax, role_name(role), "live" if role == snapshot.live else "idle")
-        figure.colorbar(filled, ax=list(axes[k]), label=action.label, aspect=16)
-        axes[k, 0].set_ylabel(plant.observations[1].label)
-    for ax in axes[-1]:
-        ax.set_xlabel(plant.observations[0].label)
+    figure, axes = panels(
+        rows,
+        2,
+        title=f"Policies after episode {last_episode(snapshot)}{others}",
+        size=(9.5, 1.0 + 2.9 * rows),
+        sharex=True,
+        sharey=True,
+    )
+    for k in range(rows):
+        contours(snapshot, k, {(0, 1): axes[k]}, others=mean)
+    for ax in axes[:-1].flat:
+        ax.set_xlabel("")
     legend_below(figure, [axes[0, 0]])
     return figure
 
 
-def _scatter(ax: Axes, seen: Float[np.ndarray, "n n_o"]) -> None:
+def contours(
+    snapshot: Snapshot,
+    action: int,
+    planes: Mapping[tuple[int, int], np.ndarray],
+    *,
+    others: Float[Tensor, " n_o"],
+) -> None:
+    """Draw one action over pairs of observations, all on one colour scale.
+
+    Args:
+        snapshot: has the policies and what they have seen.
+        action: index of the action.
+        planes: for each pair of observations, by index, two axes: for the model-based and the model-free policy.
+        others: values at which the observations outside a pair are held.
+    """
+    signals, seen = snapshot.plant.observations, visited_observations(snapshot)
+    grids = {plane: [_axis(signals[i], seen[:, i]) for i in plane] for plane in planes}
+    fields = {}
+    for plane, grid in grids.items():
+        points = others.expand(RESOLUTION**2, -1).clone()
+        points[:, plane] = torch.cartesian_prod(*grid)
+        for role in ROLES:
+            fields[plane, role] = _evaluate(snapshot, role, points)[:, action].reshape(RESOLUTION, RESOLUTION)
+    levels = _levels(list(fields.values()))
+    for plane, pair in planes.items():
+        for role, ax in zip(ROLES, pair, strict=True):
+            x, y = map(array, grids[plane])
+            filled = ax.contourf(x, y, fields[plane, role].T, levels=levels, cmap="viridis")
+            _scatter(ax, array(seen[:, plane]))
+            caption(ax, role_name(role), "live" if role == snapshot.live else "idle")
+            ax.set_xlabel(signals[plane[0]].label)
+            ax.xaxis.set_major_locator(MaxNLocator(5))
+        pair[0].set_ylabel(signals[plane[1]].label)
+    every = [ax for pair in planes.values() for ax in pair]
+    every[0].figure.colorbar(filled, ax=every, label=snapshot.plant.actions[action].label, aspect=16 * len(planes))
+
+
+def _scatter(ax: Axes, seen: Float[np.ndarray, "n 2"]) -> None:
     shown = seen[:: -(-len(seen) // SHOWN)]
     style = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.4, "alpha": 0.6}
     ax.scatter(shown[:, 0], shown[:, 1], label="visited in the last episode", **style)
@@ -94,11 +134,14 @@ def _evaluate(snapshot: Snapshot, role: Role, points: Float[Tensor, "m n_o"]) ->
 
 
 def _axis(signal: Signal, seen: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
-    """Points from end to end of what is declared and what was visited, so that no dot lies outside."""
-    ends = [end for end in (signal.low, signal.high) if math.isfinite(end)]
-    low, high = min(ends + [seen.min().item()]), max(ends + [seen.max().item()])
-    if low == high:
-        low, high = low - 1.0, high + 1.0
+    """Points from end to end of what is declared and what was visited, so that no dot lies outside.
+
+    Where no end is declared there is a margin.
+    """
+    least, greatest = seen.min().item(), seen.max().item()
+    margin = 0.05 * (greatest - least) or 1.0
+    low = min(signal.low, least) if math.isfinite(signal.low) else least - margin
+    high = max(signal.high, greatest) if math.isfinite(signal.high) else greatest + margin
     return torch.linspace(low, high, RESOLUTION, dtype=seen.dtype, device=seen.device)
 
 

@@ -7,21 +7,31 @@ pyplot: they need no backend or display, and are freed with their last reference
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from torch import Tensor
+from torch import Tensor, nn
 
 from rt_torchrl.plant import Plant
 from rt_torchrl.signal import Signal
+from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.switching import Role
 
 REAL, TWIN, REFERENCE, LARGE_SCALE = "#222222", "#D55E00", "#009E73", "#D55E00"
 FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"
 ROLES: dict[Role, str] = {"model_based": "#0072B2", "model_free": "#E69F00"}
-SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#222222")
+STEPS = {
+    "interact": REAL,
+    "update_model_free": ROLES["model_free"],
+    "fit_exogenous": SAMPLES,
+    "assimilate": TWIN,
+    "plan": ROLES["model_based"],
+    "switch_policies": "#CC79A7",
+}
 
 LIMIT_LINE = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
 REFERENCE_LINE = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
+CLOSURE_LINES = {"true": "-", "twin": (0, (5, 2)), "initial twin": (0, (1, 1.5))}
 
 
 def panels(
@@ -29,6 +39,7 @@ def panels(
 ) -> tuple[Figure, np.ndarray]:
     """A titled figure of ``size`` inches at 100 dpi and its axes, ``rows`` by ``columns``; ``layout`` of subplots."""
     figure = Figure(figsize=size, dpi=100, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.07)
     figure.suptitle(title, fontsize=12)
     axes = figure.subplots(rows, columns, squeeze=False, **layout)
     for ax in axes.flat:
@@ -47,21 +58,27 @@ def caption(ax: Axes, label: str, note: str = "") -> None:
 
 def legend_above(ax: Axes) -> None:
     """A legend above the panel on the right, clear of its curves."""
-    columns = len(ax.get_legend_handles_labels()[1])
-    ax.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns, fontsize=9, frameon=False, borderaxespad=0.1
-    )
+    entries = _entries([ax])
+    if not entries:
+        return
+    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0, "borderpad": 0.1}
+    ax.legend(entries.values(), entries, ncols=len(entries), fontsize=9, frameon=False, **place)
 
 
 def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all panels, under them; a label that several share appears once."""
+    """One legend for all panels, under them."""
+    entries = _entries(axes)
+    place = {"loc": "outside lower center", "ncols": len(entries)}
+    figure.legend(entries.values(), entries, fontsize=9.5, frameon=False, **place)
+
+
+def _entries(axes: Sequence[Axes]) -> dict[str, Artist]:
+    """What carries each label; a label that several share appears once."""
     entries = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    figure.legend(
-        entries.values(), entries, loc="outside lower center", ncols=len(entries), fontsize=9.5, frameon=False
-    )
+    return entries
 
 
 def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
@@ -85,6 +102,21 @@ def with_unit(value: float, unit: str) -> str:
 def array(tensor: Tensor) -> np.ndarray:
     """A tensor as matplotlib reads it."""
     return tensor.detach().cpu().numpy()
+
+
+def closures(snapshot: Snapshot) -> dict[str, nn.Module]:
+    """The closure of each line of ``CLOSURE_LINES``."""
+    return dict(zip(CLOSURE_LINES, (snapshot.plant.closure, snapshot.closure, snapshot.initial_closure), strict=True))
+
+
+def last_episode(snapshot: Snapshot) -> int:
+    """Number of the episode that the record is of, from 0 as in ``metrics.json``."""
+    return max(len(snapshot.episodes) - 1, 0)
+
+
+def twin_label(snapshot: Snapshot) -> str:
+    """What the twin's line is called; without a large scale the arm trains no twin."""
+    return "twin" if snapshot.large_scale is not None else "twin, not trained in this arm"
 
 
 def role_name(role: Role) -> str:

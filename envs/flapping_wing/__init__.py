@@ -1,0 +1,1 @@
+"""Flapping-wing micro air vehicle (paper, section 5.2)."""

@@ -1,0 +1,87 @@
+"""The classical controller of the NREL 5-MW turbine, to compare learned policies with."""
+
+import json
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.trajectory import Trajectory
+
+CONSTANTS = Path(__file__).parent / "data" / "nrel5mw_constants.json"
+
+
+class JonkmanController:
+    r"""Torque by regions of the generator speed, pitch by a gain-scheduled PI law.
+
+    .. math::
+        \tau_g = \begin{cases}0 & \text{1}\\ \text{linear} & 1\tfrac12\\ K\omega_F^2 & 2\\ \text{linear} & 2\tfrac12\\
+        P_r/\omega_F & 3\end{cases}, \qquad
+        \beta = \frac{K_P(\omega_F - \omega_r) + K_I\int(\omega_F - \omega_r)\,dt}{1 + \beta/\beta_K}
+
+    of the low-passed generator speed ω_F. It has memory, so it is no ``policy(observation)``: :meth:`fly` steps the
+    plant with it.
+
+    Args:
+        plant: the turbine; its actuators limit the rates.
+
+    Source: Jonkman et al., NREL/TP-500-38060, section 7; the variables are those of ``DISCON.F90``.
+    """
+
+    def __init__(self, plant: WindTurbine):
+        self.plant = plant
+        c = json.loads(CONSTANTS.read_text(encoding="utf-8"))["jonkman_controller"]
+        self.c = c
+        self.alpha = math.exp(-plant.dt * c["CornerFreq_rad_s"])
+        self.slope_15 = c["VS_Rgn2K"] * c["VS_Rgn2Sp"] ** 2 / (c["VS_Rgn2Sp"] - c["VS_CtInSp"])
+        self.synchronous = c["VS_RtGnSp"] / (1.0 + 0.01 * c["VS_SlPc"])
+        self.slope_25 = c["VS_RtPwr"] / c["VS_RtGnSp"] / (c["VS_RtGnSp"] - self.synchronous)
+        root = math.sqrt(self.slope_25 * (self.slope_25 - 4.0 * c["VS_Rgn2K"] * self.synchronous))
+        self.transition = (self.slope_25 - root) / (2.0 * c["VS_Rgn2K"])
+
+    @torch.no_grad()
+    def fly(self, initial_state: Float[Tensor, "batch 6"], exogenous: Float[Tensor, "batch n 1"]) -> Trajectory:
+        """Real episodes under this controller."""
+        plant, state = self.plant, initial_state
+        speed = plant.gear_ratio * state[:, 0]
+        pitch = torch.deg2rad(state[:, 5])
+        # Starts with the integral that holds the pitch it finds.
+        integral = pitch * (1.0 + pitch / self.c["PC_KK_rad"]) / self.c["PC_KI"]
+        states, actions = [state], []
+        for k in range(exogenous.shape[1]):
+            speed = (1.0 - self.alpha) * plant.gear_ratio * state[:, 0] + self.alpha * speed
+            torque = self.torque(speed, pitch)
+            pitch, integral = self.pitch(speed, pitch, integral)
+            t = torch.tensor(k * plant.dt, dtype=torch.float64, device=state.device)
+            command = torch.stack([torque, torch.rad2deg(pitch)], -1)
+            state, applied = plant.step(t, state, command, exogenous[:, k], plant.closure)
+            pitch = torch.deg2rad(applied[:, 1])
+            states.append(state)
+            actions.append(applied)
+        return Trajectory(torch.stack(states, 1), torch.stack(actions, 1))
+
+    def torque(self, speed: Float[Tensor, " batch"], pitch: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
+        """Generator torque [N m] at a filtered speed [rad/s]; region 3 also while the blades are pitched [rad]."""
+        c = self.c
+        torque = torch.where(
+            speed < self.transition, c["VS_Rgn2K"] * speed**2, self.slope_25 * (speed - self.synchronous)
+        )
+        torque = torch.where(speed < c["VS_Rgn2Sp"], self.slope_15 * (speed - c["VS_CtInSp"]), torque)
+        torque = torch.where(speed <= c["VS_CtInSp"], 0.0, torque)
+        rated = (speed >= c["VS_RtGnSp"]) | (pitch >= c["VS_Rgn3MP_rad"])
+        torque = torch.where(rated, c["VS_RtPwr"] / speed, torque)
+        return torque.clamp(self.plant.actions[0].low, self.plant.actions[0].high)
+
+    def pitch(self, speed: Tensor, pitch: Tensor, integral: Tensor) -> tuple[Tensor, Tensor]:
+        """Pitch command [rad] and the new integral of the speed error [rad], which saturates with the pitch."""
+        c = self.c
+        gain = 1.0 / (1.0 + pitch / c["PC_KK_rad"])
+        error = speed - c["PC_RefSpd"]
+        highest = math.radians(self.plant.actions[1].high)
+        integral = integral + error * self.plant.dt
+        integral = integral.clamp(min=c["PC_MinPit"]).minimum(highest / (gain * c["PC_KI"]))
+        command = gain * (c["PC_KP_s"] * error + c["PC_KI"] * integral)
+        return command.clamp(c["PC_MinPit"], highest), integral

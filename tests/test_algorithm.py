@@ -1,0 +1,246 @@
+"""The six steps together, on the linear-quadratic plant, where the right closure and the right gain are known."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from test_model_free import optimal_gain
+
+from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.assimilation import AssimilationConfig
+from rt_torchrl.descent import DescentConfig
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.exploration import ExplorationConfig
+from rt_torchrl.model_based import ModelBasedConfig
+from rt_torchrl.model_free import ModelFreeConfig
+from rt_torchrl.policies import SaturatedMLP
+from rt_torchrl.switching import SwitchConfig
+from rt_torchrl.twin import DigitalTwin
+
+STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "plan", "switch_policies"]
+
+
+def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
+    plant = plant or LinearQuadratic(horizon=2.0)
+    generator = torch.Generator().manual_seed(seed)
+    config = TwinningConfig(
+        **{
+            "realisations": 2,
+            "virtual_episodes": 3,
+            "model_free": ModelFreeConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
+            "assimilation": AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+            "model_based": ModelBasedConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+            **options,
+        }
+    )
+    return ReinforcementTwinning(
+        PlantEnv(plant, seed=env_seed),
+        DigitalTwin(plant, closure or plant.make_closure(generator)),
+        model_free=plant.make_policy(generator),
+        model_based=plant.make_policy(generator),
+        config=config,
+        generator=generator,
+    )
+
+
+def weights(module):
+    return torch.cat([w.detach().flatten() for w in module.parameters()]).clone()
+
+
+def scripted(found, live, idle):
+    """Let step 6 see these costs."""
+    costs = {found.switch.live: live, found.switch.idle: idle}
+    found.virtual_costs = lambda: {role: torch.tensor(cost) for role, cost in costs.items()}
+
+
+@pytest.mark.parametrize(
+    "arm, expected", [("twinning", STEPS), ("model_free", STEPS[:2]), ("model_based", [STEPS[0], *STEPS[2:5]])]
+)
+def test_steps_come_in_order(arm, expected):
+    found, calls = twinning(arm=arm), []
+
+    def recorded(step):
+        return functools.wraps(step)(lambda: calls.append(step.__name__) or step())
+
+    for name in STEPS:
+        setattr(found, name, recorded(getattr(found, name)))
+    report = found.episode()
+    assert calls == expected and list(report["seconds"].keys()) == expected
+    assert found.episodes_done == 1
+    assert ("J_p" in report) == (arm != "model_free") and ("critic_loss" in report) == (arm != "model_based")
+
+
+def test_arms_touch_their_own_half_alone():
+    for arm, moved in (("model_free", "model_free"), ("model_based", "model_based")):
+        found = twinning(arm=arm)
+        before = {role: weights(policy) for role, policy in found.policies.items()}
+        closure, critic = weights(found.twin.closure), weights(found.model_free.critic)
+        for _ in range(2):
+            found.episode()
+        assert found.switch.live == arm and found.actor.policy is found.policies[arm]
+        for role, policy in found.policies.items():
+            assert torch.equal(before[role], weights(policy)) == (role != moved)
+        assert torch.equal(closure, weights(found.twin.closure)) == (arm == "model_free")
+        assert torch.equal(critic, weights(found.model_free.critic)) == (arm == "model_based")
+
+
+def test_what_is_stored_is_what_was_applied():
+    """On the turbine, whose rate limits change most commands of a policy with noise."""
+    found = twinning(WindTurbine(horizon=30.0), exploration=ExplorationConfig(spread=1.0, episodes=5))
+    asked = []
+    act = found.actor.forward
+    found.actor.forward = lambda observation: asked.append(act(observation)) or asked[-1]
+    found.interact()
+    (record,) = found.short_term
+    commands = torch.cat(asked)[-60:]
+    stored = found.long_term._buffer[:60]
+    # The plant latches the applied action into the state at the end of the interval.
+    assert torch.equal(record.actions, record.states[1:, 4:])
+    assert torch.equal(stored["action"], record.actions)
+    assert (commands != record.actions).any(0).all()
+    assert record.states.shape == (61, 6) and record.exogenous.shape == (60, 1)
+
+
+def test_record_and_transitions_are_those_of_the_episode():
+    found = twinning(records=2)
+    for _ in range(3):
+        report = found.interact()
+    assert len(found.short_term) == 2 and len(found.long_term) == 60
+    record, last = found.short_term[-1], found.long_term._buffer[40:60]
+    # On this plant the observation is the state.
+    assert torch.equal(last["observation"], record.states[:-1])
+    assert torch.equal(last["next", "observation"], record.states[1:])
+    cost = found.twin.plant.running_cost(torch.zeros(20).double(), record.states[:-1], record.actions, record.exogenous)
+    torch.testing.assert_close(report["real_cost"], cost.mean(), rtol=1e-12, atol=0)
+    assert not last["next", "terminated"].any() and last["next", "done"][-1].all()
+
+
+def test_live_starts_model_free_and_explores_less_and_less():
+    found = twinning(arm="model_free", exploration=ExplorationConfig(spread=0.2, episodes=4))
+    assert found.switch.live == "model_free" and found.actor.policy is found.policies["model_free"]
+    strengths = [found.episode()["exploration"] for _ in range(6)]
+    assert strengths == pytest.approx([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
+
+
+def test_swap_changes_who_acts_and_copies_nothing():
+    found = twinning(switch=SwitchConfig(patience=0))
+    found.interact(), found.update_model_free(), found.fit_exogenous()
+    before = {role: weights(policy) for role, policy in found.policies.items()}
+    scripted(found, live=2.0, idle=1.0)
+    assert found.switch_policies()["event"] == "swap"
+    assert found.switch.live == "model_based"
+    found.interact()
+    assert found.actor.policy is found.policies["model_based"]
+    assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
+
+
+@pytest.mark.parametrize("live", ["model_free", "model_based"])
+def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
+    found = twinning(switch=SwitchConfig(clone_patience=0, stall=1e9))
+    found.switch.live = live
+    for step in STEPS[:-1]:
+        getattr(found, step)()
+    optimisers = {
+        "model_free": lambda: found.model_free.actor_optimiser.state,
+        "model_based": lambda: found.model_based.descent._optimiser.state,
+    }
+    idle, before = found.switch.idle, weights(found.policies[live])
+    assert all(state() for state in optimisers.values())
+    assert not torch.equal(weights(found.policies[idle]), before)
+    scripted(found, live=1.0, idle=2.0)
+    assert found.switch_policies()["event"] == "clone"
+    assert torch.equal(weights(found.policies[idle]), before) and torch.equal(weights(found.policies[live]), before)
+    assert found.policies[idle] is not found.policies[live] and found.switch.live == live
+    assert not optimisers[idle]() and optimisers[live]()
+
+
+def test_weight_change_is_over_the_whole_episode():
+    """‖w^i − w^{i−1}‖/‖w^i‖ of the idle policy, whichever step changed it."""
+    found = twinning()
+    before = weights(found.policies["model_based"])
+    report = found.episode()
+    after = weights(found.policies["model_based"])
+    assert report["weight_change"].item() == pytest.approx(((after - before).norm() / after.norm()).item(), rel=1e-12)
+    assert report["weight_change"] > 0
+
+
+def test_same_seeds_repeat_and_others_do_not():
+    def run(**seeds):
+        torch.manual_seed(np.random.default_rng().integers(2**31))
+        found = twinning(**seeds)
+        costs = [found.episode()["real_cost"] for _ in range(3)]
+        modules = [found.twin.closure, *found.policies.values(), found.model_free.critic]
+        return torch.cat([torch.stack(costs), *map(weights, modules)])
+
+    first = run(seed=1, env_seed=1)
+    assert torch.equal(first, run(seed=1, env_seed=1))
+    assert not torch.equal(first, run(seed=2, env_seed=1)) and not torch.equal(first, run(seed=1, env_seed=2))
+
+
+def test_identification_finds_the_true_closure():
+    plant = LinearQuadratic(horizon=5.0, noise=0.0)
+    found = twinning(
+        plant,
+        arm="model_based",
+        assimilation=AssimilationConfig(iterations=80, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+        exploration=ExplorationConfig(spread=0.5, episodes=5),
+    )
+    found.interact(), found.fit_exogenous()
+    report = found.assimilate()
+    # A noise-free record of the same system: J_p goes to zero, until L-BFGS stops at changes below 1e-9.
+    assert report["J_p"] < 1e-4 * report["J_p_before"] and report["J_p"] < 1e-7
+    # J_p of 1e-7 over 5 s is a trajectory off by 2e-4; an oscillation of size one tells the weights as well.
+    true = torch.tensor(LinearQuadratic.true_closure, dtype=torch.float64)
+    torch.testing.assert_close(found.twin.closure.matrix.detach(), true, rtol=0, atol=2e-3)
+
+
+def test_planning_finds_the_optimal_gain():
+    """On the true twin and over 10 s, ten time constants of the loop, the best constant gain is Riccati's."""
+    plant = LinearQuadratic(horizon=10.0, noise=0.0)
+    found = twinning(
+        plant,
+        closure=LinearClosure(LinearQuadratic.true_closure),
+        arm="model_based",
+        realisations=8,
+        model_based=ModelBasedConfig(iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    )
+    found.interact(), found.fit_exogenous()
+    report = found.plan()
+    assert report["J_a_plan"] < report["J_a_plan_before"]
+    gain, best = found.policies["model_based"].gain.detach().numpy(), optimal_gain(1.0)
+    # L-BFGS stops at cost changes of 1e-9; the cost curves with about 0.1 per unit of gain²: 1e-4, and the tail.
+    assert np.linalg.norm(gain - best) < 1e-3 * np.linalg.norm(best), (gain, best)
+
+
+def test_virtual_costs_are_from_the_same_draws():
+    """Equal policies cost the same, whatever was drawn; and the draws differ from call to call."""
+    found = twinning(virtual_episodes=4, records=2)
+    for _ in range(2):
+        found.interact()
+    found.fit_exogenous()
+    found.policies["model_based"].load_state_dict(found.policies["model_free"].state_dict())
+    with torch.no_grad():
+        first, second = found.virtual_costs(), found.virtual_costs()
+    assert first["model_free"] == first["model_based"] and first["model_free"] != second["model_free"]
+
+
+def test_policies_that_cannot_be_cloned_are_refused():
+    plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
+    with pytest.raises(ValueError, match="weights of shapes .*gain.*network.* same architecture"):
+        ReinforcementTwinning(
+            PlantEnv(plant),
+            DigitalTwin(plant, plant.make_closure(generator)),
+            model_free=LinearGain([[0.0, 0.0]]),
+            model_based=SaturatedMLP(2, plant.actions, generator=generator),
+            config=TwinningConfig(),
+            generator=generator,
+        )
+
+
+@pytest.mark.parametrize("argument", ["realisations", "records", "virtual_episodes"])
+def test_wrong_counts_are_refused(argument):
+    with pytest.raises(ValueError, match=f"{argument}=0 must be at least 1"):
+        TwinningConfig(**{argument: 0})

@@ -1,0 +1,149 @@
+"""Gradient descent of steps 4 and 5 on costs with known minima."""
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from rt_torchrl.descent import Descent, DescentConfig
+
+MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+CURVATURE = torch.tensor([1.0, 4.0, 10.0], dtype=torch.float64)
+
+
+class Point(nn.Module):
+    def __init__(self, start=(0.0, 0.0, 0.0)):
+        super().__init__()
+        self.at = nn.Parameter(torch.tensor(start, dtype=torch.float64))
+
+
+class Bowl:
+    """½ Σ c_i (x_i − m_i)², counting its evaluations."""
+
+    def __init__(self, point, offset=0.0):
+        self.point, self.offset, self.seen, self.with_gradient = point, offset, [], 0
+
+    def __call__(self):
+        cost = 0.5 * (CURVATURE * (self.point.at - MINIMUM) ** 2).sum() + self.offset
+        self.seen.append((cost.item(), self.point.at.detach().clone()))
+        self.with_gradient += torch.is_grad_enabled()
+        return cost
+
+
+def test_adam_reaches_the_minimum():
+    point = Point()
+    cost = Bowl(point)
+    found = Descent(point, DescentConfig(rate=0.02, gradient_limit=100.0)).run(cost, 600)
+    # 0.02 per step covers the distance of 2 in 100 steps; then Adam circles within about a step of the minimum and the
+    # best point seen lies closer. Cost 1e-4 is a hundredth of a step's, ½·10·0.02².
+    assert found.best < 1e-4 and (point.at - MINIMUM).abs().max() < 0.01
+    # Closed forms at the start: ½(1 + 4·4 + 10/4) and |(−1, 8, −5)|.
+    assert found.start == pytest.approx(9.75, rel=1e-14)
+    assert found.gradient == pytest.approx(math.sqrt(1 + 64 + 25), rel=1e-14)
+
+
+def test_lbfgs_reaches_the_minimum_of_a_quadratic_in_few_gradients():
+    point = Point()
+    found = Descent(point, DescentConfig(optimiser="lbfgs", rate=1.0)).run(Bowl(point), 25)
+    # Superlinear in three directions, until torch's L-BFGS stops at a change of the cost below 1e-9.
+    assert found.best < 2e-9
+    # ½c(x − m)² < 2e-9 with c ≥ 1.
+    torch.testing.assert_close(point.at.detach(), MINIMUM, rtol=0, atol=7e-5)
+
+
+def test_gradient_reported_is_not_the_clipped_one():
+    point = Point()
+    found = Descent(point, DescentConfig(gradient_limit=0.1)).run(Bowl(point), 1)
+    assert found.gradient == pytest.approx(math.sqrt(90), rel=1e-14)
+
+
+@pytest.mark.parametrize("optimiser, rate", [("adam", 3.0), ("adam", 0.1), ("lbfgs", 5.0), ("lbfgs", 1.0)])
+@pytest.mark.parametrize("iterations", [1, 2, 7])
+def test_best_weights_are_kept(optimiser, rate, iterations):
+    """With a rate of 3 Adam jumps over the minimum and climbs; what remains is the lowest point evaluated."""
+    point = Point((0.9, -1.9, 0.6))
+    cost = Bowl(point)
+    found = Descent(point, DescentConfig(optimiser=optimiser, rate=rate)).run(cost, iterations)
+    best, where = min(cost.seen, key=lambda pair: pair[0])
+    assert found.best == best
+    assert torch.equal(point.at.detach(), where)
+    assert found.start == cost.seen[0][0]
+    assert optimiser == "lbfgs" or rate < 3.0 or best == found.start
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+@pytest.mark.parametrize("iterations", [1, 2, 5, 9])
+def test_gradients_are_counted_exactly(optimiser, iterations):
+    point = Point()
+
+    def rosenbrock():
+        x, y, z = point.at
+        cost.with_gradient += torch.is_grad_enabled()
+        return (1 - x) ** 2 + 100 * (y - x**2) ** 2 + z**2
+
+    cost = Bowl(point)
+    found = Descent(point, DescentConfig(optimiser=optimiser, rate=0.1)).run(rosenbrock, iterations)
+    assert found.iterations == cost.with_gradient == iterations
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_no_iterations_do_nothing(optimiser):
+    point = Point((3.0, 3.0, 3.0))
+    cost = Bowl(point)
+    found = Descent(point, DescentConfig(optimiser=optimiser)).run(cost, 0)
+    assert found.iterations == 0 and cost.with_gradient == 0
+    assert torch.equal(point.at.detach(), torch.full((3,), 3.0, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_stops_below_a_share_of_the_start(optimiser):
+    point = Point()
+    cost = Bowl(point)
+    found = Descent(point, DescentConfig(optimiser=optimiser, rate=0.1)).run(cost, 500, stop_below=0.25)
+    assert found.best < 0.25 * found.start
+    assert found.iterations < 100
+    # It ends at the first point below, not later.
+    assert [value < 0.25 * found.start for value, _ in cost.seen] == [False] * (len(cost.seen) - 1) + [True]
+
+
+def test_adam_keeps_its_moments_between_runs_and_restart_forgets_them():
+    """Two runs of one step are two steps of torch's Adam on the gradients relative to the cost at the start of each;
+    after a restart the step is the first one again: its length is the rate in every direction, the gradient's sign."""
+    config = DescentConfig(rate=0.1, gradient_limit=100.0)
+    point, by_hand = Point(), Point()
+    descent = Descent(point, config)
+    adam = torch.optim.Adam(by_hand.parameters(), lr=0.1, betas=(0.9, config.second_moment))
+    for _ in range(2):
+        descent.run(Bowl(point), 1)
+        start = Bowl(by_hand)().item()
+        by_hand.at.grad = CURVATURE * (by_hand.at.detach() - MINIMUM) / start
+        adam.step()
+    # The same operations in another order: rounding.
+    torch.testing.assert_close(point.at, by_hand.at, rtol=1e-14, atol=1e-15)
+    before = point.at.detach().clone()
+    descent.restart()
+    descent.run(Bowl(point), 1)
+    # Adam's ε = 1e-8 beside relative gradients of a tenth and more.
+    torch.testing.assert_close(point.at.detach() - before, 0.1 * (MINIMUM - before).sign(), rtol=1e-6, atol=0)
+
+
+def test_state_round_trip_continues_identically():
+    config = DescentConfig(rate=0.1)
+    first, second = Point(), Point()
+    original, restored = Descent(first, config), Descent(second, config)
+    original.run(Bowl(first), 3)
+    second.load_state_dict(first.state_dict())
+    restored.load_state_dict(copy.deepcopy(original.state_dict()))
+    original.run(Bowl(first), 3)
+    restored.run(Bowl(second), 3)
+    assert torch.equal(first.at, second.at)
+
+
+@pytest.mark.parametrize(
+    "change", [{"optimiser": "sgd"}, {"rate": 0.0}, {"gradient_limit": math.nan}, {"second_moment": 1.0}]
+)
+def test_wrong_parameters_are_refused(change, unchecked):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        DescentConfig(**change)

@@ -1,0 +1,196 @@
+"""The real system in simulation: batches, partial resets, seeds, actuators and divergence."""
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from tensordict import TensorDict
+
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.integrators import rk4_step
+from rt_torchrl.trajectory import DivergenceError
+
+
+def act(env, found, action):
+    """One step; the TensorDict with ``next``."""
+    return env.step(found.clone().set("action", action))
+
+
+def uniform_actions(env, seed):
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    share = torch.rand(low.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return low + share * (high - low)
+
+
+def test_step_is_one_runge_kutta_step_of_the_true_system():
+    plant = LinearQuadratic()
+    env = PlantEnv(plant, batch_size=3, seed=1)
+    found = env.reset()
+    action = uniform_actions(env, 0)
+    done = act(env, found, action)
+    matrix = sum(torch.tensor(m, dtype=torch.float64) for m in (plant.A, plant.true_closure))
+    force = torch.cat([torch.zeros(3, 1, dtype=torch.float64), action + found["exogenous"]], -1)
+    expected = rk4_step(lambda t, s: s @ matrix.T + force, torch.tensor(0.0), found["state"], plant.dt)
+    # The same sums in another order.
+    torch.testing.assert_close(done["next", "state"], expected, rtol=1e-13, atol=1e-14)
+    assert torch.equal(done["next", "applied"], action)
+
+
+def test_stored_next_state_is_the_state_of_the_next_step():
+    env = PlantEnv(LinearQuadratic(horizon=1.0), batch_size=2)
+    found = env.reset()
+    seen, later = [], []
+    for k in range(10):
+        done, following = env.step_and_maybe_reset(found.set("action", uniform_actions(env, k)))
+        seen.append(done.clone())
+        later.append(following.clone())
+        found = following
+    for before, after in zip(seen[:-1], seen[1:], strict=True):
+        for key in ("state", "exogenous", "observation"):
+            assert torch.equal(before["next", key], after[key])
+    # After the end a new episode starts, but what is stored is where the old one ended.
+    assert seen[-1]["next", "truncated"].all() and not later[-1]["done"].any()
+    assert not torch.equal(seen[-1]["next", "state"], later[-1]["state"])
+
+
+def test_input_of_an_interval_is_that_of_the_draw():
+    plant = LinearQuadratic(horizon=1.0)
+    env = PlantEnv(plant, batch_size=2, seed=4)
+    generator = torch.Generator().manual_seed(4)
+    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)
+    episode = env.rollout(20)
+    assert torch.equal(episode["state"][:, 0], state)
+    assert torch.equal(episode["exogenous"], exogenous)
+    # After the last interval there is no further input; its observation is made with the last one.
+    assert torch.equal(episode["next", "exogenous"][:, -1], exogenous[:, -1])
+
+
+class Clock(LinearQuadratic):
+    """Shows the time, moves and costs by it."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return torch.ones_like(state) * t.unsqueeze(-1)
+
+    def observe(self, t, state, exogenous):
+        return torch.ones_like(state) * t.unsqueeze(-1)
+
+    def running_cost(self, t, state, applied, exogenous):
+        return t.expand_as(state[..., 0])
+
+
+def test_clock_is_that_of_the_twin_to_the_last_bit():
+    """t_k = k dt in double precision, in the observation, the cost and the field: s_n − s_0 = ½T²."""
+    env = PlantEnv(Clock(dt=0.1, horizon=5.0), batch_size=2)
+    episode = env.rollout(50)
+    t = 0.1 * torch.arange(51, dtype=torch.float64)
+    assert torch.equal(episode["observation"], t[:-1, None].expand(2, 50, 2))
+    assert torch.equal(episode["next", "observation"], t[1:, None].expand(2, 50, 2))
+    assert torch.equal(episode["next", "reward"][..., 0], -t[:-1].expand(2, 50))
+    moved = episode["next", "state"][:, -1] - episode["state"][:, 0]
+    # Exact quadrature of a linear function: rounding of 50 sums.
+    torch.testing.assert_close(moved, torch.full((2, 2), 12.5, dtype=torch.float64), rtol=1e-13, atol=0)
+
+
+def test_rows_of_a_batch_are_independent_systems():
+    plant = LinearQuadratic()
+    env, single = PlantEnv(plant, batch_size=3, seed=2), PlantEnv(plant, batch_size=1)
+    found = env.reset()
+    action = uniform_actions(env, 1)
+    together = act(env, found, action)
+    for row in range(3):
+        single.reset()
+        single._state, single._exogenous = env_row(found["state"], row), env._exogenous[row : row + 1]
+        alone = act(single, TensorDict({}, batch_size=[1]), action[row : row + 1])
+        # Rounding of another vector length.
+        for key in ("state", "reward"):
+            torch.testing.assert_close(alone["next", key][0], together["next", key][row], rtol=1e-13, atol=1e-14)
+
+
+def env_row(tensor, row):
+    return tensor[row : row + 1].clone()
+
+
+def test_partial_reset_restarts_the_marked_rows_only():
+    plant = LinearQuadratic(horizon=1.0)
+    env = PlantEnv(plant, batch_size=3, seed=5)
+    found = env.reset()
+    for k in range(4):
+        found = act(env, found, uniform_actions(env, k))["next"].exclude("reward")
+    mask = torch.tensor([[False], [True], [False]])
+    again = env.reset(found.clone().set("_reset", mask))
+    assert torch.equal(again["state"][[0, 2]], found["state"][[0, 2]])
+    assert torch.equal(again["exogenous"][[0, 2]], found["exogenous"][[0, 2]])
+    assert not torch.equal(again["state"][1], found["state"][1])
+    assert not again["done"].any()
+    ends = []
+    for k in range(10):
+        stepped = act(env, again, uniform_actions(env, 10 + k))["next"]
+        again = stepped.exclude("reward")
+        ends.append(stepped["truncated"][:, 0].tolist())
+    # Rows 0 and 2 had six steps left, row 1 has ten.
+    assert [row[0] for row in ends].index(True) == [row[2] for row in ends].index(True) == 5
+    assert [row[1] for row in ends].index(True) == 9
+
+
+def test_seed_fixes_the_sequence_of_episodes():
+    def starts(env):
+        return torch.stack([env.reset()["state"] for _ in range(3)])
+
+    env, same, other = (PlantEnv(LinearQuadratic(), batch_size=2, seed=seed) for seed in (3, 3, 4))
+    first = starts(env)
+    assert torch.equal(first, starts(same)) and not torch.equal(first, starts(other))
+    assert not torch.equal(first[0], first[1])
+    env.set_seed(3)
+    assert torch.equal(first, starts(env))
+
+
+def test_turbine_actuators_are_rate_limited():
+    """Torque by at most 15 kN m/s and pitch by 8 deg/s, from what was applied before, not from what was asked."""
+    env = PlantEnv(WindTurbine(horizon=20.0), batch_size=16, seed=6)
+    found = env.reset()
+    limit = torch.tensor([15e3, 8.0], dtype=torch.float64) * 0.5
+    last, limited, free = found["state"][:, 4:], 0, 0
+    for k in range(40):
+        action = uniform_actions(env, k)
+        step = act(env, found, action)["next"]
+        applied = step["applied"]
+        expected = last + (action - last).sign() * torch.minimum((action - last).abs(), limit)
+        # One rounding of numbers up to 4e4.
+        torch.testing.assert_close(applied, expected, rtol=1e-14, atol=1e-10)
+        assert torch.equal(step["state"][:, 4:], applied)
+        reached = (action - last).abs() <= limit
+        limited, free = limited + (~reached).sum(0), free + reached.sum(0)
+        last, found = applied, step.exclude("reward")
+    # Both branches have been seen for both actions.
+    assert (limited > 20).all() and (free > 20).all()
+
+
+def test_ideal_actuators_apply_the_command():
+    env = PlantEnv(WindTurbine(horizon=20.0, rate_limits=None), batch_size=4)
+    action = uniform_actions(env, 0)
+    # last + (command − last): one rounding.
+    torch.testing.assert_close(act(env, env.reset(), action)["next", "applied"], action, rtol=1e-14, atol=1e-10)
+
+
+class Explosive(LinearClosure):
+    def forward(self, features):
+        return 1e3 * features**3
+
+
+def test_divergence_is_raised_with_time_state_and_command():
+    plant = LinearQuadratic()
+    plant.closure = Explosive(plant.true_closure)
+    env = PlantEnv(plant, batch_size=2)
+    found = env.reset()
+    message = (
+        r"plant 'linear_quadratic' diverged at t = \d\S* s: state \[\[.*\], command \[\[.*\], "
+        r"exogenous input \[\["
+    )
+    with pytest.raises(DivergenceError, match=message):
+        for k in range(50):
+            found = act(env, found, uniform_actions(env, k))["next"].exclude("reward")
+
+
+def test_batch_size_is_checked():
+    with pytest.raises(ValueError, match="batch_size=0"):
+        PlantEnv(LinearQuadratic(), batch_size=0)

@@ -1,0 +1,139 @@
+"""Step 3 against the model's own moments, processes of known covariance and a slow sine."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess
+from rt_torchrl.signal import Signal
+
+FREE = (Signal(symbol="d", name="free", unit="m/s"),)
+DT = 0.5
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def autoregressive(n, rho, seed=0, std=1.0):
+    """x_{k+1} = ρ x_k + noise with stationary deviation ``std``: covariance std² ρ^|lag|."""
+    noise = np.random.default_rng(seed).standard_normal(n)
+    x = np.empty(n)
+    x[0] = noise[0]
+    for k in range(1, n):
+        x[k] = rho * x[k - 1] + math.sqrt(1 - rho**2) * noise[k]
+    return std * x
+
+
+def process(values, signals=FREE, **options):
+    record = torch.as_tensor(values, dtype=torch.float64).reshape(len(values), -1)
+    return ExogenousProcess(record, dt=DT, signals=signals, config=ExogenousConfig(**options))
+
+
+def test_samples_have_the_mean_and_covariance_of_the_model():
+    found = process(autoregressive(400, 0.8))
+    count = 20_000
+    small = found.sample(count, seeded(1))[..., 0] - found.mean[:, 0]
+    model = found.covariance[:, 0]
+    # Five standard errors: of a mean √(C_0/N), of a covariance at most √(2/N) C_0.
+    assert small.mean(0).abs().max() < 5 * (model[0] / count).sqrt()
+    for lag in (0, 1, 3, 10, 50, 99, 150, 399):
+        for at in (0, (399 - lag) // 2, 399 - lag):
+            estimate = (small[:, at] * small[:, at + lag]).mean()
+            assert (estimate - model[lag]).abs() < 5 * math.sqrt(2 / count) * model[0], (lag, at)
+
+
+def test_covariance_is_that_of_the_residual():
+    """A residual with known autocovariance ρ^lag, fast beside the knots so that the regression leaves it alone."""
+    found = process(autoregressive(14_400, 0.5, std=2.0))
+    lags = torch.arange(6, dtype=torch.float64)
+    # The block means that the large scale follows hold 3ish/48 of the variance; estimating adds 2 % (14 400 samples
+    # with a correlation time of 3): 10 % of the variance.
+    torch.testing.assert_close(found.covariance[:6, 0], 4.0 * 0.5**lags, rtol=0, atol=0.4)
+
+
+@pytest.mark.parametrize("n", [8, 9, 100, 1201])
+def test_spectrum_of_the_embedding_is_not_negative(n):
+    """The embedding is a covariance: its eigenvalues, the FFT of the circulant, are not negative but for rounding."""
+    found = process(autoregressive(n, 0.9, seed=n))
+    C = found.covariance[:, 0].numpy()
+    circulant = np.concatenate([C, [0.0], C[:0:-1]])
+    assert len(circulant) == 2 * n
+    eigenvalues = np.fft.fft(circulant)
+    assert np.abs(eigenvalues.imag).max() < 1e-12 * eigenvalues.real.max()
+    assert eigenvalues.real.min() > -1e-12 * eigenvalues.real.max()
+    assert C[0] > 0 and (np.abs(C) <= C[0]).all()
+
+
+def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
+    n, period = 1200, 300.0
+    t = DT * np.arange(n)
+    slow = 11.0 + 2.0 * np.sin(2 * np.pi * t / period)
+    found = process(slow + autoregressive(n, 0.0, std=0.2))
+    # Tube 0.05 and noise of block means 0.2/√4 of which the kernel, two knots wide, averages about seven: 0.07 + 0.04.
+    error = found.mean[:, 0].numpy() - slow
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    # White noise remains. Blocks of four hold a quarter of its variance, which bounds what the regression can take;
+    # the variance itself is known to √(2/1200) = 4 %, two of them.
+    assert 0.75 - 0.08 < found.covariance[0, 0].item() / 0.04 < 1.08
+    # What is taken turns up, with its sign turned, at the neighbours: at most that quarter.
+    assert found.covariance[1:4, 0].abs().max() < (0.25 + 0.08) * 0.04
+
+
+def test_constant_input_stays_constant():
+    found = process(np.full(50, 3.25))
+    assert torch.equal(found.sample(3, seeded()), torch.full((3, 50, 1), 3.25, dtype=torch.float64))
+
+
+def test_samples_are_held_within_the_physical_range():
+    signals = (Signal(symbol="u", name="wind_speed", unit="m/s", low=3.0, high=5.0), *FREE)
+    values = np.stack([4.0 + autoregressive(300, 0.3), autoregressive(300, 0.3, seed=1)], -1)
+    drawn = process(values, signals).sample(20, seeded())
+    assert drawn[..., 0].min() == 3.0 and drawn[..., 0].max() == 5.0
+    assert drawn[..., 1].min() < -2.0 and drawn[..., 1].max() > 2.0
+
+
+def test_components_are_independent_and_samples_differ():
+    base = autoregressive(300, 0.3)
+    drawn = process(np.stack([base, base], -1), FREE * 2).sample(2000, seeded())
+    centred = drawn - drawn.mean(0)
+    correlation = (centred[:, 100, 0] * centred[:, 100, 1]).mean() / centred[:, 100].square().mean()
+    assert correlation.abs() < 5 / math.sqrt(2000)
+    assert not torch.equal(drawn[0], drawn[1])
+
+
+def test_seed_fixes_the_samples():
+    found = process(autoregressive(100, 0.5))
+    first = found.sample(2, seeded(1))
+    torch.manual_seed(7)
+    assert torch.equal(first, found.sample(2, seeded(1))) and not torch.equal(first, found.sample(2, seeded(2)))
+
+
+def test_a_record_of_14_400_points_needs_no_dense_matrix():
+    """A dense covariance alone would take 1.7 GB per component; the FFT of 28 800 points takes a megabyte."""
+    found = process(autoregressive(14_400, 0.9))
+    drawn = found.sample(2, seeded())
+    assert drawn.shape == (2, 14_400, 1) and drawn.isfinite().all()
+    # Time averages of one path; correlation time of 19 steps: 760 independent values, 5 % of a variance, five of them.
+    assert (drawn - found.mean).var().item() == pytest.approx(found.covariance[0, 0].item(), rel=0.25)
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        (np.where(np.arange(20) == 6, np.nan, 1.0), r"not finite at sample 6, t = 3 s"),
+        (np.where(np.arange(20) == 19, np.inf, 1.0), r"not finite at sample 19, t = 9\.5 s"),
+        (np.ones(7), "record has 7 samples; at least 8"),
+    ],
+)
+def test_bad_records_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        process(values)
+
+
+@pytest.mark.parametrize("change", [{"knots": 7}, {"kernel_width": 0.0}, {"penalty": -1.0}, {"tube": math.nan}])
+def test_wrong_parameters_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        ExogenousConfig(**change)

@@ -1,0 +1,298 @@
+"""Figures against the numbers they are drawn from, on snapshots of short trainings."""
+
+import copy
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+
+from rt_torchrl import figures
+from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.assimilation import AssimilationConfig
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.envs.wind_turbine import figures as turbine_figures
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.figures.policy import RESOLUTION, visited_observations
+from rt_torchrl.memory import Record
+from rt_torchrl.model_based import ModelBasedConfig
+from rt_torchrl.model_free import ModelFreeConfig
+from rt_torchrl.report import episode_record
+from rt_torchrl.signal import Signal
+from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.twin import DigitalTwin
+
+EVERYWHERE = {"states", "actions", "policy_contours", "learning_curves", "seconds"}
+
+
+def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
+    generator = torch.Generator().manual_seed(0)
+    policy = plant.make_policy(generator)
+    twin = DigitalTwin(plant, plant.make_closure(generator))
+    initial, reports = copy.deepcopy(twin.closure), []
+    config = TwinningConfig(
+        arm=arm,
+        realisations=2,
+        virtual_episodes=2,
+        model_free=ModelFreeConfig(critic_iterations=2, actor_iterations=2, batch_size=8),
+        assimilation=AssimilationConfig(iterations=2),
+        model_based=ModelBasedConfig(iterations=1),
+    )
+    policies = {"model_free": policy, "model_based": copy.deepcopy(policy)}
+    twinning = ReinforcementTwinning(PlantEnv(plant), twin, **policies, config=config, generator=generator)
+    for _ in range(episodes):
+        live = twinning.switch.live
+        reports.append(episode_record(twinning.episode(), episode=len(reports), live=live))
+    return Snapshot.take(twinning, initial, reports)
+
+
+@pytest.fixture(scope="module")
+def oscillator() -> Snapshot:
+    return trained(LinearQuadratic())
+
+
+@pytest.fixture(scope="module")
+def turbine() -> Snapshot:
+    return trained(WindTurbine(horizon=60.0))
+
+
+def draw(figure) -> set[str]:
+    """Draw it, which raises on broken mathtext; return every text."""
+    FigureCanvasAgg(figure).draw()
+    return {text.get_text() for text in figure.findobj(Text)}
+
+
+def clipped_texts(figure) -> list[str]:
+    """Titles and axis labels that stick out of the canvas of a drawn figure."""
+    texts = [figure._suptitle]
+    for ax in figure.axes:
+        texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
+    boxes = {text.get_text(): text.get_window_extent() for text in texts if text.get_text()}
+    width, height = figure.bbox.size
+    return [name for name, b in boxes.items() if b.x0 < 0 or b.y0 < 0 or b.x1 > width or b.y1 > height]
+
+
+def line(ax, label):
+    return next(line for line in ax.lines if line.get_label() == label)
+
+
+def same(line, values) -> bool:
+    return np.array_equal(line.get_ydata(), values.detach().numpy())
+
+
+@pytest.mark.parametrize("name", ["oscillator", "turbine"])
+def test_every_figure_is_drawn_within_its_canvas(name, request):
+    snapshot = request.getfixturevalue(name)
+    drawn = figures.figures_of(snapshot)
+    assert set(drawn) == EVERYWHERE | {"exogenous"}
+    if name == "turbine":
+        more = turbine_figures.figures_of(snapshot)
+        assert set(more) == {"power_and_speed", "power_coefficient", "scatter"}
+        drawn |= more
+    for figure in drawn.values():
+        assert draw(figure)
+        assert clipped_texts(figure) == []
+    # Nothing is left behind: no figure is registered anywhere.
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or pyplot.get_fignums() == []
+
+
+@pytest.mark.parametrize("name", ["oscillator", "turbine"])
+def test_states_are_record_and_replay_with_units_and_residual(name, request):
+    snapshot = request.getfixturevalue(name)
+    plant, figure = snapshot.plant, figures.states(snapshot)
+    for k, (ax, signal) in enumerate(zip(figure.axes, plant.states, strict=True)):
+        assert same(line(ax, "real"), snapshot.record.states[:, k])
+        assert same(line(ax, "twin"), snapshot.replay[:, k])
+        assert ax.get_title(loc="left") == signal.label
+        assert line(ax, "real").get_xdata()[-1] == pytest.approx(plant.horizon, rel=1e-12)
+    residual = (snapshot.replay[:, 0] - snapshot.record.states[:, 0]).square().mean().sqrt()
+    assert figure.axes[0].get_title(loc="right") == f"RMS {residual:.2g} {plant.states[0].unit}"
+    assert "time [s]" in draw(figure)
+
+
+@pytest.mark.parametrize(("horizon", "unit"), [(1200.0, "s"), (3600.0, "min"), (36_000.0, "h")])
+def test_time_axis_suits_the_horizon(oscillator, horizon, unit):
+    # Twelve intervals, however long: the figure knows the plant's dt alone.
+    plant, record = LinearQuadratic(dt=horizon / 12, horizon=horizon), oscillator.record
+    short = Record(record.states[:13], record.exogenous[:12], record.actions[:12])
+    figure = figures.actions(replace(oscillator, plant=plant, record=short))
+    assert figure.axes[-1].get_xlabel() == f"time [{unit}]"
+    length = {"s": 1.0, "min": 60.0, "h": 3600.0}[unit]
+    assert figure.axes[-1].get_xlim() == pytest.approx((0.0, horizon / length), rel=1e-12)
+
+
+def test_actions_are_applied_ones_between_their_limits(turbine):
+    figure = figures.actions(turbine)
+    for k, (ax, signal) in enumerate(zip(figure.axes, turbine.plant.actions, strict=True)):
+        assert same(ax.lines[0], turbine.record.actions[:, k])
+        assert [ax.get_title(loc="left"), ax.lines[0].get_drawstyle()] == [signal.label, "steps-post"]
+        assert [limit.get_ydata()[0] for limit in ax.lines[1:]] == [signal.low, signal.high]
+    # Who acted is who was live then, not who is live after the switch.
+    assert "model-free, live" in draw(figures.actions(replace(turbine, live="model_based")))
+
+
+def test_exogenous_shows_record_mean_and_samples(turbine):
+    above, below = figures.exogenous(turbine).axes
+    assert same(line(above, "recorded"), turbine.record.exogenous[:, 0])
+    for ax in (above, below):
+        assert same(line(ax, "large scale (SVR)"), turbine.large_scale[:, 0])
+        assert ax.get_title(loc="left") == turbine.plant.inputs[0].label
+    assert same(line(below, "3 samples"), turbine.realisations[0, :, 0])
+    assert len(below.lines) == 4
+
+
+@pytest.mark.parametrize("name", ["oscillator", "turbine"])
+def test_contours_are_the_policies(name, request, monkeypatch):
+    snapshot, filled, original = request.getfixturevalue(name), [], Axes.contourf
+
+    def contourf(ax, x, y, values, **options):
+        filled.append((x, y, values, options["levels"]))
+        return original(ax, x, y, values, **options)
+
+    monkeypatch.setattr(Axes, "contourf", contourf)
+    figure = figures.policy_contours(snapshot)
+    assert len(filled) == 2 * len(snapshot.plant.actions)
+    seen = visited_observations(snapshot)
+    for j, (x, y, values, levels) in enumerate(filled):
+        k, role = j // 2, ("model_based", "model_free")[j % 2]
+        for column, row in ((0, 0), (7, 60), (RESOLUTION - 1, 3)):
+            observation = torch.tensor([x[column], y[row]])
+            # A batch may round differently from a single point.
+            expected = snapshot.policies[role](observation)[k].item()
+            assert values[row, column] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+        assert levels[0] <= values.min() and values.max() <= levels[-1]
+        # Both policies share the scale, and no visited point lies outside the axes.
+        assert np.array_equal(levels, filled[2 * k][3])
+        assert x[0] <= seen[:, 0].min() and seen[:, 1].max() <= y[-1]
+    labels = draw(figure)
+    assert {signal.label for signal in (*snapshot.plant.actions, *snapshot.plant.observations)} <= labels
+
+
+class Observing(LinearQuadratic):
+    """The oscillator seen through the first or more of its state, and through its force."""
+
+    def __init__(self, count):
+        super().__init__(horizon=2.0)
+        self.observations = tuple(
+            Signal(symbol=f"e_{k + 1}", name=f"error_{k + 1}", unit="-", low=-1.0, high=1.0) for k in range(count)
+        )
+
+    def observe(self, t, state, exogenous):
+        return torch.cat([state, exogenous], -1)[..., : len(self.observations)]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_policies_of_one_and_of_three_observations(oscillator, count):
+    plant, gain = Observing(count), torch.tensor([[0.5, -0.2, 3.0]], dtype=torch.float64)[:, :count]
+    policies = {"model_based": LinearGain(gain), "model_free": LinearGain(0.0 * gain)}
+    snapshot = replace(oscillator, plant=plant, policies=policies)
+    figure = figures.policy_contours(snapshot)
+    texts = draw(figure)
+    if count == 1:
+        curve = line(figure.axes[0], "model-based")
+        np.testing.assert_allclose(curve.get_ydata(), -0.5 * curve.get_xdata(), rtol=1e-15)
+        assert plant.observations[0].label in texts
+    else:
+        assert any("other observations at their mean" in text for text in texts)
+
+
+def test_contours_of_a_constant_policy(oscillator):
+    constant = LinearGain(torch.zeros(1, 2, dtype=torch.float64))
+    draw(figures.policy_contours(replace(oscillator, policies=dict.fromkeys(oscillator.policies, constant))))
+
+
+def test_learning_curves_timeline_and_events(oscillator):
+    live = ["model_free", "model_free", "model_based", "model_based"]
+    events = ["keep", "swap", "clone", "keep"]
+    costs = [{"real_cost": 4.0 - k, "J_a_model_based": 1.0, "J_a_model_free": 2.0, "J_p": 0.1**k} for k in range(4)]
+    episodes = [c | {"live": r, "event": e} for c, r, e in zip(costs, live, events, strict=True)]
+    figure = figures.learning_curves(replace(oscillator, episodes=episodes))
+    control, identification, strip = figure.axes
+    assert list(line(control, "real system, live").get_ydata()) == [4.0, 3.0, 2.0, 1.0]
+    assert control.get_yscale() == identification.get_yscale() == "log"
+    # An event closes its episode.
+    assert [line(control, event).get_xdata()[0] for event in ("swap", "clone")] == [1.5, 2.5]
+    spans = [
+        [(path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in bars.get_paths()]
+        for bars in strip.collections
+        if bars.get_alpha() == 1.0
+    ]
+    assert [label.get_text() for label in strip.get_yticklabels()] == ["model-free", "model-based"]
+    assert spans == [[(-0.5, 0.5), (0.5, 1.5)], [(1.5, 2.5), (2.5, 3.5)]]
+    assert draw(figure) >= {"swap", "clone"}
+
+
+@pytest.mark.parametrize("arm", ["model_free", "model_based"])
+def test_arms_leave_out_what_they_do_not_have(arm):
+    snapshot = trained(LinearQuadratic(horizon=2.0), arm=arm, episodes=1)
+    drawn = figures.figures_of(snapshot)
+    assert set(drawn) == EVERYWHERE | ({"exogenous"} if arm == "model_based" else set())
+    assert len(drawn["learning_curves"].axes) == (2 if arm == "model_free" else 3)
+    for figure in drawn.values():
+        draw(figure)
+    draw(figures.exogenous(snapshot))
+    bare = replace(snapshot, episodes=[])
+    assert set(figures.figures_of(bare)) == set(drawn) - {"learning_curves", "seconds"}
+
+
+def test_seconds_are_stacked(oscillator):
+    (ax,) = figures.seconds(oscillator).axes
+    tops = [max(bar.get_y() + bar.get_height() for bar in column) for column in zip(*ax.containers, strict=True)]
+    totals = [sum(episode["seconds"].values()) for episode in oscillator.episodes]
+    assert tops == pytest.approx(totals, rel=1e-12)
+    assert ax.get_title(loc="left") == "wall-clock time [s]"
+
+
+def test_power_and_speed_against_their_references(turbine):
+    wind, speed, power, torque, pitch = axes = turbine_figures.power_and_speed(turbine).axes
+    state, action = turbine.record.states[:-1], turbine.record.actions
+    assert same(line(wind, "wind"), turbine.record.exogenous[:, 0])
+    assert same(line(speed, "real"), 97.0 * state[:, 0])
+    assert same(line(speed, "filtered"), state[:, 1])
+    # The generator is far above its cut-in speed, so its power is torque times speed.
+    np.testing.assert_allclose(line(power, "real").get_ydata(), 97e-6 * state[:, 0] * action[:, 0], rtol=1e-12)
+    assert line(power, r"reference $\tilde P$").get_ydata().max() <= 5.0
+    assert line(speed, r"reference $\tilde\omega_g$").get_ydata().max() <= 122.9096
+    assert same(line(torque, "applied"), 1e-3 * action[:, 0]) and same(line(pitch, "applied"), action[:, 1])
+    units = [ax.get_title(loc="left").split("[")[1] for ax in axes]
+    assert units == ["m/s]", "rad/s]", "MW]", "kN m]", "deg]"]
+
+
+def test_power_coefficient_of_each_closure(turbine):
+    figure = turbine_figures.power_coefficient(turbine)
+    left, right = figure.axes
+    curves = {curve.get_gid(): curve for curve in left.lines if curve.get_gid()}
+    closures = {"true": turbine.plant.closure, "twin": turbine.closure, "initial twin": turbine.initial_closure}
+    for name, closure in closures.items():
+        curve = curves[f"{name}, 10 deg"]
+        expected = closure(torch.tensor([curve.get_xdata()[77], 10.0], dtype=torch.float64)).item()
+        # A batch may round differently from a single point.
+        assert curve.get_ydata()[77] == pytest.approx(expected, rel=1e-12)
+    lam = 63.0 * turbine.record.states[:-1, 0] / turbine.record.exogenous[:, 0]
+    visited = torch.stack([lam, turbine.record.actions[:, 1]], -1)
+    true, twin = (closure(visited).squeeze(-1).detach() for closure in (turbine.plant.closure, turbine.closure))
+    np.testing.assert_allclose(line(right, "true").get_ydata(), true, rtol=1e-12)
+    np.testing.assert_allclose(line(right, "twin").get_ydata(), twin, rtol=1e-12)
+    assert f"visited: {(twin - true).square().mean().sqrt():.2g}" in figure._suptitle.get_text()
+
+
+def test_scatter_is_twin_over_real(turbine):
+    (ax,) = turbine_figures.scatter(turbine).axes
+    points = line(ax, "sample")
+    assert same(points, 97.0 * turbine.replay[:, 0])
+    assert np.array_equal(points.get_xdata(), 97.0 * turbine.record.states[:, 0].numpy())
+    assert "rad/s" in ax.get_title(loc="left") and "rad/s" in ax.get_xlabel()
+
+
+def test_a_perfect_twin_has_no_residual(oscillator):
+    closure = LinearClosure(LinearQuadratic.true_closure)
+    twin, record = DigitalTwin(oscillator.plant, closure), oscillator.record
+    replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None]).states[0].detach()
+    figure = figures.states(replace(oscillator, closure=closure, replay=replay))
+    assert [ax.get_title(loc="right") for ax in figure.axes] == ["RMS 0 m", "RMS 0 m/s"]

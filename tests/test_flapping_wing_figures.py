@@ -1,0 +1,211 @@
+"""The drone's figures and animation against the numbers they are drawn from, on a short flight."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+from PIL import Image
+from torch import nn
+
+from rt_torchrl.envs.flapping_wing import figures
+from rt_torchrl.envs.flapping_wing.animation import FRAMES, RATE, save_animation
+from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.memory import Record
+from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.trajectory import Rollout
+
+SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
+
+
+@pytest.fixture(scope="module")
+def snapshot() -> Snapshot:
+    """Four beats of the real drone, and of a twin that has half the lift."""
+    plant, generator = FlappingWing(horizon=0.2), torch.Generator().manual_seed(0)
+    policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
+    twin = QuasiSteadyPolar(torch.tensor([0.86, 0.05, 1.5], dtype=torch.float64))
+    start, wind = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure, policies["model_based"])(start, wind)
+        replayed = Rollout(plant, twin)(start, wind, flown.actions)
+    return Snapshot(
+        plant=plant,
+        closure=twin,
+        initial_closure=plant.make_closure(generator),
+        policies=policies,
+        live="model_based",
+        record=Record(flown.states[0], wind[0], flown.actions[0]),
+        replay=replayed.states[0],
+        large_scale=wind[0] + 0.1,
+        realisations=None,
+        episodes=[],
+    )
+
+
+def draw(figure) -> set[str]:
+    """Draw it, which raises on broken mathtext; return every text."""
+    FigureCanvasAgg(figure).draw()
+    return {text.get_text() for text in figure.findobj(Text)}
+
+
+def line(ax, label):
+    return next(line for line in ax.lines if line.get_label() == label)
+
+
+def panel(figure, caption):
+    return next(ax for ax in figure.axes if ax.get_title(loc="left") == caption)
+
+
+def same(line, values) -> bool:
+    return np.array_equal(line.get_ydata(), values.numpy())
+
+
+def test_every_figure_is_drawn_within_its_canvas(snapshot):
+    drawn = figures.figures_of(snapshot)
+    assert set(drawn) == {"flight_path", "flight", "polars", "control_surfaces"}
+    for name, figure in drawn.items():
+        assert draw(figure)
+        width, height = figure.bbox.size
+        texts = [figure._suptitle]
+        for ax in figure.axes:
+            texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
+        for box in (text.get_window_extent() for text in texts if text.get_text()):
+            assert min(box.x0, box.y0) >= 0 and box.x1 <= width and box.y1 <= height, name
+
+
+def test_flight_path_is_the_record(snapshot):
+    figure = figures.flight_path(snapshot)
+    plant, real = snapshot.plant, snapshot.record.states
+    path, wind, distance = (panel(figure, name) for name in ("vertical plane", *_side_labels(plant)))
+    for name, states in (("real", real), ("twin", snapshot.replay)):
+        assert np.array_equal(line(path, name).get_xydata(), states[:, :2].numpy())
+        away = torch.hypot(states[:, 0] - 5.0, states[:, 1] - 5.0)
+        np.testing.assert_allclose(line(distance, name).get_ydata(), away.numpy(), rtol=1e-14)
+    assert line(path, "target").get_xydata().tolist() == [[5.0, 5.0]]
+    assert (path.get_xlabel(), path.get_ylabel()) == (plant.states[0].label, plant.states[1].label)
+    assert path.get_aspect() == 1.0
+    assert same(line(wind, "recorded"), snapshot.record.exogenous[:, 0])
+    assert same(line(wind, "large scale (SVR)"), snapshot.large_scale[:, 0])
+    assert 2.554 in [entry.get_ydata()[0] for entry in wind.lines]
+    assert distance.get_xlabel() == "time [s]"
+
+
+def _side_labels(plant):
+    return plant.inputs[0].label, "distance to the target [m]"
+
+
+def test_flight_path_marks_seconds_and_leaves_out_what_there_is_not(snapshot):
+    # The same record read at a longer interval lasts two seconds; the last mark is its end.
+    slow = FlappingWing(horizon=0.2)
+    slow.dt = 5e-3
+    figure = figures.flight_path(replace(snapshot, plant=slow, large_scale=None))
+    path, wind = panel(figure, "vertical plane"), panel(figure, slow.inputs[0].label)
+    assert np.array_equal(line(path, "every second").get_xydata(), snapshot.record.states[[200, 400], :2].numpy())
+    (arrows,) = path.collections
+    # A headwind blows towards -x.
+    np.testing.assert_array_equal(arrows.U, -snapshot.record.exogenous[[199, 399], 0].numpy())
+    assert [entry.get_label() for entry in wind.lines if entry.get_label()[0] != "_"] == ["recorded"]
+
+
+def test_flight_is_the_record_and_its_means_over_the_beats(snapshot):
+    figure, plant = figures.flight(snapshot), snapshot.plant
+    for k in (0, 1):
+        ax = panel(figure, plant.states[k].label)
+        assert same(line(ax, "real"), snapshot.record.states[:, k])
+        assert same(line(ax, "twin"), snapshot.replay[:, k])
+        assert line(ax, "target").get_ydata()[0] == 5.0
+    beats = {signal.label: snapshot.record.states[:-1, k] for k, signal in enumerate(plant.states) if k > 1}
+    beats |= {signal.label: snapshot.record.actions[:, k] for k, signal in enumerate(plant.actions)}
+    for label, values in beats.items():
+        ax, by_beat = panel(figure, label), values.reshape(4, SAMPLES_PER_BEAT)
+        # The sums are made in another order.
+        np.testing.assert_allclose(line(ax, "real").get_ydata(), by_beat.mean(1).numpy(), rtol=1e-12, atol=1e-14)
+        band = ax.collections[0].get_paths()[0].vertices[:, 1]
+        assert (band.min(), band.max()) == (values.min().item(), values.max().item())
+    for signal in plant.actions:
+        ends = [entry.get_ydata()[0] for entry in panel(figure, signal.label).lines[1:]]
+        assert ends == [signal.low, signal.high]
+    assert "time [s]" in draw(figure)
+
+
+def test_polars_are_those_of_the_closures(snapshot):
+    figure = figures.polars(snapshot)
+    lift, drag, share = figure.axes
+    angle = line(lift, "true").get_xdata()
+    alpha = np.radians(angle)
+    laws = {"true": (1.71, 0.043, 1.595), "twin": (0.86, 0.05, 1.5)}
+    laws["initial twin"] = snapshot.initial_closure.coefficients.tolist()
+    for name, (a, b, c) in laws.items():
+        # Curves of order one, exact to rounding.
+        np.testing.assert_allclose(line(lift, name).get_ydata(), a * np.sin(2 * alpha), atol=1e-13)
+        np.testing.assert_allclose(line(drag, name).get_ydata(), b + c * (1 - np.cos(2 * alpha)), atol=1e-13)
+    assert "twin: a = 0.86, b = 0.05, c = 1.5" in figure._suptitle.get_text()
+    assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+    assert [ax.get_title(loc="left")[-3:] for ax in (lift, drag)] == ["[-]", "[-]"]
+    assert share.get_xlabel().endswith("[deg]")
+
+
+def test_visited_angles_are_those_of_the_kinematics(snapshot):
+    # At rest in calm air the element moves along the stroke alone: alpha_e = alpha - 90 deg or alpha + 90 deg,
+    # from the chord's pitch 45 sin(2 pi f t) deg and the direction of the stroke.
+    record = snapshot.record
+    still = replace(
+        snapshot, record=Record(torch.zeros_like(record.states), torch.zeros_like(record.exogenous), record.actions)
+    )
+    sine, cosine = figures.visited_features(still).T.numpy()
+    phase = 2 * math.pi * 20.0 * 5e-4 * np.arange(len(record.actions))
+    moving = np.abs(np.sin(phase)) > 0.1
+    pitch = math.pi / 4 * np.sin(phase)
+    direction = np.sign(np.sin(phase))
+    # The floor of the speed, 0.01 m/s, shortens the direction by (0.01 / 0.7 m/s)^2 / 2 where the wing is slowest.
+    np.testing.assert_allclose(sine[moving], (direction * np.cos(pitch))[moving], atol=2e-4)
+    np.testing.assert_allclose(cosine[moving], (direction * np.sin(pitch))[moving], atol=2e-4)
+
+
+def test_polars_of_a_law_without_named_coefficients(snapshot):
+    network = nn.Sequential(nn.Linear(2, 2, dtype=torch.float64))
+    figure = figures.polars(replace(snapshot, closure=network, initial_closure=network))
+    title = figure._suptitle.get_text()
+    assert "true: a = 1.71" in title and "twin" not in title
+
+
+def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(snapshot):
+    figure = figures.control_surfaces(snapshot)
+    contours = [ax for ax in figure.axes if ax.get_title(loc="left") in ("model-based", "model-free")]
+    assert len(contours) == 8
+    planes = {(ax.get_xlabel(), ax.get_ylabel()) for ax in contours if ax.get_ylabel()}
+    e_x, e_z, de_x, de_z = (signal.label for signal in snapshot.plant.observations)
+    assert planes == {(e_x, de_x), (e_z, de_z)}
+    for ax in contours:
+        k = contours.index(ax) % 4 // 2
+        policy = snapshot.policies[ax.get_title(loc="left").replace("-", "_")]
+        filled, observation = ax.collections[0], torch.zeros(4, dtype=torch.float64)
+        plane = [0, 2] if ax.get_xlabel() == e_x else [1, 3]
+        corner = [ax.get_xlim()[0], ax.get_ylim()[1]]
+        observation[plane] = torch.tensor(corner, dtype=torch.float64)
+        value = policy(observation)[k].item()
+        level = np.searchsorted(filled.levels, value) - 1
+        # The corner is a vertex of the band that holds its value.
+        distance = np.linalg.norm(filled.get_paths()[level].vertices - corner, axis=1)
+        assert distance.min() < 1e-9
+
+
+def test_animation_has_all_frames(snapshot, tmp_path):
+    path = save_animation(snapshot, tmp_path / "flight.gif")
+    with Image.open(path) as animation:
+        assert animation.n_frames == FRAMES
+        assert animation.info["duration"] == 1000 / RATE
+        first = np.asarray(animation.convert("RGB"))
+        animation.seek(FRAMES - 1)
+        assert (np.asarray(animation.convert("RGB")) != first).any()
+    assert path.stat().st_size < 3_000_000
+
+
+def test_animation_of_another_format_is_refused(snapshot, tmp_path):
+    with pytest.raises(ValueError, match=r"flight\.mp4.*must end in '\.gif'"):
+        save_animation(snapshot, tmp_path / "flight.mp4")
+    assert list(tmp_path.iterdir()) == []

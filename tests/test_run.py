@@ -1,0 +1,169 @@
+"""A whole run on the oracle plant: results, resuming, interrupting, and what is refused before any work."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.evaluation import mean_with_confidence
+from rt_torchrl.exploration import ExplorationConfig
+from rt_torchrl.memory import LongTermMemoryConfig
+from rt_torchrl.model_free import ModelFreeConfig
+from rt_torchrl.runner import Run, RunConfig
+from rt_torchrl.switching import SwitchConfig
+
+SMALL = TwinningConfig(
+    realisations=2,
+    virtual_episodes=2,
+    exploration=ExplorationConfig(episodes=2),
+    long_term=LongTermMemoryConfig(capacity=500),
+    model_free=ModelFreeConfig(critic_iterations=3, actor_iterations=3, batch_size=8, critic_hidden=(8,)),
+    # No patience, so that swaps and clones happen within the few episodes of a test.
+    switch=SwitchConfig(patience=0, clone_patience=0, stall=10.0),
+)
+
+
+def small_run(folder, episodes=3, **options):
+    config = RunConfig(
+        episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options
+    )
+    return Run(config, LinearQuadratic(horizon=2.0))
+
+
+def test_a_run_leaves_its_results_readable(tmp_path):
+    metrics = small_run(tmp_path).train()
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    assert [record["episode"] for record in metrics["episodes"]] == [0, 1, 2]
+    promised = {"J_p", "J_a_model_based", "J_a_model_free", "live", "real_cost", "event", "seconds"}
+    assert all(promised <= record.keys() for record in metrics["episodes"])
+    summary = metrics["summary"]
+    assert {"J_p_ratio", "J_a_ratio_model_based", "J_a_ratio_model_free", "unseen", "closure", "seconds"} <= set(
+        summary
+    )
+    assert {"J_p", "J_a_model_based", "J_a_model_free"} <= set(summary["unseen"])
+    assert json.loads((tmp_path / "config.json").read_text())["episodes"] == 3
+    assert {"states.png", "actions.png"} <= {path.name for path in (tmp_path / "figures").iterdir()}
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    logged = [event.value for event in events.Scalars("twin/J_p after assimilation")]
+    # TensorBoard keeps single precision.
+    assert logged == pytest.approx([record["J_p"] for record in metrics["episodes"]], rel=1e-6)
+
+
+def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
+    run = small_run(tmp_path)
+    found = run.train()["summary"]
+    policy = run.algorithm.policies["model_based"]
+    plant, state, costs = run.unseen.plant, run.unseen.initial_state, {}
+    # Independent of the library's rollout: the plant's step in a loop.
+    for name, pi in (("before", run.initial_policy), ("after", policy)):
+        s, total = state, 0.0
+        for k in range(plant.n_steps):
+            t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]
+            a = pi(s)
+            total = total + plant.running_cost(t, s, a, z) / plant.n_steps
+            s = plant.step(t, s, a, z, plant.closure).state
+        costs[name] = total.mean().item()
+    # Sums in another order: rounding only.
+    assert found["J_a_ratio_model_based"] == pytest.approx(costs["after"] / costs["before"], rel=1e-12)
+
+
+def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
+    whole = small_run(tmp_path / "whole", episodes=4).train()
+    small_run(tmp_path / "parts", episodes=2).train()
+    parts = small_run(tmp_path / "parts", episodes=4, resume=True).train()
+    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
+        assert {**one, "seconds": None} == {**other, "seconds": None}
+    for metrics in (whole, parts):
+        del metrics["summary"]["seconds"]
+    assert whole["summary"] == parts["summary"]
+
+
+def test_an_interrupt_keeps_the_episodes_done(tmp_path, monkeypatch):
+    run, plan = small_run(tmp_path, episodes=5), ReinforcementTwinning.plan
+
+    def interrupted(self):
+        if self.episodes_done == 2:
+            raise KeyboardInterrupt
+        return plan(self)
+
+    monkeypatch.setattr(ReinforcementTwinning, "plan", interrupted)
+    metrics = run.train()
+    assert len(metrics["episodes"]) == 2
+    monkeypatch.undo()
+    # The half episode left no trace: the resumed run equals one that was never interrupted.
+    resumed = small_run(tmp_path, episodes=4, resume=True).train()
+    whole = small_run(tmp_path / "whole", episodes=4).train()
+    assert [e["J_p"] for e in resumed["episodes"]] == [e["J_p"] for e in whole["episodes"]]
+
+
+def test_quick_is_a_small_run(tmp_path):
+    effective = RunConfig(quick=True, log_dir=tmp_path).effective()
+    assert (effective.episodes, effective.unseen, effective.twinning.model_free.critic_iterations) == (3, 5, 200)
+
+
+def test_a_taken_folder_is_refused(tmp_path):
+    small_run(tmp_path, episodes=1).train()
+    with pytest.raises(ValueError, match="holds a run already.*--resume.*--overwrite"):
+        small_run(tmp_path)
+    small_run(tmp_path, episodes=1, overwrite=True).train()
+
+
+def test_an_unwritable_folder_is_refused(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="log_dir=.*cannot be written"):
+        small_run(tmp_path / "file" / "run")
+
+
+def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
+    small_run(tmp_path, episodes=1).train()
+
+    class Other(LinearQuadratic):
+        name = "other"
+
+    config = RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=SMALL)
+    with pytest.raises(ValueError, match="checkpoint is of plant 'linear_quadratic', this training of 'other'"):
+        Run(config, Other(horizon=2.0))
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
+    small_run(tmp_path, episodes=1).train()
+    wider = dataclasses.replace(SMALL, model_free=dataclasses.replace(SMALL.model_free, critic_hidden=(9,)))
+    with pytest.raises(ValueError, match="weights do not fit"):
+        Run(RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"episodes": 0}, "episodes=0"),
+        ({"unseen": 1}, "unseen=1"),
+        ({"threads": -1}, "threads=-1"),
+        ({"resume": True}, "resume needs log_dir"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        RunConfig(**options)
+
+
+def test_an_unknown_device_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="device='nowhere' cannot be used"):
+        small_run(tmp_path, device="nowhere")
+
+
+def test_the_confidence_interval_covers_the_mean_as_often_as_it_says():
+    generator = torch.Generator().manual_seed(0)
+    covered = 0
+    for _ in range(200):
+        low, high = mean_with_confidence(torch.randn(40, generator=generator, dtype=torch.float64))[
+            "confidence_interval"
+        ]
+        covered += low <= 0.0 <= high
+    # 95 % nominal; a percentile bootstrap of 40 samples covers about 94 %. 200 trials have a deviation of 1.6 %, so
+    # 89 % is three of them below.
+    assert covered / 200 >= 0.89

@@ -1,0 +1,93 @@
+"""The decision tree of step 6, table-tested on scripted costs."""
+
+import math
+
+import pytest
+
+from rt_torchrl.switching import PolicySwitch, SwitchConfig
+
+WORSE, BETTER, EQUAL = (2.0, 1.0), (1.0, 2.0), (1.0, 1.0)
+MOVING, STALLED = 0.9, 0.1
+
+
+def play(config, script, live="model_free"):
+    """Events and counters of a script of ((live cost, idle cost), weight change)."""
+    switch = PolicySwitch(config, live=live)
+    return [(switch.decide(*costs, change), switch.worse_count, switch.stall_count) for costs, change in script], switch
+
+
+@pytest.mark.parametrize(
+    "script, expected",
+    [
+        # Worse: C_π counts, and the third time in a row exceeds P_π = 2.
+        ([(WORSE, MOVING)] * 4, [("keep", 1, 0), ("keep", 2, 0), ("swap", 0, 0), ("keep", 1, 0)]),
+        # A better episode in between restarts C_π.
+        (
+            [(WORSE, MOVING)] * 2 + [(BETTER, MOVING)] + [(WORSE, MOVING)] * 3,
+            [("keep", 1, 0), ("keep", 2, 0), ("keep", 0, 0), ("keep", 1, 0), ("keep", 2, 0), ("swap", 0, 0)],
+        ),
+        # Better and stalled: C_w counts, and the fourth time in a row exceeds P_w = 3.
+        (
+            [(BETTER, STALLED)] * 5,
+            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("clone", 0, 0), ("keep", 0, 1)],
+        ),
+        # Movement restarts C_w.
+        (
+            [(BETTER, STALLED)] * 3 + [(BETTER, MOVING), (BETTER, STALLED)],
+            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("keep", 0, 0), ("keep", 0, 1)],
+        ),
+        # So does a worse live policy: the branch of the clone is not reached, stalled or not.
+        (
+            [(BETTER, STALLED)] * 3 + [(WORSE, STALLED), (BETTER, STALLED)],
+            [("keep", 0, 1), ("keep", 0, 2), ("keep", 0, 3), ("keep", 1, 0), ("keep", 0, 1)],
+        ),
+        # Equal costs are not worse; a change equal to T_w is no stall.
+        ([(EQUAL, MOVING), (EQUAL, 0.5), (EQUAL, 0.4999)], [("keep", 0, 0), ("keep", 0, 0), ("keep", 0, 1)]),
+        # An infinite cost is worse than any other.
+        ([((math.inf, 1.0), MOVING), ((1.0, math.inf), MOVING)], [("keep", 1, 0), ("keep", 0, 0)]),
+    ],
+)
+def test_every_branch(script, expected):
+    assert play(SwitchConfig(), script)[0] == expected
+
+
+@pytest.mark.parametrize("patience", [0, 1, 4])
+def test_swap_and_clone_need_more_than_their_patience(patience):
+    config = SwitchConfig(patience=patience, clone_patience=patience)
+    for costs, event in ((WORSE, "swap"), (BETTER, "clone")):
+        events = [e for e, *_ in play(config, [(costs, STALLED)] * (2 * patience + 2))[0]]
+        assert events == (["keep"] * patience + [event]) * 2
+
+
+@pytest.mark.parametrize("live, other", [("model_free", "model_based"), ("model_based", "model_free")])
+def test_roles_exchange_and_only_by_a_swap(live, other):
+    switch = play(SwitchConfig(), [(WORSE, MOVING)] * 2, live)[1]
+    assert (switch.live, switch.idle) == (live, other)
+    switch.decide(*WORSE, MOVING)
+    assert (switch.live, switch.idle) == (other, live)
+    switch = play(SwitchConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
+    assert (switch.live, switch.idle) == (live, other)
+
+
+@pytest.mark.parametrize("live_cost, event", [(1.49, "keep"), (1.5, "keep"), (1.51, "swap")])
+def test_tolerance_is_a_factor_on_the_idle_cost(live_cost, event):
+    config = SwitchConfig(patience=0, tolerance=1.5)
+    assert PolicySwitch(config).decide(live_cost, 1.0, MOVING) == event
+
+
+@pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "change"])))
+def test_nan_is_refused_and_leaves_the_counters(position, name):
+    switch = play(SwitchConfig(), [(WORSE, MOVING)])[1]
+    arguments = [1.0, 1.0, 1.0]
+    arguments[position] = math.nan
+    with pytest.raises(ValueError, match=f"{name} of step 6 is NaN"):
+        switch.decide(*arguments)
+    assert (switch.live, switch.worse_count, switch.stall_count) == ("model_free", 1, 0)
+
+
+@pytest.mark.parametrize(
+    "change", [{"patience": -1}, {"clone_patience": -1}, {"tolerance": 0.0}, {"stall": -0.5}, {"stall": math.nan}]
+)
+def test_wrong_thresholds_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        SwitchConfig(**change)
