@@ -1,1 +1,22 @@
 """Reinforcement Twinning: a digital twin and two controllers, trained while the real system runs."""
+
+from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.plant import Plant
+from rt_torchrl.signal import Signal
+from rt_torchrl.trajectory import DivergenceError, Rollout, Trajectory, control_cost, identification_cost
+from rt_torchrl.twin import DigitalTwin
+
+__all__ = [
+    "DigitalTwin",
+    "DivergenceError",
+    "Plant",
+    "PlantEnv",
+    "ReinforcementTwinning",
+    "Rollout",
+    "Signal",
+    "Trajectory",
+    "TwinningConfig",
+    "control_cost",
+    "identification_cost",
+]

@@ -4,6 +4,7 @@ import copy
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -71,9 +72,11 @@ class ModelBased:
         because the best policy for a few winds can lie just beyond a cliff of another one.
         """
         before = copy.deepcopy(self.policy.state_dict())
-        incumbent = self._cost(judged_on)
+        with torch.no_grad():
+            incumbent = self._cost(judged_on)
         descended = self.descent.run(lambda: self._cost(planned_on), self.config.iterations)
-        accepted = self._cost(judged_on).item() <= incumbent.item()
+        with torch.no_grad():
+            accepted = bool(self._cost(judged_on) <= incumbent)
         if not accepted:
             self.policy.load_state_dict(before)
             self.restart()

@@ -1,9 +1,6 @@
 """What every plant fulfils: each folder under rt_torchrl.envs, found by itself, and the linear-quadratic oracle."""
 
-import importlib
-import inspect
 import math
-import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,23 +11,12 @@ from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-import rt_torchrl.envs
+from rt_torchrl.catalogue import plants
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import Rollout, control_cost
 from rt_torchrl.twin import DigitalTwin
 
-
-def plant_class(folder):
-    """The one plant that ``<folder>/plant.py`` defines."""
-    module = importlib.import_module(f"rt_torchrl.envs.{folder}.plant")
-    members = [m for m in vars(module).values() if inspect.isclass(m) and issubclass(m, Plant)]
-    (found,) = (m for m in members if m.__module__ == module.__name__ and not inspect.isabstract(m))
-    return found
-
-
-CLASSES = {"linear_quadratic": LinearQuadratic}
-CLASSES |= {m.name: plant_class(m.name) for m in pkgutil.iter_modules(rt_torchrl.envs.__path__) if m.ispkg}
+CLASSES = {"linear_quadratic": LinearQuadratic} | plants()
 GREATEST_EPISODE = 2000
 
 

@@ -27,31 +27,30 @@ class ContinuousAdjoint:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         field = _HeldField(interval, initial_state.shape[-1], compiled=self._compiled)
         weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
+        interval_span = torch.tensor([0.0, interval.plant.dt], dtype=torch.float64, device=drive.t.device)
         state, states = initial_state, []
         for k in range(drive.t.shape[0]):
             now = Drive(drive.t[k], drive.exogenous[k], drive.command[k])
             applied = interval.plant.actuate(state, interval.command(state, now))
-            field.start = drive.t[k]
             held = torch.cat([state, applied, now.exogenous], -1)
-            end = odeint_adjoint(field, held, field.span, method="rk4", adjoint_params=weights)[-1]
+            # In absolute time: the field is evaluated again in the backward pass, long after this loop has moved on.
+            span = drive.t[k] + interval_span
+            end = odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1]
             state = interval.plant.latch(end[..., : state.shape[-1]], applied)
             states.append(state)
         return torch.stack(states)
 
 
 class _HeldField(nn.Module):
-    """d[s, a, z]/dt = [f(t, s, a, z), 0, 0] over one interval, whose own clock starts at ``start``."""
+    """d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
 
     def __init__(self, interval: Interval, n_states: int, *, compiled: bool):
         super().__init__()
         plant = interval.plant
         self.closure, self.sizes = interval.closure, (n_states, len(plant.actions), len(plant.inputs))
         self.vector_field = compiled_if(compiled, plant.vector_field)
-        self.start: Tensor
-        device = next(iter([*interval.parameters(), *interval.buffers()])).device
-        self.span = torch.tensor([0.0, plant.dt], dtype=torch.float64, device=device)
 
-    def forward(self, elapsed: Tensor, held: Tensor) -> Tensor:
+    def forward(self, t: Tensor, held: Tensor) -> Tensor:
         state, action, exogenous = held.split(self.sizes, -1)
-        rate = self.vector_field(self.start + elapsed, state, action, exogenous, self.closure)
+        rate = self.vector_field(t, state, action, exogenous, self.closure)
         return torch.cat([rate, torch.zeros_like(action), torch.zeros_like(exogenous)], -1)

@@ -1,0 +1,86 @@
+"""Time of one gradient by each engine, measured in turn in one process."""
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from rt_torchrl.catalogue import plants
+from rt_torchrl.runner import main_of
+from rt_torchrl.trajectory import Engine, Rollout, control_cost
+
+REFERENCE: Engine = "odeint_adjoint"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Time the gradient of J_a with respect to policy and closure by the gradient engines.
+
+    Args:
+        plant: folder of the plant under envs.
+        realisations: trajectories N_z.
+        steps: control intervals; 0 takes the plant's whole episode.
+        repeats: gradients of each engine, in turn.
+        engines: the engines; the ratio is to the last one.
+        compiled: compile each engine.
+        threads: number of CPU threads; 0 leaves torch's default.
+        output: JSON file for the result.
+    """
+
+    plant: str = "flapping_wing"
+    realisations: int = 5
+    steps: int = 0
+    repeats: int = 3
+    engines: tuple[Engine, ...] = ("parallel", REFERENCE)
+    compiled: bool = True
+    threads: int = 0
+    output: Path | None = None
+
+    def __post_init__(self):
+        if self.plant not in plants():
+            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(plants())}.")
+
+
+def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
+    """One gradient as a function, always of the same trajectories."""
+    generator = torch.Generator().manual_seed(0)
+    plant = plants()[config.plant]()
+    closure, policy = plant.make_closure(generator), plant.make_policy(generator)
+    initial_state = plant.draw_initial_state(config.realisations, generator)
+    exogenous = plant.draw_exogenous(config.realisations, generator)[:, : config.steps or plant.n_steps]
+    rollout = Rollout(plant, closure, policy, engine=engine, compiled=config.compiled)
+    weights = [*closure.parameters(), *policy.parameters()]
+
+    def compute() -> torch.Tensor:
+        cost = control_cost(plant, rollout(initial_state, exogenous), exogenous).mean()
+        return torch.cat([part.flatten() for part in torch.autograd.grad(cost, weights)])
+
+    return compute
+
+
+def main(config: Config) -> None:
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    functions = {engine: gradient(config, engine) for engine in config.engines}
+    found = {engine: compute() for engine, compute in functions.items()}  # compiles
+    seconds: dict[str, list[float]] = {engine: [] for engine in functions}
+    for _ in range(config.repeats):
+        for engine, compute in functions.items():
+            start = time.perf_counter()
+            compute()
+            seconds[engine].append(time.perf_counter() - start)
+    last = config.engines[-1]
+    medians = {engine: statistics.median(values) for engine, values in seconds.items()}
+    for engine, median in medians.items():
+        gap = ((found[engine] - found[last]).norm() / found[last].norm()).item()
+        print(f"{engine:<15} {median:10.3f} s   {medians[last] / median:8.1f} times faster   gap {gap:.1e}")
+    if config.output:
+        config.output.write_text(json.dumps({"seconds": seconds, "medians": medians}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)
