@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.exogenous import ExogenousProcess
+from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
 from rt_torchrl.memory import Record
 from rt_torchrl.trajectory import identification_cost
 from rt_torchrl.twin import DigitalTwin
@@ -20,11 +23,14 @@ class AssimilationConfig:
     Args:
         iterations: n_G, gradients per episode.
         stop_ratio: end the loop once J_p is below this share of its value at the start of the episode; 0 never does.
+        method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
+            forward sensitivities, for closures of some ten weights, and makes no use of ``descent``.
         descent: how the closure's weights descend J_p.
     """
 
     iterations: int = 15
     stop_ratio: float = 0.0
+    method: Literal["gradient", "levenberg_marquardt"] = "gradient"
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self):
@@ -48,6 +54,7 @@ class Assimilation:
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
+        self.second_order = LevenbergMarquardt(twin.closure)
 
     def update(
         self, records: Sequence[Record], processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
@@ -64,8 +71,34 @@ class Assimilation:
         measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
         actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
 
+        if self.config.method == "levenberg_marquardt":
+            return self.second_order.run(
+                lambda: self.normal_equations(exogenous, measured, actions),
+                self.config.iterations,
+                stop_below=self.config.stop_ratio,
+            )
+
         def cost() -> Tensor:
             replayed = self.twin.replay(measured[:, 0], exogenous, actions)
             return identification_cost(self.twin.plant, replayed, measured).mean()
 
         return self.descent.run(cost, self.config.iterations, stop_below=self.config.stop_ratio)
+
+    def normal_equations(
+        self,
+        exogenous: Float[Tensor, "batch n n_z"],
+        measured: Float[Tensor, "batch samples n_s"],
+        actions: Float[Tensor, "batch n n_a"],
+    ) -> NormalEquations:
+        """J_p, its gradient and its Gauss-Newton matrix with respect to the closure's weights."""
+        states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions)
+        plant, target = self.twin.plant, measured[:, 1:]
+        pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
+        curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
+        share = plant.dt / len(measured)
+        g, H = pointwise(states, target), curvature(states, target)
+        return NormalEquations(
+            share * plant.discrepancy(states, target).sum(),
+            share * torch.einsum("bki,bkiw->w", g, S),
+            share * torch.einsum("bkiv,bkij,bkjw->vw", S, H, S),
+        )

@@ -22,6 +22,7 @@ def state_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
         "critic_optimiser": algorithm.model_free.critic_optimiser.state_dict(),
         "actor_optimiser": algorithm.model_free.actor_optimiser.state_dict(),
         "assimilation": algorithm.assimilation.descent.state_dict(),
+        "damping": algorithm.assimilation.second_order.damping,
         "model_based": algorithm.model_based.descent.state_dict(),
         "long_term": algorithm.long_term.state_dict(),
         "short_term": list(algorithm.short_term),
@@ -54,6 +55,7 @@ def restore(algorithm: ReinforcementTwinning, state: dict[str, Any]) -> None:
     algorithm.model_free.critic_optimiser.load_state_dict(state["critic_optimiser"])
     algorithm.model_free.actor_optimiser.load_state_dict(state["actor_optimiser"])
     algorithm.assimilation.descent.load_state_dict(state["assimilation"])
+    algorithm.assimilation.second_order.damping = state["damping"]
     algorithm.model_based.descent.load_state_dict(state["model_based"])
     algorithm.long_term.load_state_dict(state["long_term"])
     for memory in ("short_term", "processes"):

@@ -86,12 +86,8 @@ class Rollout:
             DivergenceError: if a state is not finite; says which plant, realisation, time and state.
         """
         self._validate(initial_state, exogenous, command)
-        n, batch = exogenous.shape[1], exogenous.shape[0]
-        t = start + self.plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
-        commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()
-        drive = Drive(t, exogenous.transpose(0, 1).contiguous(), commands)
-        for tensor, dimension in ((initial_state, 0), (drive.exogenous, 1), (drive.command, 1)):
-            torch._dynamo.maybe_mark_dynamic(tensor, dimension)  # one compiled graph for all batch sizes
+        drive = drive_of(self.plant, exogenous, command, start=start)
+        torch._dynamo.maybe_mark_dynamic(initial_state, 0)
         ends = self._engine.end_states(self.interval, initial_state.contiguous(), drive)
         self._require_finite(ends, start)
         states = torch.cat([initial_state.unsqueeze(0), ends])
@@ -133,6 +129,17 @@ class Rollout:
             f"before was {last}, the weights those of {' and '.join(weights)}. Use a smaller dt, or weights nearer to "
             "ones that are known to work."
         )
+
+
+def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float = 0.0) -> Drive:
+    """The drive, time first, of inputs and commands that come batch first."""
+    batch, n = exogenous.shape[:2]
+    t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
+    commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()
+    drive = Drive(t, exogenous.transpose(0, 1).contiguous(), commands)
+    for tensor in drive[1:]:
+        torch._dynamo.maybe_mark_dynamic(tensor, 1)  # one compiled graph for all batch sizes
+    return drive
 
 
 def require_double(role: str, module: nn.Module | None) -> None:

@@ -4,11 +4,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plant import Plant
+from rt_torchrl.sensitivity import Sensitivities
 from rt_torchrl.trajectory import Engine, Rollout, Trajectory
 
 
 class DigitalTwin:
     """Flies virtual episodes of a plant whose true closure it does not know.
+
+    ``sensitivities`` gives replayed states with their derivatives by the closure's weights.
 
     Args:
         plant: shared with the real system in simulation; its own closure is never used here.
@@ -21,6 +24,7 @@ class DigitalTwin:
         self.plant, self.closure = plant, closure
         self._engine, self._compiled = engine, compiled
         self._replay = self._rollout(None)
+        self.sensitivities = Sensitivities(plant, closure, compiled=compiled)
 
     def _rollout(self, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, self.closure, policy, engine=self._engine, compiled=self._compiled)

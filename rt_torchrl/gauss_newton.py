@@ -1,0 +1,84 @@
+r"""Levenberg-Marquardt steps: the natural optimiser for a closure of a few weights of very different effect.
+
+.. math::
+    (H + \mu\,\mathrm{diag}\,H)\,\Delta w = -g, \qquad
+    H = \mathbb E\sum_kS_k^\top\frac{\partial^2L}{\partial s^2}S_k\,\Delta t
+
+A first-order step follows the weight that the record shows best and leaves the others behind; this one weighs them by
+what the record says of each.
+"""
+
+import copy
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from rt_torchrl.descent import Descended
+
+
+class NormalEquations(NamedTuple):
+    """Cost, gradient ``n_w`` and Gauss-Newton matrix ``n_w n_w`` at the module's present weights."""
+
+    cost: Tensor
+    gradient: Tensor
+    matrix: Tensor
+
+
+class LevenbergMarquardt:
+    """Updates the trainable weights of a module in place; the damping μ is kept from run to run.
+
+    Args:
+        module: holds the weights.
+        damping: μ at the start; it falls tenfold with every step that lowers the cost and rises tenfold otherwise.
+    """
+
+    least_damping, greatest_damping = 1e-12, 1e12
+
+    def __init__(self, module: nn.Module, *, damping: float = 1e-3):
+        if not damping > 0:
+            raise ValueError(f"damping={damping} of Levenberg-Marquardt must be positive.")
+        self.module, self.damping = module, damping
+
+    @torch.no_grad()
+    def run(self, equations: Callable[[], NormalEquations], iterations: int, *, stop_below: float = 0.0) -> Descended:
+        """Try ``iterations`` steps; a step that raises the cost, or makes it infinite, is taken back.
+
+        Args:
+            equations: at the module's present weights.
+            iterations: number of trial steps; 0 does nothing.
+            stop_below: stop early once the cost is below this share of its start; 0 never does.
+        """
+        if iterations == 0:
+            return Descended(float("nan"), float("nan"), float("nan"), 0)
+        weights = [w for w in self.module.parameters() if w.requires_grad]
+        current = equations()
+        start, gradient, count = current.cost.item(), current.gradient.norm().item(), 0
+        while count < iterations and not current.cost < stop_below * start:
+            count += 1
+            before = copy.deepcopy(self.module.state_dict())
+            vector_to_parameters(parameters_to_vector(weights) + self._step(current), weights)
+            trial = self._attempt(equations)
+            if trial is not None and trial.cost <= current.cost:
+                current, self.damping = trial, max(0.1 * self.damping, self.least_damping)
+            else:
+                self.module.load_state_dict(before)
+                self.damping = min(10.0 * self.damping, self.greatest_damping)
+        return Descended(start, current.cost.item(), gradient, count)
+
+    def _step(self, current: NormalEquations) -> Tensor:
+        diagonal = current.matrix.diagonal()
+        # A weight that the record does not show at all gets the smallest curvature that is not rounding.
+        floor = diagonal.max() * torch.finfo(diagonal.dtype).eps
+        damped = current.matrix + self.damping * torch.diag(diagonal.clamp_min(floor))
+        return -torch.linalg.solve(damped, current.gradient)
+
+    def _attempt(self, equations: Callable[[], NormalEquations]) -> NormalEquations | None:
+        """The equations at the trial weights; None if the trajectory diverges there, which only refuses the step."""
+        try:
+            found = equations()
+        except FloatingPointError:
+            return None
+        return found if found.cost.isfinite() and found.matrix.isfinite().all() else None

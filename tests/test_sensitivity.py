@@ -1,0 +1,109 @@
+"""Forward sensitivities and Levenberg-Marquardt against backpropagation and known minima."""
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
+from rt_torchrl.trajectory import Rollout, identification_cost
+from rt_torchrl.twin import DigitalTwin
+
+
+def recorded(plant, batch=3, seed=0):
+    """A true trajectory under random commands, and a twin that starts from the wrong closure."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
+    share = torch.rand(batch, plant.n_steps, len(plant.actions), generator=generator, dtype=torch.float64)
+    exogenous = plant.draw_exogenous(batch, generator)
+    start = plant.draw_initial_state(batch, generator)
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure)(start, exogenous, low + share * (high - low))
+    return DigitalTwin(plant, plant.make_closure(generator)), flown, exogenous
+
+
+@pytest.mark.parametrize("plant", [LinearQuadratic(), WindTurbine(horizon=30.0)], ids=lambda plant: plant.name)
+def test_gradient_and_states_are_those_of_backpropagation(plant):
+    twin, flown, exogenous = recorded(plant)
+    found = Assimilation(twin, AssimilationConfig()).normal_equations(exogenous, flown.states, flown.actions)
+    rollout = Rollout(plant, twin.closure, engine="autograd")
+    cost = identification_cost(plant, rollout(flown.states[:, 0], exogenous, flown.actions), flown.states).mean()
+    gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, list(twin.closure.parameters()))])
+    # The same derivatives, forward instead of backward: rounding over at most 60 steps.
+    assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
+    assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-10
+
+
+def test_matrix_is_the_hessian_where_the_residual_vanishes():
+    """At the true weights the Gauss-Newton matrix is the Hessian of J_p, here by differences of exact gradients."""
+    plant = LinearQuadratic(horizon=2.0)
+    twin, flown, exogenous = recorded(plant)
+    twin.closure.load_state_dict(plant.closure.state_dict())
+    assimilation, weight = Assimilation(twin, AssimilationConfig()), twin.closure.matrix
+    found = assimilation.normal_equations(exogenous, flown.states, flown.actions)
+    columns, step = [], 1e-5
+    for k in range(weight.numel()):
+        gradients = []
+        for sign in (1.0, -1.0):
+            with torch.no_grad():
+                weight.view(-1)[k] += sign * step
+                gradients.append(assimilation.normal_equations(exogenous, flown.states, flown.actions).gradient)
+                weight.view(-1)[k] -= sign * step
+        columns.append((gradients[0] - gradients[1]) / (2.0 * step))
+    # step² of the central difference and the rounding 1e-16/1e-5, both about 1e-10 of the matrix.
+    torch.testing.assert_close(found.matrix, torch.stack(columns, -1), rtol=1e-7, atol=1e-8)
+
+
+def test_levenberg_marquardt_identifies_the_closure_to_rounding():
+    plant = LinearQuadratic(noise=0.0)
+    twin, flown, exogenous = recorded(plant)
+    assimilation = Assimilation(twin, AssimilationConfig(method="levenberg_marquardt"))
+    assimilation.second_order.run(
+        lambda: assimilation.normal_equations(exogenous, flown.states, flown.actions), iterations=15
+    )
+    # The record is noise-free and J_p quadratic at its minimum: Newton's convergence ends in rounding.
+    torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-8)
+
+
+class Valley(torch.nn.Module):
+    """Residuals w_1 − 1 and 10 (w_2 − w_1²): Rosenbrock's valley, in which gradient steps hardly move."""
+
+    def __init__(self):
+        super().__init__()
+        self.w = torch.nn.Parameter(torch.tensor([-1.2, 1.0], dtype=torch.float64))
+
+    def equations(self):
+        w1, w2 = self.w.detach()
+        residual = torch.stack([w1 - 1.0, 10.0 * (w2 - w1**2)])
+        J = torch.stack(
+            [torch.stack([torch.ones_like(w1), torch.zeros_like(w1)]), torch.stack([-20.0 * w1, w1 * 0 + 10.0])]
+        )
+        return NormalEquations(0.5 * residual @ residual, J.T @ residual, J.T @ J)
+
+
+def test_a_step_never_raises_the_cost_and_the_valley_is_followed():
+    valley = Valley()
+    optimiser, last = LevenbergMarquardt(valley), float("inf")
+    for _ in range(60):
+        found = optimiser.run(valley.equations, 1)
+        assert found.best <= min(found.start, last)
+        last = found.best
+    torch.testing.assert_close(valley.w.detach(), torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-6)
+
+
+def test_a_trial_that_diverges_is_taken_back():
+    valley, calls = Valley(), 0
+
+    def equations():
+        nonlocal calls
+        calls += 1
+        if calls > 1:
+            raise FloatingPointError
+        return valley.equations()
+
+    before = valley.w.detach().clone()
+    optimiser = LevenbergMarquardt(valley, damping=1.0)
+    optimiser.run(equations, 3)
+    assert torch.equal(valley.w.detach(), before)
+    assert optimiser.damping == pytest.approx(1e3)
