@@ -179,6 +179,7 @@ class Run:
     def _episode(self, dashboard: Dashboard) -> None:
         live = self.algorithm.switch.live
         record = report.episode_record(self.algorithm.episode(), episode=len(self.episodes), live=live)
+        record["closure"] = report.named_weights(self.algorithm.twin.closure)
         self.episodes.append(record)
         checkpoint.save(self.folder / "checkpoint.pt", self.algorithm, self.episodes)
         dashboard.episode(record)

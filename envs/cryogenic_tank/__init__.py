@@ -1,0 +1,1 @@
+"""Cryogenic storage tank with a thermodynamic vent (paper, section 5.3)."""

@@ -1,0 +1,102 @@
+"""The exogenous input of the tank: the heat load of an orbit in and out of the sun."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class LoadModel(Protocol):
+    """Anything that draws histories of the heat load."""
+
+    def draw(
+        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
+    ) -> Float[Tensor, "{batch} {n_steps}"]:
+        """Heat load Q_h [W] of ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class CyclicLoad:
+    r"""Gaussian peaks once per orbit over a least load, with uniform noise (paper, section 5.3).
+
+    .. math::
+        Q_h(t) = \max\Big(0,\; Q_{min} + \hat Q\sum_j a_j\,e^{-(t - t_j)^2/(2\sigma^2)} + n(t)\Big), \quad
+        t_j = (j + \tfrac12)\,T_h,
+
+    with a_j uniform on 1 ± 0.1 and n uniform on ±√3 σ_n.
+
+    Note: the paper prints no width of the peaks; here T_h/8, which leaves the load near its minimum for almost half of
+    the orbit.
+
+    Args:
+        minimum: Q_min [W], not negative.
+        peak: nominal height Q̂ of a peak above it [W], not negative.
+        variation: largest relative departure of a peak's height, in [0, 1].
+        period: T_h [s], positive.
+        width: standard deviation σ of a peak in time [s], positive.
+        noise: standard deviation σ_n of the noise [W], not negative; it is white, one value per sample.
+
+    Raises:
+        ValueError: if an argument is out of its range.
+    """
+
+    minimum: float = 50.0
+    peak: float = 250.0
+    variation: float = 0.1
+    period: float = 5400.0
+    width: float = 675.0
+    noise: float = 25.0
+
+    def __post_init__(self):
+        for name, unit in (("minimum", "W"), ("peak", "W"), ("noise", "W")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}={value} {unit} of CyclicLoad must be zero or above.")
+        for name in ("period", "width"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}={value} s of CyclicLoad must be positive and finite.")
+        if not 0.0 <= self.variation <= 1.0:
+            raise ValueError(f"variation={self.variation} of CyclicLoad must be in [0, 1], a fraction of the peak.")
+
+    @property
+    def mean(self) -> float:
+        """Mean load [W] over whole orbits; exact if the noise, within ±√3σ_n, never reaches the floor at zero."""
+        return self.minimum + self.peak * self.width * math.sqrt(2.0 * math.pi) / self.period
+
+    def draw(
+        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
+    ) -> Float[Tensor, "{batch} {n_steps}"]:
+        """Heat load Q_h [W] of ``batch`` independent episodes, in float64 on the generator's device.
+
+        Args:
+            batch: number of episodes.
+            n_steps: samples of each.
+            dt: sampling interval [s].
+            generator: source of the peaks' heights and of the noise.
+
+        Raises:
+            ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
+        """
+        if batch < 1 or n_steps < 1:
+            raise ValueError(f"batch={batch} and n_steps={n_steps} must be at least 1.")
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ValueError(f"dt={dt} s must be positive and finite.")
+        like = {"dtype": torch.float64, "device": generator.device}
+        t = dt * torch.arange(n_steps, **like)
+        orbit = (t / self.period).floor().long()
+        # Peaks of neighbouring orbits count as far as six standard deviations, e^{−18} = 1.5e-8 of their height.
+        reach = math.ceil(6.0 * self.width / self.period)
+        peaks = int(orbit[-1]) + 1 + 2 * reach
+        height = 1.0 + self.variation * (2.0 * torch.rand(batch, peaks, generator=generator, **like) - 1.0)
+        load = torch.full((batch, n_steps), self.minimum, **like)
+        for j in range(-reach, reach + 1):
+            distance = t - (orbit + j + 0.5) * self.period
+            load += self.peak * height[:, orbit + j + reach] * torch.exp(-0.5 * (distance / self.width) ** 2)
+        noise = 2.0 * torch.rand(batch, n_steps, generator=generator, **like) - 1.0
+        return (load + math.sqrt(3.0) * self.noise * noise).clamp_min(0.0)

@@ -1,0 +1,27 @@
+"""What the operator of a tank judges an episode by."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.plant import Plant
+
+SETTLED_SHARE = 0.6
+"""Share of an episode after which the pressure should be held: three of five days."""
+BAND = 5e3
+"""Half width [Pa] of the band the pressure should be held in."""
+
+
+def merit(
+    plant: Plant,
+    states: Float[Tensor, "batch samples 3"],
+    applied: Float[Tensor, "batch n 1"],
+    exogenous: Float[Tensor, "batch n 1"],
+) -> dict[str, Float[Tensor, " batch"]]:
+    """Largest pressure error after three of five days, whether it is within the band, and the mass vented."""
+    settled = states[:, round(SETTLED_SHARE * applied.shape[1]) :, 2]
+    error = (settled - plant.set_point).abs().amax(-1)
+    return {
+        "late pressure error [kPa]": 1e-3 * error,
+        "held within 5 kPa [-]": (error <= BAND).double(),
+        "vented mass [kg]": plant.vented_mass(states, applied, plant.closure)[:, -1],
+    }

@@ -1,0 +1,227 @@
+"""Saturation properties of a pure fluid as differentiable functions of pressure."""
+
+import math
+import os
+import tempfile
+import zipfile
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.interpolate import make_interp_spline
+from torch import Tensor, nn
+
+CELLS = 128
+"""Pieces of the spline: values to 1e-7 of their maximum over 80 … 900 kPa of hydrogen, slopes to 2e-6."""
+DEGREE = 5
+LAYOUT = 1
+"""Version of the cached array; a file of another version is fitted again."""
+TOLERANCE = 1e-6
+"""Greatest error of a value between the nodes, over its maximum, with which a fit is accepted."""
+CRITICAL_SHARE = 0.95
+"""Share of the critical pressure up to which a fit is tried: above, slopes grow without bound."""
+
+
+class Properties(NamedTuple):
+    """Properties of saturated liquid (l) and vapour (v) at one pressure, or their slopes per Pa."""
+
+    T: Tensor  # [K]
+    rho_l: Tensor  # [kg/m³]
+    rho_v: Tensor  # [kg/m³]
+    h_l: Tensor  # [J/kg]
+    h_v: Tensor  # [J/kg]
+    c_p: Tensor  # of the liquid [J/(kg K)]
+
+
+class Saturation(nn.Module):
+    r"""T, ρ_l, ρ_v, h_l, h_v and c_p,l of a pure fluid over its saturation pressure.
+
+    Quintic splines in ln p through the values of CoolProp, on an even grid: the cell of a pressure is a floor, all
+    properties come with one gather, and Horner's rule gives values and slopes,
+
+    .. math:: f(p) = \sum_{m=0}^5 c_{im} u^m, \quad u = \frac{\ln(p/p_{lo})}{h} - i, \qquad
+        \frac{df}{dp} = \frac{1}{hp}\sum_{m=1}^5 m\,c_{im} u^{m-1}.
+
+    Four continuous derivatives: the plant needs one, its adjoint a second. The fit is made from CoolProp when it is
+    first needed, takes about a second, most of it to load CoolProp, and is kept in the user's cache.
+
+    Outside its range a property is NaN, never that of the nearest end: a trajectory that leaves the range stops with
+    the library's ``DivergenceError``. Where a pressure is at hand as a number, :meth:`check` says so at once.
+
+    Args:
+        fluid: a pure fluid by its name in CoolProp, such as ``Hydrogen`` (normal) or ``ParaHydrogen``.
+        low: least pressure [Pa].
+        high: greatest pressure [Pa].
+
+    Raises:
+        ValueError: if CoolProp does not know the fluid, it is a mixture, or the range is not one of its saturation.
+
+    Source: C. de Boor, *A Practical Guide to Splines*, chapter IX; I. H. Bell et al., *Ind. Eng. Chem. Res.* 53 (2014)
+    2498 (CoolProp).
+    """
+
+    def __init__(self, fluid: str = "Hydrogen", *, low: float = 80e3, high: float = 900e3):
+        super().__init__()
+        self.fluid, self.low, self.high = fluid, float(low), float(high)
+        if not (math.isfinite(high) and 0.0 < low < high):
+            raise ValueError(f"low={low} Pa and high={high} Pa must be positive, finite and increasing.")
+        self.register_buffer("table", torch.tensor(coefficients(fluid, self.low, self.high)))
+        self._width = math.log(high / low) / CELLS
+
+    def forward(self, p: Float[Tensor, "*batch"]) -> Properties:
+        """Properties at the pressure p [Pa]."""
+        return self.with_slopes(p)[0]
+
+    def with_slopes(self, p: Float[Tensor, "*batch"]) -> tuple[Properties, Properties]:
+        """Properties at the pressure p [Pa] and their derivatives along the saturation line [unit/Pa]."""
+        x = torch.log(p / self.low) / self._width
+        x = torch.where(self._within(p), x, math.nan)
+        # Clamped as an integer, where no derivative is lost: what a NaN becomes as an index is undefined.
+        cell = x.floor().long().clamp(0, CELLS - 1)
+        u = (x - cell).unsqueeze(-1)
+        c = self.table[cell]
+        value, slope = c[..., DEGREE, :], torch.zeros_like(c[..., DEGREE, :])
+        for power in range(DEGREE - 1, -1, -1):
+            slope = slope * u + value
+            value = value * u + c[..., power, :]
+        slope = slope / (self._width * p).unsqueeze(-1)
+        return Properties(*value.unbind(-1)), Properties(*slope.unbind(-1))
+
+    def check(self, p: Float[Tensor, "*batch"]) -> None:
+        """Refuse pressures outside the range.
+
+        Raises:
+            ValueError: with the worst of them and the range.
+        """
+        outside = ~self._within(p)
+        if outside.any():
+            offenders = p[outside]
+            worst = offenders[(offenders - 0.5 * (self.low + self.high)).abs().argmax()].item()
+            raise ValueError(
+                f"pressure p={worst / 1e3:g} kPa is outside the saturation table of {self.fluid}, "
+                f"{self.low / 1e3:g} … {self.high / 1e3:g} kPa; build Saturation with a range that holds it."
+            )
+
+    def _within(self, p: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
+        return (p >= self.low) & (p <= self.high)
+
+    def extra_repr(self) -> str:
+        return f"fluid={self.fluid!r}, p={self.low / 1e3:g}…{self.high / 1e3:g} kPa ({CELLS} cells)"
+
+
+@cache
+def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
+    """Spline coefficients [cell, power, property], from memory, from the user's cache, or fitted."""
+    # Another CoolProp may have other equations of state.
+    path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
+    table = _load(path, low, high)
+    if table is None:
+        table = fit(fluid, low, high)
+        _save(path, table, low, high)
+    table.flags.writeable = False  # every user of a fluid shares it
+    return table
+
+
+def cache_folder() -> Path:
+    """Where fits are kept: the user's cache folder."""
+    try:
+        from platformdirs import user_cache_path
+    except ModuleNotFoundError:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rt_torchrl"
+    return user_cache_path("rt_torchrl")
+
+
+def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 6"] | None:
+    """The cached table; None if there is none, or it cannot be read or is not what its name says."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            table, limits = file["table"], file["range"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    shape = (CELLS, DEGREE + 1, len(Properties._fields))
+    whole = table.shape == shape and table.dtype == np.float64 and np.isfinite(table).all()
+    return table if whole and np.array_equal(limits, [low, high]) else None
+
+
+def _save(path: Path, table: Float[np.ndarray, "cells 6 6"], low: float, high: float) -> None:
+    """Write a table so that other processes see it whole or not at all."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+            np.savez(file, table=table, range=np.array([low, high]))
+        os.replace(file.name, path)
+    except OSError:
+        return  # A folder that cannot be written costs the next process a second, not this one its fit.
+
+
+def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
+    """Fit the spline coefficients to CoolProp and compare them with it between the nodes.
+
+    Raises:
+        ValueError: as :class:`Saturation`, or if the fit misses ``TOLERANCE``.
+    """
+    fluid_state = _open_fluid(fluid, low, high)
+    nodes = np.linspace(math.log(low), math.log(high), CELLS + 1)
+    pressures = np.exp(nodes)
+    pressures[[0, -1]] = low, high
+    spline = make_interp_spline(nodes, _from_coolprop(fluid_state, pressures), k=DEGREE)
+    width = (nodes[-1] - nodes[0]) / CELLS
+    powers = [spline(nodes[:-1], nu=m) * width**m / math.factorial(m) for m in range(DEGREE + 1)]
+    between = 0.5 * (nodes[1:] + nodes[:-1])
+    truth = _from_coolprop(fluid_state, np.exp(between))
+    error = np.abs(spline(between) - truth).max(0) / np.abs(truth).max(0)
+    if error.max() > TOLERANCE:
+        raise ValueError(
+            f"the fit of {Properties._fields[error.argmax()]} of {fluid} over {low / 1e3:g} … {high / 1e3:g} kPa errs "
+            f"by {error.max():.1e} of its maximum, more than {TOLERANCE:.0e}; narrow the range, above all at its top."
+        )
+    return np.stack(powers, 1)
+
+
+def _open_fluid(fluid: str, low: float, high: float):
+    """CoolProp's state of a pure fluid, after a check that the range lies between triple and critical point."""
+    import CoolProp.CoolProp as CP  # here, because it takes a second to load and a cached fit does without
+
+    try:
+        fluid_state = CP.AbstractState("HEOS", fluid)
+        pure = CP.get_fluid_param_string(fluid, "pure") == "true"
+    except ValueError as error:
+        raise ValueError(
+            f"fluid={fluid!r} is not known to CoolProp; choose a pure fluid such as Hydrogen, ParaHydrogen, Nitrogen, "
+            "Oxygen or Methane."
+        ) from error
+    if not pure:
+        raise ValueError(
+            f"fluid={fluid!r} is a mixture, which boils over a range of temperatures; choose a pure fluid."
+        )
+    least, greatest = fluid_state.trivial_keyed_output(CP.iP_triple), CRITICAL_SHARE * fluid_state.p_critical()
+    if not (least <= low and high <= greatest):
+        raise ValueError(
+            f"low={low / 1e3:g} and high={high / 1e3:g} kPa of {fluid} must lie between its triple point, "
+            f"{least / 1e3:.4g} kPa, and {CRITICAL_SHARE:.0%} of its critical pressure, {greatest / 1e3:.4g} kPa."
+        )
+    return fluid_state
+
+
+def _from_coolprop(fluid_state, pressures: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
+    import CoolProp.CoolProp as CP
+
+    rows = []
+    for p in pressures:
+        fluid_state.update(CP.PQ_INPUTS, float(p), 0.0)
+        liquid, vapour = fluid_state.saturated_liquid_keyed_output, fluid_state.saturated_vapor_keyed_output
+        rows.append(
+            (
+                fluid_state.T(),
+                liquid(CP.iDmass),
+                vapour(CP.iDmass),
+                liquid(CP.iHmass),
+                vapour(CP.iHmass),
+                liquid(CP.iCpmass),
+            )
+        )
+    return np.array(rows)

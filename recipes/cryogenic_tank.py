@@ -1,0 +1,76 @@
+"""Reinforcement twinning of the cryogenic tank (paper, sections 5.3 and 6.4)."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import nn
+
+from rt_torchrl.algorithm import TwinningConfig
+from rt_torchrl.assimilation import AssimilationConfig
+from rt_torchrl.descent import DescentConfig
+from rt_torchrl.envs.cryogenic_tank import figures
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.model_based import ModelBasedConfig
+from rt_torchrl.model_free import ModelFreeConfig
+from rt_torchrl.policies import SaturatedMLP
+from rt_torchrl.runner import Run, RunConfig, main_of
+from rt_torchrl.switching import SwitchConfig
+
+PAPER = TwinningConfig(
+    # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.
+    realisations=1,
+    model_free=ModelFreeConfig(critic_iterations=1000, actor_iterations=1000, discount=0.998),
+    assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt"),
+    model_based=ModelBasedConfig(iterations=5, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    switch=SwitchConfig(patience=4, clone_patience=20),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunConfig):
+    """Train twin and controllers on the cryogenic tank.
+
+    Args:
+        policy: paper (a cubic of the pressure error, 3 weights) or mlp.
+        hidden: widths of the hidden layers of an mlp policy.
+        dt: control interval [s].
+        horizon: length of an episode T_o [s].
+        fluid: pure fluid in the tank, by its name in CoolProp.
+        wall: how the wall temperature is integrated: explicit, or exponential for a light wall.
+        wall_heat_capacity: m_s c_s [J/K].
+    """
+
+    policy: Literal["paper", "mlp"] = "paper"
+    hidden: tuple[int, ...] = (16, 16)
+    dt: float = 30.0
+    horizon: float = 4.32e5
+    fluid: str = "Hydrogen"
+    wall: Literal["explicit", "exponential"] = "explicit"
+    wall_heat_capacity: float = 500e3
+    unseen: int = 100
+    twinning: TwinningConfig = field(default_factory=lambda: PAPER)
+
+    def plant(self) -> CryogenicTank:
+        return CryogenicTank(
+            dt=self.dt,
+            horizon=self.horizon,
+            fluid=self.fluid,
+            wall=self.wall,
+            wall_heat_capacity=self.wall_heat_capacity,
+        )
+
+
+def main(config: Config) -> None:
+    plant = config.plant()
+
+    def make_policy(generator: torch.Generator) -> nn.Module:
+        if config.policy == "paper":
+            return plant.make_policy(generator)
+        return SaturatedMLP(len(plant.observations), plant.actions, hidden=config.hidden, generator=generator)
+
+    Run(config, plant, make_policy=make_policy, plant_figures=figures.figures_of).train()
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,235 @@
+"""Saturation properties against CoolProp, and the cache of their fit."""
+
+import math
+
+import CoolProp.CoolProp as CP
+import numpy as np
+import pytest
+import torch
+
+from rt_torchrl.envs.cryogenic_tank import saturation
+from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
+
+LOW, HIGH = 80e3, 900e3
+KEYS = {"T": ("T", 0), "rho_l": ("D", 0), "rho_v": ("D", 1), "h_l": ("H", 0), "h_v": ("H", 1), "c_p": ("C", 0)}
+
+
+def double(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def pressures(n=301):
+    """No nodes of the fit among them but the two ends."""
+    return np.linspace(LOW, HIGH, n)
+
+
+def from_coolprop(fluid, p):
+    """By CoolProp's high-level interface, where the fit uses the low-level one."""
+    return np.array([CP.PropsSI(key, "P", p, "Q", quality, fluid) for key, quality in KEYS.values()])
+
+
+def slopes_of_coolprop(fluid, p):
+    """First derivatives along the saturation line; of T, ρ and h by CoolProp itself, of c_p by central differences."""
+    state, columns = CP.AbstractState("HEOS", fluid), []
+    for key, quality in ((CP.iT, 0), (CP.iDmass, 0), (CP.iDmass, 1), (CP.iHmass, 0), (CP.iHmass, 1)):
+        column = []
+        for each in p:
+            state.update(CP.PQ_INPUTS, each, quality)
+            column.append(state.first_saturation_deriv(key, CP.iP))
+        columns.append(column)
+    up, down = (CP.PropsSI("C", "P", p + sign, "Q", 0, fluid) for sign in (1.0, -1.0))
+    return np.array([*columns, (up - down) / 2.0])
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """An empty cache, on disk and in memory."""
+    monkeypatch.setattr(saturation, "cache_folder", lambda: tmp_path / "deep" / "cache")
+    saturation.coefficients.cache_clear()
+    yield tmp_path / "deep" / "cache"
+    saturation.coefficients.cache_clear()
+
+
+# Properties
+
+
+@pytest.mark.parametrize("fluid", ["Hydrogen", "ParaHydrogen", "Nitrogen"])
+def test_values_are_those_of_coolprop(fluid):
+    p = pressures()
+    values = np.stack([x.numpy() for x in Saturation(fluid)(torch.from_numpy(p))])
+    truth = from_coolprop(fluid, p)
+    assert (np.abs(values - truth).max(1) < 1e-6 * np.abs(truth).max(1)).all()
+
+
+@pytest.mark.parametrize("fluid", ["Hydrogen", "ParaHydrogen", "Nitrogen"])
+def test_slopes_are_those_of_coolprop(fluid):
+    p = pressures()[1:-1]
+    _, slopes = Saturation(fluid).with_slopes(torch.from_numpy(p))
+    found, truth = np.stack([x.numpy() for x in slopes]), slopes_of_coolprop(fluid, p)
+    assert (np.abs(found - truth).max(1) < 1e-4 * np.abs(truth).max(1)).all()
+
+
+def test_temperature_at_the_set_point_of_the_tank():
+    p = double(500e3)
+    assert Saturation("Hydrogen")(p).T.item() == pytest.approx(27.243, abs=5e-4)
+    assert Saturation("ParaHydrogen")(p).T.item() == pytest.approx(27.112, abs=5e-4)
+
+
+def test_slopes_are_the_derivatives_of_the_values():
+    p = torch.linspace(LOW, HIGH, 41, dtype=torch.float64).requires_grad_()
+    values, slopes = Saturation().with_slopes(p)
+    for value, slope in zip(values, slopes, strict=True):
+        (gradient,) = torch.autograd.grad(value.sum(), p, retain_graph=True)
+        torch.testing.assert_close(slope, gradient, rtol=1e-10, atol=1e-12 * slope.abs().max().item())
+
+
+def test_derivatives_of_values_and_slopes():
+    fit = Saturation()
+    sizes = torch.stack(fit(double(HIGH)), -1).abs()
+
+    def scaled(log_p):
+        values, slopes = fit.with_slopes(log_p.exp())
+        return torch.stack(values, -1) / sizes, torch.stack(slopes, -1) / sizes * HIGH
+
+    log_p = torch.linspace(math.log(LOW) + 0.01, math.log(HIGH) - 0.01, 7, dtype=torch.float64)
+    assert torch.autograd.gradcheck(scaled, log_p.requires_grad_())
+
+
+def test_second_derivative_is_continuous_across_cells():
+    fit = Saturation()
+    knots = torch.exp(
+        math.log(LOW) + (math.log(HIGH / LOW) / saturation.CELLS) * torch.arange(1, saturation.CELLS).double()
+    )
+    found = []
+    for side in (1.0 - 1e-9, 1.0 + 1e-9):
+        p = (knots * side).requires_grad_()
+        slope = fit.with_slopes(p)[1]
+        found.append(torch.stack([torch.autograd.grad(s.sum(), p, retain_graph=True)[0] for s in slope]))
+    sizes = found[0].abs().amax(1, keepdim=True)
+    # Rounding of the values, 1e-14 or so, over the square of a cell's width of 0.02.
+    assert ((found[1] - found[0]).abs() < 1e-7 * sizes).all()
+
+
+def test_batches_and_function_transforms():
+    fit = Saturation()
+    p = torch.linspace(LOW, HIGH, 24, dtype=torch.float64).view(2, 3, 4)
+    flat = torch.stack(fit(p.flatten()), -1).view(2, 3, 4, 6)
+    assert torch.equal(torch.stack(fit(p), -1), flat)
+    assert torch.equal(torch.vmap(lambda q: torch.stack(fit(q), -1))(p), flat)
+    _, tangent = torch.func.jvp(lambda q: fit(q).T, (p,), (torch.ones_like(p),))
+    torch.testing.assert_close(tangent, fit.with_slopes(p)[1].T)
+
+
+# Outside the range
+
+
+@pytest.mark.parametrize("p", [79.9e3, 900.1e3, 0.0, -1.0, 1e9, math.inf, math.nan])
+def test_outside_the_range_everything_is_nan_and_check_raises(p):
+    fit = Saturation()
+    values, slopes = fit.with_slopes(double(p, 500e3))
+    assert all(x[0].isnan() and x[1].isfinite() for x in (*values, *slopes))
+    with pytest.raises(ValueError, match="Hydrogen, 80 … 900 kPa"):
+        fit.check(double(p, 500e3))
+
+
+def test_check_names_the_worst_pressure_and_accepts_the_ends():
+    fit = Saturation()
+    with pytest.raises(ValueError, match="p=1200 kPa"):
+        fit.check(double(79e3, 500e3, 1200e3))
+    fit.check(double(LOW, HIGH))
+    assert all(x.isfinite().all() for x in fit(double(LOW, HIGH)))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"fluid": "Unobtainium"}, "not known to CoolProp; choose a pure fluid such as Hydrogen"),
+        ({"fluid": "Air"}, "mixture"),
+        ({"low": 5e3}, "triple point, 7.358 kPa"),
+        ({"high": 1290e3}, "critical pressure, 1232 kPa"),
+        ({"fluid": "Helium"}, "critical pressure, 216.9 kPa"),
+        ({"low": 500e3, "high": 400e3}, "increasing"),
+        ({"low": -1.0}, "positive"),
+        ({"high": math.inf}, "finite"),
+        ({"low": math.nan}, "positive"),
+    ],
+)
+def test_bad_arguments_raise(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Saturation(**arguments)
+
+
+def test_a_fit_that_misses_its_tolerance_raises(monkeypatch):
+    monkeypatch.setattr(saturation, "TOLERANCE", 1e-12)
+    with pytest.raises(ValueError, match="narrow the range"):
+        saturation.fit("Hydrogen", LOW, HIGH)
+
+
+# Cache
+
+
+def forbidden(*arguments):
+    raise AssertionError("fitted although it was cached")
+
+
+def test_a_fit_is_made_once_and_kept(own_cache, monkeypatch):
+    first = Saturation().table
+    (path,) = own_cache.iterdir()  # and no half-written file beside it
+    monkeypatch.setattr(saturation, "fit", forbidden)
+    assert torch.equal(Saturation().table, first)  # from memory
+    saturation.coefficients.cache_clear()
+    assert torch.equal(Saturation().table, first)  # from the file
+    path.unlink()
+    saturation.coefficients.cache_clear()
+    with pytest.raises(AssertionError, match="fitted"):
+        Saturation()
+
+
+def test_modules_do_not_share_their_buffers(own_cache):
+    one, other = Saturation(), Saturation()
+    one.table.zero_()
+    assert other.table.abs().max() > 0
+
+
+def damaged(path, how):
+    content = path.read_bytes()
+    if how == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "flipped":
+        middle = len(content) // 2
+        path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+    else:
+        table = np.load(path)["table"]
+        limits = {"another range": [LOW, 800e3]}.get(how, [LOW, HIGH])
+        table = {"nan": table * math.nan, "shape": table[:-1], "single": table.astype(np.float32)}.get(how, table)
+        np.savez(path, table=table, range=np.array(limits))
+
+
+@pytest.mark.parametrize("how", ["truncated", "empty", "flipped", "another range", "nan", "shape", "single"])
+def test_a_damaged_cache_is_fitted_again(own_cache, how, monkeypatch):
+    whole = Saturation().table
+    (path,) = own_cache.iterdir()
+    damaged(path, how)
+    saturation.coefficients.cache_clear()
+    assert torch.equal(Saturation().table, whole)
+    saturation.coefficients.cache_clear()
+    monkeypatch.setattr(saturation, "fit", forbidden)
+    assert torch.equal(Saturation().table, whole)  # the file was mended
+
+
+def test_another_coolprop_is_fitted_again(own_cache, monkeypatch):
+    Saturation()
+    saturation.coefficients.cache_clear()
+    monkeypatch.setattr(saturation, "version", lambda name: "99.0")
+    Saturation()
+    assert len(list(own_cache.iterdir())) == 2
+
+
+def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setattr(saturation, "cache_folder", lambda: tmp_path / "file")
+    saturation.coefficients.cache_clear()
+    assert Properties(*Saturation()(double(500e3))).T.isfinite().all()
+    saturation.coefficients.cache_clear()
