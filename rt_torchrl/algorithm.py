@@ -26,7 +26,6 @@ from rt_torchrl.switching import PolicySwitch, Role, SwitchConfig
 from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
-TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
 Arm = Literal["twinning", "model_free", "model_based"]
 
 
@@ -139,7 +138,7 @@ class ReinforcementTwinning:
         episode = next(iter(self.collector))[0]
         # What is learned from is the action that was applied.
         episode["action"] = episode["next", "applied"]
-        transitions = episode.select(*TRANSITION)
+        transitions = self.model_free.transitions(episode)
         self.long_term.store(transitions, self.model_free.td_errors(transitions))
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
         self.short_term.append(Record(states, episode["exogenous"], episode["action"]))

@@ -8,12 +8,15 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from rt_torchrl.memory import LongTermMemory
 from rt_torchrl.plant import Plant
 from rt_torchrl.policies import mlp
+
+TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +28,8 @@ class ModelFreeConfig:
         actor_iterations: n_A.
         batch_size: n_b; at most n_t transitions are sampled.
         discount: γ per control interval.
+        return_steps: control intervals whose rewards a target sums before it bootstraps; 1 as in the paper. A control
+            interval that is short beside the dynamics makes one action matter little, and less than the critic's error.
         target_rate: τ of the target critic.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
@@ -36,6 +41,7 @@ class ModelFreeConfig:
     actor_iterations: int = 1000
     batch_size: int = 128
     discount: float = 0.98
+    return_steps: int = 1
     target_rate: float = 0.01
     critic_rate: float = 1e-3
     actor_rate: float = 2e-3
@@ -46,8 +52,9 @@ class ModelFreeConfig:
         for argument in ("critic_iterations", "actor_iterations"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        if self.batch_size < 1:
-            raise ValueError(f"batch_size={self.batch_size} must be at least 1.")
+        for argument in ("batch_size", "return_steps"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if not 0.0 <= self.discount < 1.0:
             raise ValueError(f"discount={self.discount} must lie in [0, 1); the critic bootstraps through truncation.")
         for argument in ("target_rate", "critic_rate", "actor_rate", "gradient_limit"):
@@ -83,10 +90,10 @@ class ModelFree:
     r"""Deep deterministic policy gradient with prioritised replay (paper, section 4.1).
 
     .. math::
-        y_k = r_k + \gamma\,q'(e_{k+1}, \pi(e_{k+1})), \quad \delta_k = y_k - q(e_k, a_k), \quad
+        y_k = \sum_{j<m}\gamma^jr_{k+j} + \gamma^m\,q'(e_{k+m}, \pi(e_{k+m})), \quad \delta_k = y_k - q(e_k, a_k), \quad
         J_q = \mathbb E[w_k\delta_k^2], \quad \frac{dR}{dw_a} = \mathbb E\Big[\frac{dq}{da}\frac{d\pi}{dw_a}\Big]
 
-    with the target critic q′ and the importance weights w of the sampling.
+    with the target critic q′, the importance weights w of the sampling and, in the paper, m = 1.
 
     Args:
         plant: see :class:`Critic`.
@@ -115,7 +122,15 @@ class ModelFree:
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
         self.target = SoftUpdate(self.loss, tau=config.target_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_rate)
+        # TorchRL counts the steps beyond the first one.
+        beyond = config.return_steps - 1
+        self._returns = MultiStep(config.discount, beyond) if beyond else nn.Identity()
         self.restart()
+
+    def transitions(self, episode: TensorDictBase) -> TensorDictBase:
+        """What D_L keeps of an episode, a TensorDict of batch size n: (e_k, a_k, return, e_{k+m}) of each interval."""
+        transitions = episode.select(*TRANSITION)
+        return self._returns(transitions.unsqueeze(0))[0].select(*TRANSITION, "steps_to_next_obs", strict=False)
 
     def restart(self) -> None:
         """Forget the state of the policy's optimiser, because its weights have jumped."""

@@ -96,6 +96,7 @@ def judged(unseen: UnseenEpisodes, fly: Baseline) -> dict[str, Any]:
     return {"J_a": mean_with_confidence(costs), "merit": unseen.merit(flown)}
 
 
+@torch.no_grad()
 def named_weights(closure: nn.Module) -> dict[str, Any] | None:
     """Weights of a closure, in physical units where it has ``named_coefficients``; None if it has no weights."""
     if hasattr(closure, "named_coefficients"):

@@ -1,13 +1,28 @@
 """What changed from episode to episode: costs, roles, computing time."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatterSciNotation, MaxNLocator
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
-from rt_torchrl.figures.style import REAL, ROLES, STEPS, TWIN, caption, legend_above, panels, role_name
+from rt_torchrl.figures.style import (
+    REAL,
+    REFERENCE_LINE,
+    ROLES,
+    STEPS,
+    TWIN,
+    caption,
+    legend_above,
+    legend_below,
+    panels,
+    role_name,
+)
+from rt_torchrl.report import named_weights
 from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.switching import Role
 
@@ -24,6 +39,8 @@ EVENTS = {
     "swap": {"color": "0.35", "linewidth": 1.2, "linestyle": "-", "label": "swap"},
     "clone": {"color": "0.35", "linewidth": 1.4, "linestyle": ":", "label": "clone"},
 }
+WIDE_RANGE = 5.0
+"""Ratio of the greatest to the least value from which a weight is drawn on a logarithmic axis."""
 
 
 def learning_curves(snapshot: Snapshot) -> Figure:
@@ -76,6 +93,60 @@ def seconds(snapshot: Snapshot) -> Figure:
     return figure
 
 
+@torch.no_grad()
+def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] | None = None) -> Figure:
+    """Each named coefficient of the twin after every episode, with its start and, where known, its true value.
+
+    The number above a panel is how far the last value is from the true one.
+
+    Args:
+        snapshot: its episodes report ``closure``, see :func:`tracked_weights`.
+        labels: for the name of a coefficient, its label with the unit and what to multiply it by to get that unit; by
+            default the name alone.
+    """
+    columns = tracked_weights(snapshot.episodes)
+    true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
+    wide = min(3, len(columns))
+    rows = -(-len(columns) // wide)
+    size = (0.6 + 3.6 * wide, 1.3 + 2.6 * rows)
+    figure, axes = panels(rows, wide, title="Closure weights of the twin over the episodes", size=size, sharex=True)
+    for ax, (name, found) in zip(axes.flat, columns.items(), strict=False):
+        label, factor = (labels or {}).get(name, (name.replace("_", " "), 1.0))
+        ax.plot(np.arange(len(found)), factor * found, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
+        if name in start:
+            ax.axhline(factor * start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
+        if name in true:
+            ax.axhline(factor * true[name], label="true", **REFERENCE_LINE)
+        if _logarithmic(ax, WIDE_RANGE):
+            ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ax.yaxis.set_minor_formatter(NullFormatter())
+        caption(ax, label, f"{100.0 * (found[-1] / true[name] - 1.0):+.2g} %" if true.get(name) else "")
+    for ax in axes.flat[len(columns) :]:
+        ax.remove()
+    for ax in axes.flat[max(0, len(columns) - wide) : len(columns)]:
+        ax.set_xlabel("episode")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.tick_params(labelbottom=True)
+    axes[0, 0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
+    legend_below(figure, axes.flat[: len(columns)].tolist())
+    return figure
+
+
+def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarray, " episodes"]]:
+    """The coefficients that the episodes report by name as a number; nan in an episode that does not.
+
+    There are none in runs older than the key ``closure``, nor for a closure whose weights have no names.
+    """
+    reported = [_numbers(episode.get("closure")) for episode in episodes]
+    return {name: _column(reported, name) for name in dict.fromkeys(name for found in reported for name in found)}
+
+
+def _numbers(closure: dict[str, Any] | None) -> dict[str, float]:
+    """Of the weights that :func:`named_weights` gives, those that are numbers with a name."""
+    return {name: value for name, value in (closure or {}).items() if isinstance(value, float)}
+
+
 def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
     """A value per episode; nan where the arm has none."""
     values = (episode.get(key) for episode in episodes)
@@ -88,13 +159,25 @@ def _draw_costs(ax: Axes, episodes: list[dict[str, Any]], curves: dict[str, dict
     columns = {key: column for key, column in columns.items() if np.isfinite(column).any()}
     for key, column in columns.items():
         ax.plot(number, column, linewidth=1.4, markersize=4, **curves[key])
-    # A plant may have costs that are not positive, which a logarithm would hide.
-    if all((column[np.isfinite(column)] > 0).all() for column in columns.values()):
-        ax.set_yscale("log")
-        # A decade or so needs numbers between the powers of ten.
-        ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
-        ax.grid(True, which="minor", axis="y", color="0.95", linewidth=0.5)
-        ax.tick_params(which="minor", labelsize=8)
+    _logarithmic(ax)
+
+
+def _logarithmic(ax: Axes, least_range: float = 1.0) -> bool:
+    """A logarithmic axis, unless a value is not positive, which it would hide, or all are within a factor.
+
+    Returns:
+        Whether the axis is logarithmic.
+    """
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
+    values = values[np.isfinite(values)]
+    if values.size == 0 or values.min() <= 0.0 or values.max() < least_range * values.min():
+        return False
+    ax.set_yscale("log")
+    # A decade or so needs numbers between the powers of ten.
+    ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
+    ax.grid(True, which="minor", axis="y", color="0.95", linewidth=0.5)
+    ax.tick_params(which="minor", labelsize=8)
+    return True
 
 
 def _draw_events(ax: Axes, episodes: list[dict[str, Any]]) -> None:

@@ -26,8 +26,8 @@ def policy_contours(snapshot: Snapshot) -> Figure:
     """Every action as a function of the observations, model-based beside model-free on the same colour scale.
 
     Dots are observations of the last real episode; the axes span the declared range of the observations and those.
-    With one observation the figure holds curves; with more than two, contours over the first two, the others held at
-    their mean in the episode.
+    With one observation the figure holds curves, on both sides of zero error; with more than two, contours over the
+    first two, the others held at their mean in the episode.
     """
     return _curves(snapshot) if len(snapshot.plant.observations) == 1 else _contours(snapshot)
 
@@ -42,7 +42,8 @@ def visited_observations(snapshot: Snapshot) -> Float[Tensor, "n n_o"]:
 
 def _curves(snapshot: Snapshot) -> Figure:
     plant, seen = snapshot.plant, visited_observations(snapshot)
-    axis = _axis(plant.observations[0], seen[:, 0])
+    # Errors of both signs, so that the target is in sight.
+    axis = _axis(plant.observations[0], torch.cat([seen[:, 0], -seen[:, 0]]))
     figure, axes = panels(
         len(plant.actions),
         title=f"Policies after episode {last_episode(snapshot)}",
@@ -56,6 +57,7 @@ def _curves(snapshot: Snapshot) -> Figure:
     shown = array(seen[:: -(-len(seen) // SHOWN), 0])
     for ax, action in zip(axes.flat, plant.actions, strict=True):
         limits(ax, action)
+        ax.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
         rug = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
         ax.plot(shown, np.full_like(shown, 0.02), "|", label="visited", **rug)
         caption(ax, action.label)

@@ -96,7 +96,9 @@ def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
 
 def with_unit(value: float, unit: str) -> str:
     """A number to two digits with its unit, which is left out when there is none."""
-    return f"{value:.2g}" if unit == "-" else f"{value:.2g} {unit}"
+    # Rounded first, so that hundreds are not written as powers of ten.
+    number = f"{float(f'{value:.2g}'):g}"
+    return number if unit == "-" else f"{number} {unit}"
 
 
 def array(tensor: Tensor) -> np.ndarray:

@@ -1,0 +1,255 @@
+"""Figures of the cryogenic tank: its days in orbit, what its vent takes away, the path of the vented fluid."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor, nn
+
+from rt_torchrl.envs.cryogenic_tank.merit import BAND
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.figures.learning import closure_weights, tracked_weights
+from rt_torchrl.figures.style import (
+    CLOSURE_LINES,
+    LARGE_SCALE,
+    LIMIT_LINE,
+    REAL,
+    REFERENCE,
+    REFERENCE_LINE,
+    SAMPLES,
+    TWIN,
+    array,
+    caption,
+    closures,
+    last_episode,
+    legend_above,
+    legend_below,
+    panels,
+    time_axis,
+    twin_label,
+)
+from rt_torchrl.snapshot import Snapshot
+
+POINTS = 720
+"""Groups of samples a record is drawn in at most: ten minutes each in five days, a ninth of an orbit."""
+DAY = 86_400.0
+LABELS = {
+    "U_s": ("wall to fluid $U_s$ [W/(m² K)]", 1.0),
+    "U_HX": ("heat exchanger $U_{HX}$ [W/(m² K)]", 1.0),
+    "K_JT": ("valve $K_{JT}$ [GPa s²/kg²]", 1e-9),
+}
+CLOSURE_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
+
+
+def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
+    """Every figure of the tank, by name; ``closure_weights`` replaces the general one, which knows no units."""
+    drawn = {figure.__name__: figure(snapshot) for figure in (tank, heat_exchanger, vent_path)}
+    if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
+        drawn["closure_weights"] = closure_weights(snapshot, LABELS)
+    return drawn
+
+
+@torch.no_grad()
+def tank(snapshot: Snapshot) -> Figure:
+    """The last episode: pressure around its set point, masses, wall, vent and load (paper, fig. 21a-b).
+
+    A record of more than ``POINTS`` samples is drawn in groups, with the mean of each and the range within it. The
+    axes hold the real tank and no more than as much again above and below it: a twin that is far off leaves them.
+    """
+    plant, record = snapshot.plant, snapshot.record
+    real = _quantities(plant, record.states, record.actions, plant.closure)
+    twin = _quantities(plant, snapshot.replay, record.actions, snapshot.closure)
+    time, label = time_axis(plant, len(record.actions))
+    group = -(-len(time) // POINTS)
+    note = f"\nmean and range of every {group * plant.dt / 60.0:g} min" if group > 1 else ""
+    title = f"Tank, episode {last_episode(snapshot)}{note}"
+    figure, axes = panels(len(real) + 1, title=title, size=(9.5, 12.0), sharex=True)
+    _draw_references(axes[0, 0], plant)
+    for ax, (name, values) in zip(axes.flat, real.items(), strict=False):
+        _draw_groups(ax, time, array(values), group)
+        low, high = ax.get_ylim()
+        middle, mean = _means(group, time, array(twin[name]))
+        ax.plot(middle, mean, color=TWIN, linewidth=0.9, label=twin_label(snapshot))
+        height = high - low
+        ax.set_ylim(max(min(low, mean.min()), low - height), min(max(high, mean.max()), high + height))
+        caption(ax, name)
+    load = axes[-1, 0]
+    _draw_groups(load, time, array(record.exogenous[:, 0]), group)
+    if snapshot.large_scale is not None:
+        mean = array(snapshot.large_scale[:, 0])
+        load.plot(*_means(group, time, mean), color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
+        legend_above(load)
+    caption(load, plant.inputs[0].label)
+    load.set_xlabel(label)
+    load.set_xlim(0.0, time[-1] + time[1])
+    legend_below(figure, [axes[0, 0]])
+    return figure
+
+
+def _quantities(
+    plant: CryogenicTank, states: Float[Tensor, "n_plus_1 3"], actions: Float[Tensor, "n 1"], closure: nn.Module
+) -> dict[str, Float[Tensor, " n"]]:
+    """What there is to see of a trajectory at the start of every interval, by label."""
+    T_s, V_l, p = states[:-1].unbind(-1)
+    now = plant.saturation(p)
+    return {
+        "pressure $p$ [kPa]": 1e-3 * p,
+        "liquid mass $m_l$ [kg]": V_l * now.rho_l,
+        "vented mass since the start [kg]": plant.vented_mass(states, actions, closure)[:-1],
+        "wall-fluid temperature difference $T_s - T$ [K]": T_s - now.T,
+        r"vent flow $\dot m_c$ [g/s]": 1e3 * plant.vent(states[:-1], actions, closure).flow,
+    }
+
+
+def _draw_references(ax: Axes, plant: CryogenicTank) -> None:
+    target, half = 1e-3 * plant.set_point, 1e-3 * BAND
+    ax.axhspan(target - half, target + half, color=REFERENCE, alpha=0.13, linewidth=0, label=rf"$\pm${half:g} kPa")
+    ax.axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
+
+
+def _draw_groups(ax: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], group: int) -> None:
+    middle, mean = _means(group, time, values)
+    if group > 1:
+        starts = np.arange(0, len(values), group)
+        least, greatest = (extreme.reduceat(values, starts) for extreme in (np.minimum, np.maximum))
+        ax.fill_between(middle, least, greatest, color=SAMPLES, alpha=0.45, linewidth=0)
+    ax.plot(middle, mean, color=REAL, linewidth=1.5, label="real")
+
+
+def _means(group: int, *series: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " groups"]]:
+    """The mean of every ``group`` samples; the last group may be smaller."""
+    starts = np.arange(0, len(series[0]), group)
+    counts = np.diff(np.append(starts, len(series[0])))
+    return [np.add.reduceat(values, starts) / counts for values in series]
+
+
+@torch.no_grad()
+def heat_exchanger(snapshot: Snapshot) -> Figure:
+    """Heat the exchanger takes and load the vent holds over Δp_V at the set point, for each closure.
+
+    Below, how often the last episode had each pressure drop: a twin can only know what was visited.
+    """
+    plant, record = snapshot.plant, snapshot.record
+    # Denser towards the shut valve, where the flow goes with the root of the drop.
+    drop = plant.actions[0].high * torch.linspace(0.0, 1.0, 201, dtype=torch.float64) ** 2
+    drop = drop.to(record.states.device)
+    state = plant.state_at(torch.full_like(drop, plant.set_point))
+    title = f"Heat exchanger at the set point, {1e-3 * plant.set_point:g} kPa"
+    figure, axes = panels(3, title=title, size=(7.5, 8.0), sharex=True, height_ratios=(2.0, 2.0, 1.0))
+    heat, held, share = axes.flat
+    for name, closure in closures(snapshot).items():
+        style = {"color": CLOSURE_COLOURS[name], "linestyle": CLOSURE_LINES[name], "linewidth": 1.8, "label": name}
+        heat.plot(1e-3 * array(drop), array(plant.vent(state, drop[:, None], closure).heat), **style)
+        held.plot(1e-3 * array(drop), array(plant.held_load(state, drop[:, None], closure)), **style)
+    mean = record.exogenous.mean().item()
+    held.axhline(mean, label="mean load of the last episode", **LIMIT_LINE)
+    visited = 1e-3 * array(_drop(plant, record.states[:-1], record.actions))
+    weight = np.full(len(visited), 100.0 / len(visited))
+    share.hist(visited, np.linspace(0.0, 1e-3 * plant.actions[0].high, 41), weights=weight, color=SAMPLES)
+    caption(heat, "heat taken by the exchanger $Q_{HX}$ [W]")
+    caption(held, "load at which the pressure stands still [W]", f"mean load {mean:.3g} W")
+    caption(share, "share of the last episode [%] per 5 kPa")
+    share.set_xlabel(r"pressure drop $\Delta p_V$ [kPa]")
+    share.set_xlim(0.0, 1e-3 * plant.actions[0].high)
+    legend_below(figure, [held])
+    return figure
+
+
+def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
+    """p − p_1 [Pa], less than the action where the back pressure stops it."""
+    p = states[:, 2]
+    return p - plant.valve_outlet(p, actions[:, 0])
+
+
+@torch.no_grad()
+def vent_path(snapshot: Snapshot) -> Figure:
+    """Temperature over entropy of the vented fluid, at the mean pressure and drop of the last day of the record.
+
+    1: liquid of the tank at p. 2: behind the valve at p_1, same enthalpy. 3: all vapour at p_1, as an endless heat
+    exchanger would leave it; the real one leaves it at the cross, with the share ε of the heat from 2 to 3.
+    """
+    plant, record = snapshot.plant, snapshot.record
+    last = slice(-min(len(record.actions), round(DAY / plant.dt)), None)
+    states, drop = record.states[:-1][last], _drop(plant, record.states[:-1][last], record.actions[last]).mean()
+    state = states.mean(0)
+    effectiveness = plant.vent(state, drop[None], plant.closure).effectiveness.item()
+    path = VentPath.of(plant.saturation.fluid, state[2].item(), drop.item(), effectiveness)
+    hours = len(states) * plant.dt / 3600.0
+    title = f"Path of the vented {plant.saturation.fluid.lower()}, episode {last_episode(snapshot)}"
+    title += rf", mean of the last {hours:g} h" + "\n"
+    title += rf"$p$ = {1e-3 * path.p:.4g} kPa, $\Delta p_V$ = {1e-3 * path.drop:.3g} kPa, "
+    title += rf"$T - T_1$ = {path.T[0] - path.T[1]:.3g} K, $\Delta h_c$ = {1e-3 * path.latent:.4g} kJ/kg"
+    figure, ((whole, near),) = panels(1, 2, title=title, size=(11.0, 5.0), width_ratios=(1.0, 1.3))
+    for ax in (whole, near):
+        _draw_path(ax, path)
+    caption(whole, "temperature $T$ [K]", "whole dome")
+    caption(near, "temperature $T$ [K]", "around the vent")
+    _zoom(near, path)
+    legend_below(figure, [near])
+    return figure
+
+
+class VentPath(NamedTuple):
+    """States of the vented fluid at the points 1, 2, 3 and at the outlet, and the saturation lines around them."""
+
+    p: float  # [Pa]
+    drop: float  # p − p_1 [Pa]
+    latent: float  # Δh_c = h_v(p_1) − h_l(p) [J/kg]
+    effectiveness: float  # ε [-]
+    T: list[float]  # [K]
+    s: list[float]  # [J/(kg K)]
+    valve: Float[np.ndarray, "2 n"]  # s and T from 1 to 2 at constant enthalpy
+    dome: Float[np.ndarray, "2 m"]  # s and T of saturated liquid, then of saturated vapour from the critical point
+
+    @classmethod
+    def of(cls, fluid: str, p: float, drop: float, effectiveness: float) -> "VentPath":
+        """From CoolProp."""
+        import CoolProp.CoolProp as CP  # here, because it takes a second to load
+
+        fluid_state = CP.AbstractState("HEOS", fluid)
+
+        def at(pair: int, first: float, second: float) -> tuple[float, float, float]:
+            fluid_state.update(pair, first, second)
+            return fluid_state.smass(), fluid_state.T(), fluid_state.hmass()
+
+        def mixed(p: float, h: float) -> tuple[float, float]:
+            """s and T of the mixture of enthalpy h, between its two ends."""
+            (s_l, T, h_l), (s_v, _, h_v) = (at(CP.PQ_INPUTS, p, quality) for quality in (0.0, 1.0))
+            return s_l + (h - h_l) / (h_v - h_l) * (s_v - s_l), T
+
+        s_1, T_1, h_1 = at(CP.PQ_INPUTS, p, 0.0)
+        s_3, T_3, h_3 = at(CP.PQ_INPUTS, p - drop, 1.0)
+        valve = np.array([mixed(between, h_1) for between in np.linspace(p, p - drop, 21)]).T
+        latent = h_3 - h_1
+        s_out = mixed(p - drop, h_1 + effectiveness * latent)[0]
+        # Up to where CoolProp's saturation solver is sure to succeed.
+        heights = np.linspace(fluid_state.trivial_keyed_output(CP.iT_triple), fluid_state.T_critical() - 0.01, 300)
+        sides = [[at(CP.QT_INPUTS, quality, T)[:2] for T in heights] for quality in (0.0, 1.0)]
+        dome = np.array(sides[0] + sides[1][::-1]).T
+        s = [s_1, valve[0, -1], s_3, s_out]
+        return cls(p, drop, latent, effectiveness, [T_1, T_3, T_3, T_3], s, valve, dome)
+
+
+def _draw_path(ax: Axes, path: VentPath) -> None:
+    s = [1e-3 * entropy for entropy in path.s]
+    ax.plot(1e-3 * path.dome[0], path.dome[1], color="0.55", linewidth=1.3, label="saturation")
+    ax.axhline(path.T[0], label="liquid in the tank", **REFERENCE_LINE)
+    ax.plot(1e-3 * path.valve[0], path.valve[1], color=REAL, linewidth=2.0, label="valve (1-2)")
+    ax.plot(s[1:3], path.T[1:3], color=TWIN, linewidth=2.0, label="heat exchanger (2-3)")
+    ax.plot(s[:3], path.T[:3], "o", color=REAL, markersize=5, label="_points")
+    outlet = rf"outlet, $\varepsilon$ = {path.effectiveness:.3g}"
+    ax.plot(s[3:], path.T[3:], "x", color=REAL, markersize=9, markeredgewidth=1.8, label=outlet)
+    ax.set_xlabel("specific entropy $s$ [kJ/(kg K)]")
+
+
+def _zoom(ax: Axes, path: VentPath) -> None:
+    """Span the path, number its points."""
+    height, (left, right) = max(path.T[0] - path.T[1], 0.02), (1e-3 * path.s[0], 1e-3 * path.s[2])
+    ax.set_ylim(path.T[1] - 0.5 * height, path.T[0] + 0.5 * height)
+    ax.set_xlim(left - 0.06 * (right - left), right + 0.06 * (right - left))
+    ax.ticklabel_format(axis="y", useOffset=False)
+    for name, place, offset in zip("123", zip(path.s, path.T, strict=True), ((8, 7), (8, -14), (6, -14)), strict=False):
+        ax.annotate(name, (1e-3 * place[0], place[1]), offset, textcoords="offset points", fontsize=11)

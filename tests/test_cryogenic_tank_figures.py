@@ -1,0 +1,222 @@
+"""The tank's figures against the numbers they are drawn from, on six hours in orbit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+
+from rt_torchrl import figures as general
+from rt_torchrl.envs.cryogenic_tank import figures
+from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.memory import Record
+from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.trajectory import Rollout
+
+FOUND = {"U_s": [8.0, 46.0], "U_HX": [12.0, 70.0], "K_JT": [90e9, 480e9]}
+TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}
+
+
+@pytest.fixture(scope="module")
+def snapshot() -> Snapshot:
+    """The real tank, and a twin whose coefficients are some percent off."""
+    plant, generator = CryogenicTank(horizon=6 * 3600.0), torch.Generator().manual_seed(0)
+    policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
+    twin = ConstantCoefficients(torch.tensor([found[-1] for found in FOUND.values()], dtype=torch.float64))
+    start, load = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure, policies["model_based"], engine="autograd")(start, load)
+        replayed = Rollout(plant, twin, engine="autograd")(start, load, flown.actions)
+    return Snapshot(
+        plant=plant,
+        closure=twin,
+        initial_closure=plant.make_closure(generator),
+        policies=policies,
+        live="model_based",
+        record=Record(flown.states[0], load[0], flown.actions[0]),
+        replay=replayed.states[0],
+        large_scale=load[0] + 10.0,
+        realisations=load,
+        episodes=[{"closure": {name: found[k] for name, found in FOUND.items()}} for k in range(2)],
+    )
+
+
+def draw(figure) -> set[str]:
+    """Draw it, which raises on broken mathtext; return every text."""
+    FigureCanvasAgg(figure).draw()
+    return {text.get_text() for text in figure.findobj(Text)}
+
+
+def line(ax, label):
+    return next(line for line in ax.lines if line.get_label() == label)
+
+
+def panel(figure, caption):
+    return next(ax for ax in figure.axes if ax.get_title(loc="left").startswith(caption))
+
+
+def test_every_figure_is_drawn_within_its_canvas(snapshot):
+    drawn = figures.figures_of(snapshot)
+    assert set(drawn) == {"tank", "heat_exchanger", "vent_path", "closure_weights"}
+    for name, figure in drawn.items():
+        assert draw(figure)
+        width, height = figure.bbox.size
+        texts = [figure._suptitle]
+        for ax in figure.axes:
+            texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
+            left, right = (text.get_window_extent() for text in (ax._left_title, ax._right_title))
+            assert not ax._right_title.get_text() or left.x1 < right.x0, name
+        for box in (text.get_window_extent() for text in texts if text.get_text()):
+            assert min(box.x0, box.y0) >= 0 and box.x1 <= width and box.y1 <= height, name
+
+
+def test_tank_is_the_record(snapshot):
+    figure, plant = figures.tank(snapshot), snapshot.plant
+    actions = snapshot.record.actions
+    for name, states, K_JT in (("real", snapshot.record.states, 500e9), ("twin", snapshot.replay, 480e9)):
+        T_s, V_l, p = states[:-1].unbind(-1)
+        fluid, drop = plant.saturation(p), actions[:, 0]
+        flow = (drop / K_JT).sqrt()  # tens of kPa, far above the laminar drop of 100 Pa
+        expected = {
+            "pressure": (1e-3 * p, 1e-12),
+            "liquid mass": (V_l * fluid.rho_l, 1e-12),
+            "wall-fluid temperature difference": (T_s - fluid.T, 1e-9),
+            "vent flow": (1e3 * flow, 1e-5),
+            "vented mass": (30.0 * (flow.cumsum(0) - flow), 1e-5),
+        }
+        for label, (values, tolerance) in expected.items():
+            drawn = line(panel(figure, label), name).get_ydata()
+            np.testing.assert_allclose(drawn, values.numpy(), rtol=tolerance, atol=1e-12, err_msg=label)
+    load = panel(figure, "heat load")
+    assert np.array_equal(line(load, "real").get_ydata(), snapshot.record.exogenous[:, 0].numpy())
+    assert np.array_equal(line(load, "large scale (SVR)").get_ydata(), snapshot.large_scale[:, 0].numpy())
+    units = [ax.get_title(loc="left").split("[")[1] for ax in figure.axes]
+    assert units == ["kPa]", "kg]", "kg]", "K]", "g/s]", "W]"]
+    assert load.get_xlabel() == "time [h]"
+    assert load.get_xlim() == pytest.approx((0.0, 6.0), rel=1e-12)
+
+
+def test_pressure_has_its_set_point_and_band(snapshot):
+    pressure = panel(figures.tank(snapshot), "pressure")
+    assert line(pressure, r"set point $\tilde p$").get_ydata()[0] == 500.0
+    (band,) = pressure.patches
+    assert (band.get_y(), band.get_y() + band.get_height()) == (495.0, 505.0)
+
+
+def test_long_records_are_thinned_to_mean_and_range(snapshot):
+    # Twice the six hours and a bit: groups of three, the last with one sample.
+    record = snapshot.record
+    n = 2 * len(record.actions) + 1
+    repeated = [torch.cat([values[:720]] * 2 + [values[:1]]) for values in (record.states, *record[1:])]
+    states = torch.cat([repeated[0], repeated[0][-1:]])
+    record = Record(states, *repeated[1:])
+    long = replace(snapshot, record=record, replay=states, large_scale=repeated[1], realisations=None)
+    figure = figures.tank(long)
+    load, values = panel(figure, "heat load"), repeated[1][:, 0].numpy()
+    drawn = line(load, "real").get_ydata()
+    assert n % 3 == 1 and len(drawn) == (n + 2) // 3 <= figures.POINTS
+    assert drawn[5] == pytest.approx(values[15:18].mean(), rel=1e-12)
+    assert drawn[-1] == values[-1]
+    vertices = load.collections[0].get_paths()[0].vertices[:, 1]
+    assert (vertices.min(), vertices.max()) == (values.min(), values.max())
+    assert any("every 1.5 min" in text for text in draw(figure))
+
+
+def test_a_twin_far_off_does_not_flatten_the_real_tank(snapshot):
+    far = snapshot.replay.clone()
+    far[:, 0] += 100.0
+    ax = panel(figures.tank(replace(snapshot, replay=far)), "wall-fluid")
+    real = line(ax, "real").get_ydata()
+    low, high = ax.get_ylim()
+    assert low < real.min() and real.max() < high
+    # The axes of the real tank alone, with margins of 5 %, and as much again above.
+    assert high - low <= 2.0 * 1.1 * 1.001 * np.ptp(real)
+
+
+def test_heat_exchanger_of_each_closure(snapshot):
+    figure, plant = figures.heat_exchanger(snapshot), snapshot.plant
+    heat, held, share = figure.axes
+    closures = {"true": plant.closure, "twin": snapshot.closure, "initial twin": snapshot.initial_closure}
+    calm = torch.zeros(1, 1, dtype=torch.float64)
+    for name, closure in closures.items():
+        drop, load = line(held, name).get_xdata()[150], line(held, name).get_ydata()[150]
+        state = plant.state_at(torch.tensor([500e3], dtype=torch.float64))
+        action = torch.tensor([[1e3 * drop]], dtype=torch.float64)
+        assert line(heat, name).get_ydata()[150] == pytest.approx(plant.vent(state, action, closure).heat.item())
+        # At the held load, which a wall with T_s - T = Q/(U_s A_s) hands to the fluid, the pressure stands still: its
+        # rate is that of rounding, where the load alone makes some 1e-3 Pa/s.
+        U_s = closure.named_coefficients()["U_s"].item()
+        state[:, 0] += load / (U_s * plant.wall_area)
+        assert abs(plant.vector_field(calm[0], state, action, calm, closure)[0, 2].item()) < 1e-8
+    mean = snapshot.record.exogenous.mean().item()
+    assert line(held, "mean load of the last episode").get_ydata()[0] == mean
+    assert sum(bar.get_height() for bar in share.patches) == pytest.approx(100.0, rel=1e-9)
+    assert all("[W]" in ax.get_title(loc="left") for ax in (heat, held))
+    assert share.get_xlabel().endswith("[kPa]")
+
+
+def test_vent_path_is_isenthalpic_then_isobaric(snapshot):
+    from CoolProp.CoolProp import PropsSI
+
+    figure, plant = figures.vent_path(snapshot), snapshot.plant
+    p = snapshot.record.states[:-1, 2].mean().item()
+    p_1 = p - snapshot.record.actions.mean().item()
+    (s_1, T_1), (s_2, T_2), (s_3, T_3) = line(figure.axes[1], "_points").get_xydata()
+    h = PropsSI("H", "P", p, "Q", 0, "Hydrogen")
+    # CoolProp's own flash at p_1 and h agrees to its iterations.
+    assert 1e3 * s_1 == pytest.approx(PropsSI("S", "P", p, "Q", 0, "Hydrogen"), rel=1e-7)
+    assert 1e3 * s_2 == pytest.approx(PropsSI("S", "P", p_1, "H", h, "Hydrogen"), rel=1e-7)
+    assert 1e3 * s_3 == pytest.approx(PropsSI("S", "P", p_1, "Q", 1, "Hydrogen"), rel=1e-7)
+    # The plant's table is fitted to 1e-6.
+    table = plant.saturation(torch.tensor([p, p_1], dtype=torch.float64)).T
+    np.testing.assert_allclose([T_1, T_3], table, rtol=2e-6)
+    assert T_2 == T_3
+    # At constant pressure T ds = dh: the area under 2-3 is the heat taken up.
+    heat = PropsSI("H", "P", p_1, "Q", 1, "Hydrogen") - h
+    assert 1e3 * T_3 * (s_3 - s_2) == pytest.approx(heat, rel=1e-7)
+    outlet = next(entry for entry in figure.axes[1].lines if entry.get_label().startswith("outlet"))
+    share = (outlet.get_xdata()[0] - s_2) / (s_3 - s_2)
+    assert outlet.get_label().endswith(f"{share:.3g}") and 0.5 < share < 1.0
+    assert {"specific entropy $s$ [kJ/(kg K)]", "temperature $T$ [K]"} <= draw(figure)
+
+
+def test_vent_path_of_a_shut_valve(snapshot):
+    record = snapshot.record
+    shut = replace(snapshot, record=record._replace(actions=torch.zeros_like(record.actions)))
+    draw(figures.vent_path(shut))
+
+
+def test_closure_weights_with_truth_start_and_units(snapshot):
+    figure = figures.figures_of(snapshot)["closure_weights"]
+    for ax, (name, found) in zip(figure.axes, FOUND.items(), strict=True):
+        scale = 1e-9 if name == "K_JT" else 1.0
+        assert list(line(ax, "twin").get_ydata()) == pytest.approx([scale * value for value in found], rel=1e-14)
+        assert line(ax, "true").get_ydata()[0] == pytest.approx(scale * TRUE[name], rel=1e-14)
+        start = snapshot.initial_closure.named_coefficients()[name].item()
+        assert line(ax, "start").get_ydata()[0] == pytest.approx(scale * start, rel=1e-14)
+        assert ax.get_yscale() == "log" and ax.get_title(loc="left").endswith("]")
+        assert ax.get_title(loc="right") == f"{100 * (found[-1] / TRUE[name] - 1):+.2g} %"
+
+
+def test_closure_weights_are_left_out_of_older_records(snapshot):
+    for episodes in ([], [{}], [{"closure": None}], [{"closure": {"weight": [[1.0, 2.0]]}}]):
+        older = replace(snapshot, episodes=episodes)
+        assert "closure_weights" not in figures.figures_of(older)
+    # Of a run that was resumed from such a record the new part is drawn.
+    resumed = replace(snapshot, episodes=[{}, *snapshot.episodes])
+    found = line(general.figures_of(resumed)["closure_weights"].axes[0], "twin").get_ydata()
+    assert np.isnan(found[0]) and list(found[1:]) == FOUND["U_s"]
+    untrained = replace(snapshot, large_scale=None, realisations=None)
+    assert "closure_weights" not in general.figures_of(untrained) | figures.figures_of(untrained)
+
+
+def test_policy_curves_are_on_both_sides_of_the_set_point(snapshot):
+    (ax,) = general.policy_contours(snapshot).axes
+    for role in ("model_based", "model_free"):
+        curve = line(ax, role.replace("_", "-"))
+        error = torch.from_numpy(curve.get_xdata())[:, None]
+        np.testing.assert_allclose(curve.get_ydata(), snapshot.policies[role](error)[:, 0].detach(), rtol=1e-12)
+        assert error.min() < 0.0 < error.max()
