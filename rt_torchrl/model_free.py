@@ -122,9 +122,7 @@ class ModelFree:
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
         self.target = SoftUpdate(self.loss, tau=config.target_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_rate)
-        # TorchRL counts the steps beyond the first one.
-        beyond = config.return_steps - 1
-        self._returns = MultiStep(config.discount, beyond) if beyond else nn.Identity()
+        self._returns = MultiStep(config.discount, config.return_steps)
         self.restart()
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
