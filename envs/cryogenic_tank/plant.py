@@ -83,7 +83,7 @@ class CryogenicTank(Plant):
 
     states = (
         Signal(symbol="T_s", name="wall_temperature", unit="K", low=0.0),
-        Signal(symbol="V_l", name="liquid_volume", unit="m^3", low=0.0, high=60.0),
+        Signal(symbol="V_l", name="liquid_volume", unit="m³", low=0.0, high=60.0),
         Signal(symbol="p", name="pressure", unit="Pa", low=80e3, high=900e3),
     )
     actions = (Signal(symbol=r"\Delta p_V", name="valve_drop", unit="Pa", low=0.0, high=200e3),)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from platformdirs import user_cache_path
 from scipy.interpolate import make_interp_spline
 from torch import Tensor, nn
 
@@ -128,10 +129,6 @@ def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cell
 
 def cache_folder() -> Path:
     """Where fits are kept: the user's cache folder."""
-    try:
-        from platformdirs import user_cache_path
-    except ModuleNotFoundError:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rt_torchrl"
     return user_cache_path("rt_torchrl")
 
 

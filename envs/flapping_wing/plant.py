@@ -30,10 +30,10 @@ class FlappingWing(Plant):
     ====  ===================  =================================================  ====  =============
     kind  name                 symbol                                             unit  range
     ====  ===================  =================================================  ====  =============
-    s     position_x           :math:`x`, forwards                                m     about 0 ... 5
-    s     position_z           :math:`z`, upwards                                 m     about 0 ... 5
-    s     velocity_x           :math:`\dot x`                                     m/s   about ±5
-    s     velocity_z           :math:`\dot z`                                     m/s   about ±5
+    s     forward_position     :math:`x`, forwards                                m     about 0 ... 5
+    s     height               :math:`z`, upwards                                 m     about 0 ... 5
+    s     forward_speed        :math:`\dot x`                                     m/s   about ±5
+    s     climb_speed          :math:`\dot z`                                     m/s   about ±5
     a     flapping_amplitude   :math:`A_\phi`                                     deg   50 ... 88
     a     stroke_plane_angle   :math:`\beta_w`, negative pushes towards +x        deg   −30 ... 30
     z     headwind             :math:`u_\infty`, positive blows towards −x        m/s   about −2 ... 4
@@ -78,10 +78,10 @@ class FlappingWing(Plant):
     least_steps_per_beat = 20
 
     states = (
-        Signal(symbol="x", name="position_x", unit="m"),
-        Signal(symbol="z", name="position_z", unit="m"),
-        Signal(symbol=r"\dot x", name="velocity_x", unit="m/s"),
-        Signal(symbol=r"\dot z", name="velocity_z", unit="m/s"),
+        Signal(symbol="x", name="forward_position", unit="m"),
+        Signal(symbol="z", name="height", unit="m"),
+        Signal(symbol=r"\dot x", name="forward_speed", unit="m/s"),
+        Signal(symbol=r"\dot z", name="climb_speed", unit="m/s"),
     )
     actions = (
         Signal(symbol=r"A_\phi", name="flapping_amplitude", unit="deg", low=50.0, high=88.0),
