@@ -54,38 +54,31 @@ def summary(
     J_p before and after are of the same episodes, flown by the final live policy.
     """
     closure, live = algorithm.twin.closure, algorithm.policies[algorithm.switch.live]
+    laws = {"found": closure, "true": unseen.plant.closure, "start": initial_closure}
     before = unseen.control_costs(initial_policy)
     after = {role: unseen.control_costs(algorithm.policies[role]) for role in ROLES}
     flown = unseen.fly(live)
-    J_p = {name: unseen.identification_costs(c, flown) for name, c in (("before", initial_closure), ("after", closure))}
+    J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
+    unseen_costs = {"J_p": J_p, "J_p_before": J_p_before, "J_a_before": before}
+    unseen_costs |= {f"J_a_{role}": costs for role, costs in after.items()}
     better = min(ROLES, key=lambda role: after[role].mean().item())
     found = {
-        "J_p_ratio": (J_p["after"].mean() / J_p["before"].mean()).item(),
+        "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": (after[role].mean() / before.mean()).item() for role in ROLES},
         "unseen": {
             "episodes": len(before),
-            "J_p": mean_with_confidence(J_p["after"]),
-            "J_p_before": mean_with_confidence(J_p["before"]),
-            **{f"J_a_{role}": mean_with_confidence(after[role]) for role in ROLES},
-            "J_a_before": mean_with_confidence(before),
+            **{name: mean_with_confidence(costs) for name, costs in unseen_costs.items()},
             "merit": {role: unseen.merit(unseen.fly(algorithm.policies[role])) for role in ROLES},
             "baselines": {name: judged(unseen, fly) for name, fly in baselines.items()},
         },
         "live": algorithm.switch.live,
         "better": better,
-        "closure": {
-            "found": named_weights(closure),
-            "true": named_weights(unseen.plant.closure),
-            "start": named_weights(initial_closure),
-        },
+        "closure": {name: named_weights(law) for name, law in laws.items()},
         "seconds": seconds_per_step(episodes),
     }
     if optimum is not None:
-        found["reference"] = {
-            "J_a": optimum.cost,
-            "J_a_of_each_start": optimum.costs,
-            "better_over_reference": after[better].mean().item() / optimum.cost,
-        }
+        found["reference"] = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs}
+        found["reference"]["better_over_reference"] = after[better].mean().item() / optimum.cost
     return found
 
 

@@ -164,8 +164,7 @@ class FlappingWing(Plant):
         at_rest = torch.zeros(len(t), 2, dtype=torch.float64)
         basis = torch.eye(2, dtype=torch.float64)
         columns = [torch.func.jvp(acceleration, (at_rest,), (e.expand_as(at_rest),))[1] for e in basis]
-        rates = torch.linalg.eigvals(torch.stack(columns, -1)).real
-        return max(0.0, -rates.min().item())
+        return max(0.0, -torch.linalg.eigvals(torch.stack(columns, -1)).real.min().item())
 
     # The system
 

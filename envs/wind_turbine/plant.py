@@ -176,17 +176,9 @@ class WindTurbine(Plant):
         cutoff = 2.0 * math.pi * self.filter_frequency
         window = 2.0 * math.pi / self.rated_rotor_speed
         held = torch.zeros_like(acceleration)
-        return torch.stack(
-            [
-                acceleration,
-                cutoff * (omega_g - omega_hat),
-                cutoff * (u - u_hat),
-                (self.speed_error(omega_hat, u_hat) - e2) / window,
-                held,
-                held,
-            ],
-            -1,
-        )
+        filters = (cutoff * (omega_g - omega_hat), cutoff * (u - u_hat))
+        integral = (self.speed_error(omega_hat, u_hat) - e2) / window
+        return torch.stack([acceleration, *filters, integral, held, held], -1)
 
     def aerodynamic_torque(self, omega_r: Tensor, beta: Tensor, u: Tensor, closure: nn.Module) -> Tensor:
         r"""τ_a = ½ρπR³(C_p/λ)u² [N m], fading to zero over λ < 1 (standstill), where no closure is defined.
