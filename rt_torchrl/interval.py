@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
-from rt_torchrl.plant import Plant, Transition
+from rt_torchrl.plant import Plant
 
 
 class Drive(NamedTuple):
@@ -38,8 +38,5 @@ class Interval(nn.Module):
         return self.policy(self.plant.observe(drive.t, state, drive.exogenous))
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
-        return self.transition(state, drive).state
-
-    def transition(self, state: Tensor, drive: Drive) -> Transition:
-        """The end of the interval and the applied action."""
-        return self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure)
+        """The state at the end of the interval."""
+        return self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure).state

@@ -10,7 +10,6 @@ import torch
 from torch import nn
 
 from rt_torchrl.plant import Plant
-from rt_torchrl.policies import SaturatedAffine  # noqa: F401  (re-exported for the tests)
 from rt_torchrl.signal import Signal
 
 
