@@ -3,9 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
-from torch import nn
-
 from rt_torchrl.algorithm import TwinningConfig
 from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.descent import DescentConfig
@@ -13,7 +10,6 @@ from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.policies import SaturatedMLP
 from rt_torchrl.runner import Run, RunConfig, main_of
 from rt_torchrl.switching import SwitchConfig
 
@@ -33,7 +29,6 @@ class Config(RunConfig):
 
     Args:
         policy: paper (a cubic of the pressure error, 3 weights) or mlp.
-        hidden: widths of the hidden layers of an mlp policy.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         fluid: pure fluid in the tank, by its name in CoolProp.
@@ -62,14 +57,7 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
-    plant = config.plant()
-
-    def make_policy(generator: torch.Generator) -> nn.Module:
-        if config.policy == "paper":
-            return plant.make_policy(generator)
-        return SaturatedMLP(len(plant.observations), plant.actions, hidden=config.hidden, generator=generator)
-
-    Run(config, plant, make_policy=make_policy, plant_figures=figures.figures_of).train()
+    Run(config, config.plant(), plant_figures=figures.figures_of).train()
 
 
 if __name__ == "__main__":

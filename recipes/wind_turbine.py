@@ -16,7 +16,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.runner import Run, RunConfig, main_of
 
 PAPER = TwinningConfig(
@@ -33,7 +32,6 @@ class Config(RunConfig):
 
     Args:
         policy: paper (affine in e1 and e2, no bias, 4 weights), bias (the same with bias, 6) or mlp.
-        hidden: widths of the hidden layers of an mlp policy.
         dt: control interval [s]; 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         mean_wind: mean wind speed U [m/s].
@@ -42,7 +40,6 @@ class Config(RunConfig):
     """
 
     policy: Literal["paper", "bias", "mlp"] = "paper"
-    hidden: tuple[int, ...] = (32, 32)
     dt: float = 0.5
     horizon: float = 600.0
     mean_wind: float = 11.0
@@ -56,13 +53,10 @@ class Config(RunConfig):
             wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
         return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind)
 
-    def make_policy(self, generator: torch.Generator) -> nn.Module:
-        plant = WindTurbine
-        if self.policy == "mlp":
-            return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
-        return SaturatedAffine(
-            len(plant.observations), plant.actions, bias=self.policy == "bias", weight_scale=0.5, generator=generator
-        )
+    def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:
+        if self.policy != "bias":
+            return super().make_policy(plant, generator)
+        return plant.make_policy(generator, bias=True)
 
 
 def main(config: Config) -> None:
@@ -70,7 +64,6 @@ def main(config: Config) -> None:
     Run(
         config,
         plant,
-        make_policy=config.make_policy,
         plant_figures=figures.figures_of,
         baselines={"Jonkman": JonkmanController(plant).fly},
     ).train()

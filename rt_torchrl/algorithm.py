@@ -100,9 +100,7 @@ class ReinforcementTwinning:
         self.short_term = ShortTermMemory(config.records)
         self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
         self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
-        self.actor = LivePolicy(
-            twin.plant, self.policies[self.switch.live], spread=config.exploration.spread, generator=generator
-        )
+        self.actor = LivePolicy(twin.plant, self.policies[self.switch.live], config.exploration, generator=generator)
         self.collector = Collector(
             env,
             TensorDictModule(self.actor, in_keys=["observation"], out_keys=["action"]),
@@ -133,8 +131,7 @@ class ReinforcementTwinning:
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
-        self.actor.policy = self.policies[self.switch.live]
-        self.actor.strength = self.config.exploration.strength(self.episodes_done)
+        self.actor.begin(self.policies[self.switch.live], strength=self.config.exploration.strength(self.episodes_done))
         episode = next(iter(self.collector))[0]
         # What is learned from is the action that was applied.
         episode["action"] = episode["next", "applied"]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 from torch import Tensor, nn
 
@@ -54,12 +54,14 @@ class UnseenEpisodes:
         """J_a of each episode."""
         return control_cost(self.plant, self.fly(policy), self.exogenous)
 
-    def merit(self, flown: Trajectory) -> dict[str, dict[str, Any]]:
-        """The plant's own quantities of the episodes as flown: mean with confidence interval, and median."""
-        found = self.plant.merit(flown.states, flown.actions, self.exogenous)
-        return {
-            name: mean_with_confidence(values) | {"median": values.median().item()} for name, values in found.items()
-        }
+    def judge(self, flown: Trajectory) -> "Judged":
+        """J_a and the plant's own quantities of the episodes as flown."""
+        costs = control_cost(self.plant, flown, self.exogenous)
+        return Judged(costs, self.plant.merit(flown.states, flown.actions, self.exogenous))
+
+    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
+        """The kinds of episodes that this plant's results are also shown apart for."""
+        return self.plant.categories(self.exogenous)
 
     @torch.no_grad()
     def identification_costs(self, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
@@ -67,6 +69,22 @@ class UnseenEpisodes:
         rollout = Rollout(self.plant, closure, compiled=self._compiled)
         replayed = rollout(self.initial_state, self.exogenous, flown.actions)
         return identification_cost(self.plant, replayed, flown.states)
+
+
+class Judged(NamedTuple):
+    """J_a and the plant's own quantities of each unseen episode under one controller."""
+
+    control_costs: Float[Tensor, " count"]
+    merit: dict[str, Float[Tensor, " count"]]
+
+    def statistics(self, chosen: Bool[Tensor, " count"] | None = None) -> dict[str, Any]:
+        """``J_a`` and ``merit``: mean with confidence interval, and median; of the ``chosen`` episodes only."""
+        chosen = torch.ones_like(self.control_costs, dtype=torch.bool) if chosen is None else chosen
+        merit = {
+            name: mean_with_confidence(values[chosen]) | {"median": values[chosen].median().item()}
+            for name, values in self.merit.items()
+        }
+        return {"J_a": mean_with_confidence(self.control_costs[chosen]), "merit": merit}
 
 
 Baseline = Callable[[Tensor, Tensor], Trajectory]

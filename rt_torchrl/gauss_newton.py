@@ -33,14 +33,18 @@ class LevenbergMarquardt:
     Args:
         module: holds the weights.
         damping: μ at the start; it falls tenfold with every step that lowers the cost and rises tenfold otherwise.
+        tolerance: the run ends where an undamped step promises to lower the cost by less than this share of it: what is
+            left of the cost is then not the weights' doing, and more equations would be solved for nothing.
     """
 
     least_damping, greatest_damping = 1e-12, 1e12
 
-    def __init__(self, module: nn.Module, *, damping: float = 1e-3):
+    def __init__(self, module: nn.Module, *, damping: float = 1e-3, tolerance: float = 1e-4):
         if not damping > 0:
             raise ValueError(f"damping={damping} of Levenberg-Marquardt must be positive.")
-        self.module, self.damping = module, damping
+        if not tolerance >= 0:
+            raise ValueError(f"tolerance={tolerance} of Levenberg-Marquardt must not be negative.")
+        self.module, self.damping, self.tolerance = module, damping, tolerance
 
     @torch.no_grad()
     def run(self, equations: Callable[[], NormalEquations], iterations: int, *, stop_below: float = 0.0) -> Descended:
@@ -57,9 +61,11 @@ class LevenbergMarquardt:
         current = equations()
         start, gradient, count = current.cost.item(), current.gradient.norm().item(), 0
         while count < iterations and not current.cost < stop_below * start:
+            if promised(current, self._step(current, self.least_damping)) <= self.tolerance * current.cost:
+                break
             count += 1
             before = copy.deepcopy(self.module.state_dict())
-            vector_to_parameters(parameters_to_vector(weights) + self._step(current), weights)
+            vector_to_parameters(parameters_to_vector(weights) + self._step(current, self.damping), weights)
             trial = self._attempt(equations)
             if trial is not None and trial.cost <= current.cost:
                 current, self.damping = trial, max(0.1 * self.damping, self.least_damping)
@@ -68,11 +74,11 @@ class LevenbergMarquardt:
                 self.damping = min(10.0 * self.damping, self.greatest_damping)
         return Descended(start, current.cost.item(), gradient, count)
 
-    def _step(self, current: NormalEquations) -> Tensor:
+    def _step(self, current: NormalEquations, damping: float) -> Tensor:
         diagonal = current.matrix.diagonal()
         # A weight that the record does not show at all gets the smallest curvature that is not rounding.
         floor = diagonal.max() * torch.finfo(diagonal.dtype).eps
-        damped = current.matrix + self.damping * torch.diag(diagonal.clamp_min(floor))
+        damped = current.matrix + damping * torch.diag(diagonal.clamp_min(floor))
         return -torch.linalg.solve(damped, current.gradient)
 
     def _attempt(self, equations: Callable[[], NormalEquations]) -> NormalEquations | None:
@@ -82,3 +88,8 @@ class LevenbergMarquardt:
         except FloatingPointError:
             return None
         return found if found.cost.isfinite() and found.matrix.isfinite().all() else None
+
+
+def promised(equations: NormalEquations, step: Tensor) -> Tensor:
+    """By how much the quadratic model of the cost falls with a step."""
+    return -(equations.gradient @ step + 0.5 * step @ equations.matrix @ step)

@@ -30,6 +30,8 @@ class ModelFreeConfig:
         discount: γ per control interval.
         return_steps: control intervals whose rewards a target sums before it bootstraps; 1 as in the paper. A control
             interval that is short beside the dynamics makes one action matter little, and less than the critic's error.
+        reward_scale: factor on the rewards the critic learns from, so that its values are of the order of ten, which
+            a perceptron reaches within an episode; a value is the mean reward over 1 − γ. What is reported is unscaled.
         target_rate: τ of the target critic.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
@@ -42,6 +44,7 @@ class ModelFreeConfig:
     batch_size: int = 128
     discount: float = 0.98
     return_steps: int = 1
+    reward_scale: float = 1.0
     target_rate: float = 0.01
     critic_rate: float = 1e-3
     actor_rate: float = 2e-3
@@ -57,7 +60,7 @@ class ModelFreeConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if not 0.0 <= self.discount < 1.0:
             raise ValueError(f"discount={self.discount} must lie in [0, 1); the critic bootstraps through truncation.")
-        for argument in ("target_rate", "critic_rate", "actor_rate", "gradient_limit"):
+        for argument in ("reward_scale", "target_rate", "critic_rate", "actor_rate", "gradient_limit"):
             if not getattr(self, argument) > 0.0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
 
@@ -100,6 +103,9 @@ class ModelFree:
         policy: π_mf, updated in place.
         config: see :class:`ModelFreeConfig`.
         generator: source of the critic's initial weights.
+
+    Raises:
+        ValueError: if ``return_steps`` exceeds an episode of the plant.
     """
 
     def __init__(
@@ -110,6 +116,11 @@ class ModelFree:
         *,
         generator: torch.Generator,
     ):
+        if config.return_steps > plant.n_steps:
+            raise ValueError(
+                f"return_steps={config.return_steps} exceeds the {plant.n_steps} control intervals of an episode of "
+                f"plant {plant.name!r}; use at most a tenth of them, or a longer horizon."
+            )
         self.config, self.policy = config, policy
         self.critic = Critic(plant, config.critic_hidden, generator=generator).to(generator.device)
         self.loss = DDPGLoss(
@@ -126,9 +137,16 @@ class ModelFree:
         self.restart()
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
-        """What D_L keeps of an episode, a TensorDict of batch size n: (e_k, a_k, return, e_{k+m}) of each interval."""
+        """What D_L keeps of an episode, a TensorDict: (e_k, a_k, return, e_{k+m}) of the intervals with m after them.
+
+        The last m − 1 are left out: with shorter sums, the values of where episodes end, such as a target that is
+        reached, would rest on hardly anything but themselves, and drift without bound.
+        """
+        whole = len(episode) - self.config.return_steps + 1
         transitions = episode.select(*TRANSITION)
-        return self._returns(transitions.unsqueeze(0))[0].select(*TRANSITION, "steps_to_next_obs", strict=False)
+        transitions["next", "reward"] = self.config.reward_scale * transitions["next", "reward"]
+        returns = self._returns(transitions.unsqueeze(0))[0, :whole]
+        return returns.select(*TRANSITION, "steps_to_next_obs", strict=False)
 
     def restart(self) -> None:
         """Forget the state of the policy's optimiser, because its weights have jumped."""
@@ -147,9 +165,10 @@ class ModelFree:
             episode_length: n_t.
 
         Returns:
-            Means over the iterations of ``critic_loss``, ``td_error``, ``value`` and both gradient norms.
+            Means over the iterations of ``critic_loss``, ``td_error``, ``value`` and both gradient norms; the first
+            three for the rewards as they are, without ``reward_scale``.
         """
-        size = min(self.config.batch_size, episode_length)
+        size, scale = min(self.config.batch_size, episode_length), self.config.reward_scale
         found = {key: [] for key in ("critic_loss", "td_error", "critic_gradient", "value", "actor_gradient")}
         for _ in range(self.config.critic_iterations):
             batch = memory.sample(size)
@@ -160,7 +179,7 @@ class ModelFree:
             self.critic_optimiser.step()
             self.target.step()
             memory.refresh(batch["index"], td_error)
-            for key, value in zip(found, (loss.detach(), td_error.mean(), norm), strict=False):
+            for key, value in zip(found, (loss.detach() / scale**2, td_error.mean() / scale, norm), strict=False):
                 found[key].append(value)
         for _ in range(self.config.actor_iterations):
             loss = _actor_loss(self.loss, memory.sample(size))
@@ -168,7 +187,7 @@ class ModelFree:
             loss.backward()
             norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.gradient_limit)
             self.actor_optimiser.step()
-            found["value"].append(-loss.detach())
+            found["value"].append(-loss.detach() / scale)
             found["actor_gradient"].append(norm)
         return TensorDict({key: torch.stack(values).mean() for key, values in found.items() if values})
 

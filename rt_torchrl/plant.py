@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.integrators import RK4_REAL_STABILITY, rk4_step
@@ -152,6 +152,10 @@ class Plant(nn.Module, ABC):
         exogenous: Float[Tensor, "batch n n_z"],
     ) -> dict[str, Float[Tensor, " batch"]]:
         """Physical quantities an engineer judges whole episodes by, named with their unit; here none."""
+        return {}
+
+    def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
+        """Kinds of episodes, by name, that results are also shown apart for; here none."""
         return {}
 
     # Randomness, always from the generator that is passed in

@@ -7,10 +7,10 @@ from tensordict import TensorDict
 from torch import nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation import Baseline, Optimum, UnseenEpisodes, mean_with_confidence
-from rt_torchrl.trajectory import control_cost
+from rt_torchrl.evaluation import Baseline, Judged, Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.switching import Role
 
-ROLES = ("model_based", "model_free")
+ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
 
 def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, Any]:
@@ -40,53 +40,68 @@ def progress(record: dict[str, Any]) -> str:
 
 
 @torch.no_grad()
+def judge(unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, Baseline]) -> dict[str, Judged]:
+    """Both policies, then the classical controllers, on the unseen episodes."""
+    judged = {role: unseen.judge(unseen.fly(policies[role])) for role in ROLES}
+    flown = {name: fly(unseen.initial_state, unseen.exogenous) for name, fly in baselines.items()}
+    return judged | {name: unseen.judge(trajectory) for name, trajectory in flown.items()}
+
+
+@torch.no_grad()
 def summary(
     algorithm: ReinforcementTwinning,
     unseen: UnseenEpisodes,
+    judged: dict[str, Judged],
     initial_policy: nn.Module,
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
     optimum: Optimum | None,
-    baselines: dict[str, Baseline],
 ) -> dict[str, Any]:
     """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
 
     J_p before and after are of the same episodes, flown by the final live policy.
     """
-    closure, live = algorithm.twin.closure, algorithm.policies[algorithm.switch.live]
+    closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.plant.closure, "start": initial_closure}
     before = unseen.control_costs(initial_policy)
-    after = {role: unseen.control_costs(algorithm.policies[role]) for role in ROLES}
-    flown = unseen.fly(live)
+    flown = unseen.fly(algorithm.policies[live])
     J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
-    unseen_costs = {"J_p": J_p, "J_p_before": J_p_before, "J_a_before": before}
-    unseen_costs |= {f"J_a_{role}": costs for role, costs in after.items()}
-    better = min(ROLES, key=lambda role: after[role].mean().item())
+    after = {role: judged[role].control_costs.mean() for role in ROLES}
+    better = min(ROLES, key=lambda role: after[role].item())
     found = {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
-        **{f"J_a_ratio_{role}": (after[role].mean() / before.mean()).item() for role in ROLES},
+        **{f"J_a_ratio_{role}": (after[role] / before.mean()).item() for role in ROLES},
         "unseen": {
             "episodes": len(before),
-            **{name: mean_with_confidence(costs) for name, costs in unseen_costs.items()},
-            "merit": {role: unseen.merit(unseen.fly(algorithm.policies[role])) for role in ROLES},
-            "baselines": {name: judged(unseen, fly) for name, fly in baselines.items()},
+            "J_p": mean_with_confidence(J_p),
+            "J_p_before": mean_with_confidence(J_p_before),
+            "J_a_before": mean_with_confidence(before),
+            **results(unseen, judged),
         },
-        "live": algorithm.switch.live,
+        "live": live,
         "better": better,
         "closure": {name: named_weights(law) for name, law in laws.items()},
         "seconds": seconds_per_step(episodes),
     }
     if optimum is not None:
         found["reference"] = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs}
-        found["reference"]["better_over_reference"] = after[better].mean().item() / optimum.cost
+        found["reference"]["better_over_reference"] = after[better].item() / optimum.cost
     return found
 
 
-def judged(unseen: UnseenEpisodes, fly: Baseline) -> dict[str, Any]:
-    """J_a and the plant's own quantities of a classical controller on the unseen episodes."""
-    flown = fly(unseen.initial_state, unseen.exogenous)
-    costs = control_cost(unseen.plant, flown, unseen.exogenous)
-    return {"J_a": mean_with_confidence(costs), "merit": unseen.merit(flown)}
+def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:
+    """What the controllers reach on all unseen episodes, and on each kind of them apart."""
+    overall = {name: found.statistics() for name, found in judged.items()}
+    kinds = {name: chosen for name, chosen in unseen.categories().items() if chosen.sum() > 1}
+    return {
+        **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
+        "merit": {role: overall[role]["merit"] for role in ROLES},
+        "baselines": {name: found for name, found in overall.items() if name not in ROLES},
+        "categories": {
+            kind: {"episodes": int(chosen.sum())} | {name: found.statistics(chosen) for name, found in judged.items()}
+            for kind, chosen in kinds.items()
+        },
+    }
 
 
 @torch.no_grad()
@@ -136,16 +151,26 @@ def _interval(found: dict[str, Any]) -> str:
 
 
 def merit_lines(unseen: dict[str, Any]) -> list[str]:
-    """The plant's own quantities, mean and median, of both policies and the classical controllers."""
-    columns = {role.replace("_", "-"): unseen["merit"][role] for role in ROLES}
-    columns |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
-    if not columns["model-based"]:
+    """The plant's own quantities under every controller: of all episodes, then with J_a of each kind apart."""
+    merits = {role: unseen["merit"][role] for role in ROLES}
+    merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
+    if not merits[ROLES[0]]:
         return []
-    lines = [f"  {'mean (median)':<28}" + "".join(f"{name:>20}" for name in columns)]
-    for name in columns["model-based"]:
-        found = [merit[name] for merit in columns.values()]
-        values = (f"{value['mean']:.4g} ({value['median']:.4g})" for value in found)
-        lines.append(f"  {name:<28}" + "".join(f"{value:>20}" for value in values))
+    lines = [f"  {'mean (median)':<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
+    lines += _rows(merits)
+    for kind, found in unseen["categories"].items():
+        lines.append(f"  {kind}, {found['episodes']} of {unseen['episodes']} episodes")
+        lines += _rows({name: {"J_a": found[name]["J_a"]} | found[name]["merit"] for name in merits})
+    return lines
+
+
+def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
+    """A line for each quantity."""
+    lines = []
+    for name in next(iter(columns.values())):
+        values = [merit[name] for merit in columns.values()]
+        shown = (f"{v['mean']:.4g}" + (f" ({v['median']:.4g})" if "median" in v else "") for v in values)
+        lines.append(f"    {name:<26}" + "".join(f"{text:>20}" for text in shown))
     return lines
 
 

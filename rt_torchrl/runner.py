@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import json
 import logging
 import os
@@ -22,9 +23,10 @@ from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.dashboard import Dashboard
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.evaluation import Baseline, UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation import Baseline, Judged, UnseenEpisodes, exact_optimum
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
+from rt_torchrl.policies import SaturatedMLP
 from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.trajectory import Engine
 from rt_torchrl.twin import DigitalTwin
@@ -37,6 +39,8 @@ class RunConfig:
     """Options every recipe has.
 
     Args:
+        policy: paper for the plant's own, or mlp.
+        hidden: widths of the hidden layers of an mlp policy.
         episodes: number of real episodes n_e.
         seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: parallel (exact, fast), odeint_adjoint (the paper's continuous
@@ -55,6 +59,8 @@ class RunConfig:
         twinning: hyper-parameters of the six steps.
     """
 
+    policy: str = "paper"
+    hidden: tuple[int, ...] = (32, 32)
     episodes: int = 20
     seed: int = 0
     engine: Engine = "parallel"
@@ -76,6 +82,18 @@ class RunConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
+
+    def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
+        """The policy asked for, with random initial weights; override it for policies of your own.
+
+        Raises:
+            ValueError: if there is no policy of that name.
+        """
+        if self.policy == "paper":
+            return plant.make_policy(generator)
+        if self.policy == "mlp":
+            return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
+        raise ValueError(f"policy={self.policy!r} does not exist; choose paper or mlp.")
 
     def effective(self) -> "RunConfig":
         """With ``quick`` carried out."""
@@ -99,7 +117,6 @@ class Run:
     Args:
         config: see :class:`RunConfig`.
         plant: the real system in simulation, and the twin's physics.
-        make_policy: draws the initial weights of both policies; by default the plant's own policy.
         plant_figures: figures only this plant has.
         baselines: classical controllers to judge beside the policies, by name.
         animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
@@ -114,7 +131,6 @@ class Run:
         config: RunConfig,
         plant: Plant,
         *,
-        make_policy: Callable[[torch.Generator], nn.Module] | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, Baseline] | None = None,
         animate: Callable[[Snapshot, Path], None] | None = None,
@@ -129,7 +145,7 @@ class Run:
         logging.getLogger("torchrl").setLevel(logging.WARNING)
         self.folder = require_folder(config, plant.name)
         generator = torch.Generator(device=device).manual_seed(config.seed)
-        self.make_policy = make_policy or plant.make_policy
+        self.make_policy = functools.partial(config.make_policy, plant)
         model_based = self.make_policy(generator).to(device)
         closure = plant.make_closure(generator).to(device)
         self.initial_policy, self.initial_closure = copy.deepcopy(model_based), copy.deepcopy(closure)
@@ -169,8 +185,9 @@ class Run:
         if not self.episodes:
             raise SystemExit("interrupted before the first episode was done; nothing to report.")
         self._drop_half_an_episode()
-        metrics = self._results(gap)
-        self._draw(dashboard)
+        judged = report.judge(self.unseen, self.algorithm.policies, self.baselines)
+        metrics = self._results(gap, judged)
+        self._draw(dashboard, judged)
         dashboard.close()
         print(report.table(metrics))
         print(f"results in {self.folder}; look at them with: tensorboard --logdir {self.folder}")
@@ -192,17 +209,10 @@ class Run:
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
             self.episodes = checkpoint.load(self.folder / "checkpoint.pt", self.algorithm)
 
-    def _results(self, gap: float) -> dict[str, Any]:
+    def _results(self, gap: float, judged: dict[str, Judged]) -> dict[str, Any]:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
-        summary = report.summary(
-            self.algorithm,
-            self.unseen,
-            self.initial_policy,
-            self.initial_closure,
-            self.episodes,
-            optimum,
-            self.baselines,
-        )
+        initial = self.initial_policy, self.initial_closure
+        summary = report.summary(self.algorithm, self.unseen, judged, *initial, self.episodes, optimum)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = {"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary}
@@ -217,9 +227,9 @@ class Run:
     def _figures(self, snapshot: Snapshot) -> dict[str, Figure]:
         return figures.figures_of(snapshot) | self.plant_figures(snapshot)
 
-    def _draw(self, dashboard: Dashboard) -> None:
+    def _draw(self, dashboard: Dashboard, judged: dict[str, Judged]) -> None:
         snapshot = self._snapshot()
-        drawn = self._figures(snapshot)
+        drawn = self._figures(snapshot) | {"unseen": figures.unseen(judged, self.unseen.categories())}
         (self.folder / "figures").mkdir(exist_ok=True)
         for name, figure in drawn.items():
             figure.savefig(self.folder / "figures" / f"{name}.png", dpi=120)

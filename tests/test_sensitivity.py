@@ -107,3 +107,18 @@ def test_a_trial_that_diverges_is_taken_back():
     optimiser.run(equations, 3)
     assert torch.equal(valley.w.detach(), before)
     assert optimiser.damping == pytest.approx(1e3)
+
+
+def test_a_cost_that_the_weights_cannot_lower_ends_the_run():
+    valley, calls = Valley(), 0
+    valley.w.data.fill_(1.0)
+
+    def equations():
+        nonlocal calls
+        calls += 1
+        found = valley.equations()
+        # What noise leaves of the cost at its minimum, and a gradient that is rounding beside it.
+        return NormalEquations(found.cost + 1.0, found.gradient + 1e-9, found.matrix)
+
+    found = LevenbergMarquardt(valley).run(equations, 15)
+    assert (calls, found.iterations, found.best) == (1, 0, 1.0)

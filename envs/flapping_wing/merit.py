@@ -1,6 +1,6 @@
 """What the operator of a drone judges a flight by."""
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rt_torchrl.plant import Plant
@@ -12,11 +12,16 @@ def merit(
     applied: Float[Tensor, "batch n 2"],
     exogenous: Float[Tensor, "batch n 1"],
 ) -> dict[str, Float[Tensor, " batch"]]:
-    """Distance to the target at the end and at its least, and whether the last second's wind could be held."""
+    """Distance to the target at the end and at its least."""
     distance = (plant.target - states[..., :2]).norm(dim=-1)
+    return {"final distance [m]": distance[:, -1], "least distance [m]": distance.amin(-1)}
+
+
+def categories(plant: Plant, exogenous: Float[Tensor, "batch n 1"]) -> dict[str, Bool[Tensor, " batch"]]:
+    """Whether the stroke plane turns far enough to hold the wind of the last second, when the drone should hover.
+
+    No policy stays at the target in a gust beyond that; it is blown away, and how far says nothing of the policy.
+    """
     last = round(1.0 / plant.dt)
-    return {
-        "final distance [m]": distance[:, -1],
-        "least distance [m]": distance.amin(-1),
-        "gust can be held [-]": (exogenous[:, -last:, 0].amax(-1) <= plant.strongest_wind).double(),
-    }
+    held = exogenous[:, -last:, 0].amax(-1) <= plant.strongest_wind
+    return {"gust can be held": held, "gust too strong to hold": ~held}

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.envs.flapping_wing import merit as judgement
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
-from rt_torchrl.envs.flapping_wing.merit import merit
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.plant import Plant, require_stable_step
 from rt_torchrl.policies import SaturatedAffine
@@ -278,8 +278,7 @@ class FlappingWing(Plant):
         """½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
-    def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
-        return merit(self, states, applied, exogenous)
+    merit, categories = judgement.merit, judgement.categories
 
     # Randomness
 

@@ -275,9 +275,9 @@ class WindTurbine(Plant):
         """Saint-Drenan's C_p with the coefficients of Dai 2016; draws nothing."""
         return SaintDrenan.from_set("Dai2016")
 
-    def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """The paper's policy: one bias-free affine law per action through the smooth clip."""
-        return SaturatedAffine(2, self.actions, bias=False, weight_scale=0.5, generator=generator)
+    def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
+        """The paper's policy: one affine law per action through the smooth clip, without bias unless asked for."""
+        return SaturatedAffine(2, self.actions, bias=bias, weight_scale=0.5, generator=generator)
 
 
 def smoothstep(x: Tensor) -> Tensor:

@@ -1,0 +1,53 @@
+"""How good the controllers are on episodes they were never trained on."""
+
+import numpy as np
+from jaxtyping import Bool
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from rt_torchrl.evaluation import Judged
+from rt_torchrl.figures.style import REFERENCE, ROLES, array, caption, legend_below, panels
+
+MARKERS = ("o", "^", "s", "D")
+"""One for each kind of episodes."""
+WIDEST_LINEAR = 30.0
+"""Ratio of the largest to the smallest value above which a panel is logarithmic."""
+
+
+def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count"]]) -> Figure:
+    """J_a and every quantity of the plant's merit, a point for each episode and a bar at each mean, by controller.
+
+    Args:
+        judged: by controller, the policies first.
+        categories: the kinds of episodes, told apart by the marker.
+    """
+    first = next(iter(judged.values()))
+    quantities = {"$J_a$": {name: found.control_costs for name, found in judged.items()}}
+    quantities |= {name: {who: found.merit[name] for who, found in judged.items()} for name in first.merit}
+    count = len(first.control_costs)
+    title = f"{count} unseen episodes, a point each; bar: mean"
+    figure, axes = panels(1, len(quantities), title=title, size=(max(4.5, 3.1 * len(quantities)), 4.2))
+    kinds = {kind: array(chosen) for kind, chosen in categories.items()} or {"": np.ones(count, dtype=bool)}
+    for ax, (name, values) in zip(axes.flat, quantities.items(), strict=True):
+        _strip(ax, {who: array(found) for who, found in values.items()}, kinds)
+        caption(ax, name)
+    if categories:
+        legend_below(figure, [axes[0, 0]])
+    return figure
+
+
+def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]) -> None:
+    """One column of points per controller, spread sideways so that they do not hide each other."""
+    rng = np.random.default_rng(0)
+    for column, (who, found) in enumerate(values.items()):
+        place = column + 0.25 * rng.uniform(-1.0, 1.0, len(found))
+        for marker, (kind, chosen) in zip(MARKERS, kinds.items(), strict=False):
+            style = {"color": ROLES.get(who, REFERENCE), "alpha": 0.6, "markersize": 4.5, "markeredgewidth": 0.0}
+            ax.plot(place[chosen], found[chosen], marker, label=kind or None, **style)
+        ax.plot([column - 0.35, column + 0.35], [found.mean()] * 2, color="0.1", linewidth=2.0)
+    together = np.concatenate(list(values.values()))
+    if together.min() > 0.0 and together.max() > WIDEST_LINEAR * together.min():
+        ax.set_yscale("log")
+    ax.set_xticks(range(len(values)), [who.replace("_", "-") for who in values])
+    ax.set_xlim(-0.6, len(values) - 0.4)

@@ -1,0 +1,64 @@
+"""Exploration noise: deviation and correlation of what reaches the actuators, and a fresh start at each episode."""
+
+import math
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.exploration import ExplorationConfig, LivePolicy
+
+
+class Held(torch.nn.Module):
+    """Asks for the same action always."""
+
+    def __init__(self, action):
+        super().__init__()
+        self.action = action
+
+    def forward(self, observation):
+        return self.action
+
+
+def noise(plant, n=40_000, *, strength=1.0, **options):
+    """What a policy that asks for mid-range is made to do, over half the range."""
+    middle = torch.tensor([0.5 * (a.low + a.high) for a in plant.actions], dtype=torch.float64)
+    config = ExplorationConfig(spread=0.1, **options)
+    actor = LivePolicy(plant, Held(middle), config, generator=torch.Generator().manual_seed(0))
+    actor.begin(actor.policy, strength=strength)
+    observation = torch.zeros(len(plant.observations), dtype=torch.float64)
+    acted = torch.stack([actor(observation) for _ in range(n)])
+    half = torch.tensor([0.5 * (a.high - a.low) for a in plant.actions], dtype=torch.float64)
+    return (acted - middle) / half
+
+
+@pytest.mark.parametrize("intervals", [0.0, 3.0])
+def test_deviation_and_correlation_are_those_asked_for(intervals):
+    plant = LinearQuadratic()
+    found = noise(plant, correlation_time=intervals * plant.dt, strength=0.5)
+    rho = math.exp(-1.0 / intervals) if intervals else 0.0
+    # Standard error of a deviation over 40 000 samples of which some 1 + 2ρ/(1 − ρ) count as one: 2 % at most.
+    assert found.std(0).tolist() == pytest.approx([0.05] * len(plant.actions), rel=0.05)
+    for lag in (1, 2, 5):
+        correlation = (found[lag:] * found[:-lag]).mean(0) / found.square().mean(0)
+        assert correlation.tolist() == pytest.approx([rho**lag] * len(plant.actions), abs=0.04)
+
+
+def test_an_episode_does_not_begin_with_the_noise_of_the_last_one():
+    plant = LinearQuadratic()
+    config = ExplorationConfig(correlation_time=1e6 * plant.dt, spread=0.1)
+    policy = plant.make_policy(torch.Generator().manual_seed(0))
+    actor = LivePolicy(plant, policy, config, generator=torch.Generator().manual_seed(0))
+    observation = torch.zeros(len(plant.observations), dtype=torch.float64)
+    firsts = []
+    for _ in range(2):
+        actor.begin(policy, strength=1.0)
+        firsts.append(actor(observation))
+        torch.testing.assert_close(actor(observation), firsts[-1], rtol=0, atol=1e-2)
+    assert (firsts[0] - firsts[1]).abs().min() > 1e-2
+
+
+@pytest.mark.parametrize(("argument", "value"), [("spread", -1.0), ("episodes", -1), ("correlation_time", -1.0)])
+def test_negative_parameters_are_refused(argument, value):
+    with pytest.raises(ValueError, match=f"{argument}=-1"):
+        ExplorationConfig(**{argument: value})
