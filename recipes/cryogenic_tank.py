@@ -8,6 +8,7 @@ from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
 from rt_torchrl.runner import Run, RunConfig, main_of
@@ -15,8 +16,17 @@ from rt_torchrl.switching import SwitchConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.
+    # The pressure moves over days: noise that lasts a period of the load, returns over 17 h and a discount over 42 h.
     realisations=1,
-    model_free=ModelFreeConfig(critic_iterations=1000, actor_iterations=1000, discount=0.998),
+    exploration=ExplorationConfig(correlation_time=5400.0),
+    model_free=ModelFreeConfig(
+        critic_iterations=1000,
+        actor_iterations=1000,
+        discount=0.9998,
+        return_steps=2000,
+        reward_scale=1e-3,
+        actor_rate=5e-4,
+    ),
     assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt"),
     model_based=ModelBasedConfig(iterations=5, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     switch=SwitchConfig(patience=4, clone_patience=20),

@@ -30,8 +30,9 @@ PAPER = TwinningConfig(
         reward_scale=1e-3,
         actor_rate=1e-4,
     ),
-    # The gust is smooth over its 3 s: what the default tube of the regression leaves would pass for drag.
-    exogenous=ExogenousConfig(tube=2e-3, penalty=1e3),
+    # The gust is smooth over its 3 s, and what a regression leaves of it would pass for drag: a kernel of 0.3 s and a
+    # tube of 2e-4 leave 1e-4 m/s.
+    exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     model_based=ModelBasedConfig(iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5)),
     switch=SwitchConfig(patience=4, clone_patience=4),

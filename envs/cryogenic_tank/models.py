@@ -4,21 +4,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.closures import PositiveCoefficients
 from rt_torchrl.policies import SmoothClip
 from rt_torchrl.signal import Signal
 
-NAMES = ("U_s", "U_HX", "K_JT")
-TRUE_COEFFICIENTS = (50.0, 75.0, 500e9)
-"""U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²] of the real tank (paper, section 5.3)."""
-FIRST_GUESS = (1.0, 1.0, 10e9)
-"""Where the paper's twin starts, w_p⁰ = [1, 1, 10], in the same units."""
 
-
-class ConstantCoefficients(nn.Module):
+class ConstantCoefficients(PositiveCoefficients):
     r"""Wall-to-fluid and heat-exchanger coefficients and the valve's constant, the same in every state.
 
-    The trained weights are log U_s, log U_HX and log K_JT: they differ by a factor of 10¹⁰, have to travel a factor of
-    50 and stay positive; a step in the logarithm is the same percentage of each.
+    In their logarithms, because they differ by a factor of 10¹⁰ and have to travel a factor of 50.
 
     Any module that maps the four features of :meth:`CryogenicTank.features` to three positive coefficients, such as a
     perceptron with exponentials at its end, can stand in.
@@ -30,34 +24,14 @@ class ConstantCoefficients(nn.Module):
         ValueError: if there are not three positive, finite coefficients.
     """
 
-    def __init__(self, coefficients: Float[Tensor, " n"]):
-        super().__init__()
-        coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
-        if coefficients.shape != (3,) or not (coefficients.isfinite() & (coefficients > 0.0)).all():
-            raise ValueError(
-                f"coefficients={coefficients.tolist()} must be U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²], positive and "
-                f"finite; the tank of the paper has {TRUE_COEFFICIENTS}."
-            )
-        self.log_coefficients = nn.Parameter(coefficients.log())
-
-    @classmethod
-    def true(cls) -> "ConstantCoefficients":
-        """Those of the real tank; the weights are frozen, they are not what is learned."""
-        return cls(torch.tensor(TRUE_COEFFICIENTS, dtype=torch.float64)).requires_grad_(False)
+    names = {"U_s": "W/(m² K)", "U_HX": "W/(m² K)", "K_JT": "Pa s²/kg²"}
+    true_coefficients = (50.0, 75.0, 500e9)  # paper, section 5.3
+    guessed_coefficients = (1.0, 1.0, 10e9)  # where the paper's twin starts, w_p⁰ = [1, 1, 10]
 
     @classmethod
     def first_guess(cls, device: torch.device | str = "cpu") -> "ConstantCoefficients":
         """Those the paper's twin starts from."""
-        return cls(torch.tensor(FIRST_GUESS, dtype=torch.float64, device=device))
-
-    @property
-    def coefficients(self) -> Float[Tensor, "3"]:
-        """U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²]."""
-        return self.log_coefficients.exp()
-
-    def named_coefficients(self) -> dict[str, Tensor]:
-        """U_s, U_HX and K_JT by name, in their own units."""
-        return dict(zip(NAMES, self.coefficients.unbind(), strict=True))
+        return cls(torch.tensor(cls.guessed_coefficients, dtype=torch.float64, device=device))
 
     def forward(self, features: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
         """U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²]; the features do not matter here."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad, LoadModel
 from rt_torchrl.envs.cryogenic_tank.merit import merit
 from rt_torchrl.envs.cryogenic_tank.mixture import Conditions, evaporation_heat, mixture_rates
-from rt_torchrl.envs.cryogenic_tank.models import TRUE_COEFFICIENTS, ConstantCoefficients, CubicVentLaw
+from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, valve_conductance, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
@@ -79,7 +79,7 @@ class CryogenicTank(Plant):
     back_pressure = 80e3  # least p_1 [Pa], held by a regulator at the end of the vent line
     greatest_pressure = 900e3  # end of the saturation table [Pa]; a shut tank reaches 700 kPa in an episode
     superheat_unit = 0.05  # typical T_s − T [K]
-    rated_valve = TRUE_COEFFICIENTS[2]  # K_JT of the valve's data sheet, for the cost [Pa s²/kg²]
+    rated_valve = ConstantCoefficients.true_coefficients[2]  # K_JT of the valve's data sheet, for the cost [Pa s²/kg²]
 
     states = (
         Signal(symbol="T_s", name="wall_temperature", unit="K", low=0.0),

@@ -2,13 +2,12 @@ r"""Closure of the flapping wing: a law for the lift and drag of a blade element
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-TRUE_COEFFICIENTS = (1.71, 0.043, 1.595)
-"""a, b and c of a semi-elliptical wing as the paper takes them from Lee et al. 2016."""
+from rt_torchrl.closures import PositiveCoefficients
 
 
-class QuasiSteadyPolar(nn.Module):
+class QuasiSteadyPolar(PositiveCoefficients):
     r"""Lift and drag coefficients of a blade element, eqs. (drone_eq_Clift) and (drone_eq_Cdrag) of the paper.
 
     .. math::
@@ -19,8 +18,7 @@ class QuasiSteadyPolar(nn.Module):
     the air. The law takes its sine and cosine, which are the components of the direction of that velocity across and
     along the chord: no angle is ever formed, and any other polar of the two, such as a perceptron, can stand in.
 
-    The trained weights are log a, log b and log c: the coefficients stay positive, and a step changes each by the same
-    percentage although b is forty times smaller than the others.
+    The true a, b and c are those of a semi-elliptical wing, as the paper takes them from Lee et al. 2016.
 
     Note: the paper takes :math:`\alpha_e` from an arc cosine, which has no sign and no slope at 0 and 180 deg; here its
     sine keeps the sign of the flow across the chord, so that the lift turns with the side the air comes from.
@@ -32,20 +30,8 @@ class QuasiSteadyPolar(nn.Module):
         ValueError: if there are not three positive, finite coefficients.
     """
 
-    def __init__(self, coefficients: Float[Tensor, " n"]):
-        super().__init__()
-        coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
-        if coefficients.shape != (3,) or not (coefficients.isfinite() & (coefficients > 0.0)).all():
-            raise ValueError(
-                f"coefficients={coefficients.tolist()} must be a, b and c, positive and finite; "
-                f"the wing of the paper has {TRUE_COEFFICIENTS}."
-            )
-        self.log_coefficients = nn.Parameter(coefficients.log())
-
-    @classmethod
-    def true(cls) -> "QuasiSteadyPolar":
-        """The wing of the real system; its weights are frozen, it is not what is learned."""
-        return cls(torch.tensor(TRUE_COEFFICIENTS, dtype=torch.float64)).requires_grad_(False)
+    names = {"a": "-", "b": "-", "c": "-"}
+    true_coefficients = (1.71, 0.043, 1.595)
 
     @classmethod
     def draw(cls, generator: torch.Generator, *, spread: float = 0.5) -> "QuasiSteadyPolar":
@@ -58,16 +44,7 @@ class QuasiSteadyPolar(nn.Module):
             raise ValueError(f"spread={spread} of QuasiSteadyPolar must be in [0, 1), a fraction of the true values.")
         like = {"dtype": torch.float64, "device": generator.device}
         factor = 1.0 + spread * (2.0 * torch.rand(3, generator=generator, **like) - 1.0)
-        return cls(torch.tensor(TRUE_COEFFICIENTS, **like) * factor)
-
-    @property
-    def coefficients(self) -> Float[Tensor, "3"]:
-        """a, b and c [-]."""
-        return self.log_coefficients.exp()
-
-    def named_coefficients(self) -> dict[str, Tensor]:
-        """a, b and c by name."""
-        return dict(zip("abc", self.coefficients.unbind(), strict=True))
+        return cls(torch.tensor(cls.true_coefficients, **like) * factor)
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """C_L and C_D [-] at (sin α_e, cos α_e) = (U_ξ, U_ζ)/|U|."""
