@@ -75,11 +75,12 @@ def main(config: Config) -> None:
             seconds[engine].append(time.perf_counter() - start)
     last = config.engines[-1]
     medians = {engine: statistics.median(values) for engine, values in seconds.items()}
+    gaps = {engine: ((g - found[last]).norm() / found[last].norm()).item() for engine, g in found.items()}
     for engine, median in medians.items():
-        gap = ((found[engine] - found[last]).norm() / found[last].norm()).item()
-        print(f"{engine:<15} {median:10.3f} s   {medians[last] / median:8.1f} times faster   gap {gap:.1e}")
+        print(f"{engine:<15} {median:10.3f} s   {medians[last] / median:8.1f} times faster   gap {gaps[engine]:.1e}")
     if config.output:
-        config.output.write_text(json.dumps({"seconds": seconds, "medians": medians}, indent=2) + "\n")
+        result = {"seconds": seconds, "medians": medians, "gaps": gaps}
+        config.output.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.exogenous import ExogenousConfig
 from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
@@ -27,8 +28,12 @@ PAPER = TwinningConfig(
         reward_scale=1e-3,
         actor_rate=5e-4,
     ),
-    assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt"),
-    model_based=ModelBasedConfig(iterations=5, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    # Knots every 300 s and a kernel of 600 s: the peaks of the load are 675 s wide.
+    exogenous=ExogenousConfig(knots=1440),
+    # Ten per cent of U_HX move the pressure by 50 Pa, another draw of the load's noise by 200 Pa.
+    assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
+    # Starting pressures differ by 25 kPa: a plan for one of them is not one for the others.
+    model_based=ModelBasedConfig(iterations=5, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     switch=SwitchConfig(patience=4, clone_patience=20),
 )
 

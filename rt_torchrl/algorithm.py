@@ -163,9 +163,8 @@ class ReinforcementTwinning:
 
     def plan(self) -> TensorDict:
         """Step 5: n_mb gradient steps on J_a over N_z virtual trajectories under π_mb, on the twin with w_p*."""
-        planned_on, judged_on = map(
-            self.draw_virtual_episodes, (self.config.realisations, self.config.virtual_episodes)
-        )
+        count = self.config.model_based.realisations or self.config.realisations
+        planned_on, judged_on = map(self.draw_virtual_episodes, (count, self.config.virtual_episodes))
         found, accepted = self.model_based.update(planned_on, judged_on)
         return findings(
             J_a_plan_before=found.start,

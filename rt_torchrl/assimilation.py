@@ -23,6 +23,9 @@ class AssimilationConfig:
     Args:
         iterations: n_G, gradients per episode.
         stop_ratio: end the loop once J_p is below this share of its value at the start of the episode; 0 never does.
+        inputs: ``realisations`` replays the record under N_z samples of the exogenous process, as in the paper;
+            ``record`` under the exogenous input that was measured. Realisations keep a twin from fitting what is chance
+            in the input, but weights that move the states less than that chance are lost in it.
         method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
             forward sensitivities, for closures of some ten weights, and makes no use of ``descent``.
         descent: how the closure's weights descend J_p.
@@ -30,6 +33,7 @@ class AssimilationConfig:
 
     iterations: int = 15
     stop_ratio: float = 0.0
+    inputs: Literal["realisations", "record"] = "realisations"
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
     descent: DescentConfig = field(default_factory=DescentConfig)
 
@@ -67,7 +71,10 @@ class Assimilation:
             count: N_z, realisations of each.
             generator: source of the realisations.
         """
-        exogenous = torch.cat([process.sample(count, generator) for process in processes])
+        if self.config.inputs == "record":
+            count, exogenous = 1, torch.stack([record.exogenous for record in records])
+        else:
+            exogenous = torch.cat([process.sample(count, generator) for process in processes])
         measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
         actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
 

@@ -35,16 +35,20 @@ class LevenbergMarquardt:
         damping: μ at the start; it falls tenfold with every step that lowers the cost and rises tenfold otherwise.
         tolerance: the run ends where an undamped step promises to lower the cost by less than this share of it: what is
             left of the cost is then not the weights' doing, and more equations would be solved for nothing.
+        longest_step: greatest change of a weight in one step, a factor of e for a weight that is a logarithm. Far from
+            the minimum a longer one can end where the states no longer depend on the weight, and stay there.
     """
 
     least_damping, greatest_damping = 1e-12, 1e12
+    least_step = 1e-9  # change of the weights below which they have arrived, whatever rounding is left of the cost
 
-    def __init__(self, module: nn.Module, *, damping: float = 1e-3, tolerance: float = 1e-4):
-        if not damping > 0:
-            raise ValueError(f"damping={damping} of Levenberg-Marquardt must be positive.")
+    def __init__(self, module: nn.Module, *, damping: float = 1e-3, tolerance: float = 1e-4, longest_step: float = 1.0):
+        for argument, value in (("damping", damping), ("longest_step", longest_step)):
+            if not value > 0:
+                raise ValueError(f"{argument}={value} of Levenberg-Marquardt must be positive.")
         if not tolerance >= 0:
             raise ValueError(f"tolerance={tolerance} of Levenberg-Marquardt must not be negative.")
-        self.module, self.damping, self.tolerance = module, damping, tolerance
+        self.module, self.damping, self.tolerance, self.longest_step = module, damping, tolerance, longest_step
 
     @torch.no_grad()
     def run(self, equations: Callable[[], NormalEquations], iterations: int, *, stop_below: float = 0.0) -> Descended:
@@ -61,11 +65,13 @@ class LevenbergMarquardt:
         current = equations()
         start, gradient, count = current.cost.item(), current.gradient.norm().item(), 0
         while count < iterations and not current.cost < stop_below * start:
-            if promised(current, self._step(current, self.least_damping)) <= self.tolerance * current.cost:
+            if self._arrived(current):
                 break
             count += 1
             before = copy.deepcopy(self.module.state_dict())
-            vector_to_parameters(parameters_to_vector(weights) + self._step(current, self.damping), weights)
+            step = self._step(current, self.damping)
+            step *= (self.longest_step / step.abs().max()).clamp(max=1.0)
+            vector_to_parameters(parameters_to_vector(weights) + step, weights)
             trial = self._attempt(equations)
             if trial is not None and trial.cost <= current.cost:
                 current, self.damping = trial, max(0.1 * self.damping, self.least_damping)
@@ -73,6 +79,11 @@ class LevenbergMarquardt:
                 self.module.load_state_dict(before)
                 self.damping = min(10.0 * self.damping, self.greatest_damping)
         return Descended(start, current.cost.item(), gradient, count)
+
+    def _arrived(self, current: NormalEquations) -> bool:
+        newton = self._step(current, self.least_damping)
+        little = promised(current, newton) <= self.tolerance * current.cost
+        return bool(little or newton.abs().max() < self.least_step)
 
     def _step(self, current: NormalEquations, damping: float) -> Tensor:
         diagonal = current.matrix.diagonal()

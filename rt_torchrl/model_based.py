@@ -19,17 +19,22 @@ class ModelBasedConfig:
 
     Args:
         iterations: n_mb, gradients per episode.
+        realisations: N_z of this step; None for that of the others. One virtual episode costs about as much as twenty,
+            and where the initial states differ much, a plan made on one of them says little of the others.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         descent: how the policy's weights descend J_a.
     """
 
     iterations: int = 10
+    realisations: int | None = None
     experience: int = 100
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self):
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
+        if self.realisations is not None and self.realisations < 1:
+            raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
         if self.experience < 1:
             raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")
 

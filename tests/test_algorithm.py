@@ -104,6 +104,26 @@ def test_what_is_stored_is_what_was_applied():
     assert record.states.shape == (61, 6) and record.exogenous.shape == (60, 1)
 
 
+@pytest.mark.parametrize("inputs", ["record", "realisations"])
+def test_the_true_twin_replays_the_record_exactly_under_the_measured_input_only(inputs):
+    plant = LinearQuadratic(horizon=2.0)
+    config = AssimilationConfig(iterations=1, inputs=inputs)
+    found = twinning(plant, closure=LinearClosure(plant.closure.matrix.clone()), assimilation=config)
+    found.interact()
+    found.fit_exogenous()
+    J_p = found.assimilate()["J_p_before"].item()
+    assert (J_p < 1e-20) == (inputs == "record")
+
+
+def test_step_five_may_plan_on_a_number_of_its_own():
+    found, drawn = twinning(model_based=ModelBasedConfig(iterations=1, realisations=7)), []
+    draw = found.draw_virtual_episodes
+    found.draw_virtual_episodes = lambda count: drawn.append(count) or draw(count)
+    found.episode()
+    # Planned on, judged on, compared on.
+    assert drawn == [7, 3, 3]
+
+
 def test_record_and_transitions_are_those_of_the_episode():
     found = twinning(records=2)
     for _ in range(3):

@@ -122,3 +122,30 @@ def test_a_cost_that_the_weights_cannot_lower_ends_the_run():
 
     found = LevenbergMarquardt(valley).run(equations, 15)
     assert (calls, found.iterations, found.best) == (1, 0, 1.0)
+
+
+def test_no_step_is_longer_than_asked_for():
+    valley = Valley()
+    optimiser = LevenbergMarquardt(valley, longest_step=0.05)
+    for _ in range(20):
+        before = valley.w.detach().clone()
+        optimiser.run(valley.equations, 1)
+        assert (valley.w.detach() - before).abs().max() <= 0.05 + 1e-12
+
+
+def test_rounding_ends_the_run():
+    valley, calls = Valley(), 0
+    valley.w.data.fill_(1.0 + 1e-12)
+
+    def equations():
+        nonlocal calls
+        calls += 1
+        return valley.equations()
+
+    assert LevenbergMarquardt(valley).run(equations, 15).iterations == 0 and calls == 1
+
+
+@pytest.mark.parametrize("argument", ["damping", "longest_step"])
+def test_parameters_out_of_range_are_refused(argument):
+    with pytest.raises(ValueError, match=f"{argument}=0.0"):
+        LevenbergMarquardt(Valley(), **{argument: 0.0})

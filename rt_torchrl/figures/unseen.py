@@ -33,6 +33,9 @@ def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count
         _strip(ax, {who: array(found) for who, found in values.items()}, kinds)
         caption(ax, name)
     if categories:
+        # In grey: the marker tells the kind, the colour the controller.
+        for marker, kind in zip(MARKERS, kinds, strict=False):
+            axes[0, 0].plot([], [], marker, color="0.4", markersize=6, markeredgewidth=0.0, label=kind)
         legend_below(figure, [axes[0, 0]])
     return figure
 
@@ -42,9 +45,9 @@ def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]
     rng = np.random.default_rng(0)
     for column, (who, found) in enumerate(values.items()):
         place = column + 0.25 * rng.uniform(-1.0, 1.0, len(found))
-        for marker, (kind, chosen) in zip(MARKERS, kinds.items(), strict=False):
+        for marker, chosen in zip(MARKERS, kinds.values(), strict=False):
             style = {"color": ROLES.get(who, REFERENCE), "alpha": 0.6, "markersize": 4.5, "markeredgewidth": 0.0}
-            ax.plot(place[chosen], found[chosen], marker, label=kind or None, **style)
+            ax.plot(place[chosen], found[chosen], marker, **style)
         ax.plot([column - 0.35, column + 0.35], [found.mean()] * 2, color="0.1", linewidth=2.0)
     together = np.concatenate(list(values.values()))
     if together.min() > 0.0 and together.max() > WIDEST_LINEAR * together.min():

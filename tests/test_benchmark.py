@@ -1,0 +1,41 @@
+"""The gradient engines as the benchmark compares them; over whole episodes in the slow tests."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
+
+
+def compared(tmp_path, *options):
+    """What the benchmark writes, run in a process of its own."""
+    output = tmp_path / "result.json"
+    command = [sys.executable, str(RECIPE), "--repeats", "1", "--output", str(output), *options]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(output.read_text())
+
+
+def test_every_engine_is_timed_and_compared(tmp_path):
+    options = ["--plant", "wind_turbine", "--steps", "20", "--realisations", "2", "--no-compiled"]
+    found = compared(tmp_path, *options, "--engines", "parallel", "autograd", "odeint_adjoint")
+    assert all(seconds > 0 for seconds in found["medians"].values())
+    assert found["gaps"]["odeint_adjoint"] == 0.0
+    # Both others are exact; the continuous adjoint differs from them by the order of its step.
+    assert 0.0 < found["gaps"]["parallel"] < 1e-4
+    assert found["gaps"]["parallel"] == pytest.approx(found["gaps"]["autograd"], rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
+def test_engines_agree_over_a_whole_episode(tmp_path, plant):
+    found = compared(tmp_path, "--plant", plant, "--realisations", "2")
+    assert found["gaps"]["parallel"] < 1e-4
+
+
+def test_an_unknown_plant_is_refused():
+    done = subprocess.run([sys.executable, str(RECIPE), "--plant", "moon"], capture_output=True, text=True)
+    assert done.returncode != 0 and "choose one of" in done.stderr
