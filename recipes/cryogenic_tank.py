@@ -8,6 +8,7 @@ from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.exogenous import ExogenousConfig
 from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.model_based import ModelBasedConfig
@@ -72,7 +73,8 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
-    Run(config, config.plant(), plant_figures=figures.figures_of).train()
+    baselines = {"on-off": OnOffValve, "PI": PIValve}
+    Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines).train()
 
 
 if __name__ == "__main__":

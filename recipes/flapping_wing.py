@@ -9,6 +9,7 @@ from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.animation import save_animation
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
+from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.exogenous import ExogenousConfig
 from rt_torchrl.exploration import ExplorationConfig
@@ -67,7 +68,13 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
-    Run(config, config.plant(), plant_figures=figures.figures_of, animate=save_animation).train()
+    Run(
+        config,
+        config.plant(),
+        plant_figures=figures.figures_of,
+        baselines={"PD": TrimmedPD},
+        animate=save_animation,
+    ).train()
 
 
 if __name__ == "__main__":

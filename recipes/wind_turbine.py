@@ -60,13 +60,8 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
-    plant = config.plant()
-    Run(
-        config,
-        plant,
-        plant_figures=figures.figures_of,
-        baselines={"Jonkman": JonkmanController(plant).fly},
-    ).train()
+    baselines = {"Jonkman": JonkmanController}
+    Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines).train()
 
 
 if __name__ == "__main__":

@@ -87,10 +87,6 @@ class Judged(NamedTuple):
         return {"J_a": mean_with_confidence(self.control_costs[chosen]), "merit": merit}
 
 
-Baseline = Callable[[Tensor, Tensor], Trajectory]
-"""A classical controller: flies real episodes from initial states and exogenous inputs."""
-
-
 class Optimum(NamedTuple):
     """Best mean J_a found, the policy that has it, and the cost reached from every start."""
 

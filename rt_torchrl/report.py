@@ -7,7 +7,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.evaluation import Baseline, Judged, Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.classical import ClassicalController
+from rt_torchrl.evaluation import Judged, Optimum, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.switching import Role
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
@@ -40,10 +41,12 @@ def progress(record: dict[str, Any]) -> str:
 
 
 @torch.no_grad()
-def judge(unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, Baseline]) -> dict[str, Judged]:
+def judge(
+    unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, ClassicalController]
+) -> dict[str, Judged]:
     """Both policies, then the classical controllers, on the unseen episodes."""
     judged = {role: unseen.judge(unseen.fly(policies[role])) for role in ROLES}
-    flown = {name: fly(unseen.initial_state, unseen.exogenous) for name, fly in baselines.items()}
+    flown = {name: law.fly(unseen.initial_state, unseen.exogenous) for name, law in baselines.items()}
     return judged | {name: unseen.judge(trajectory) for name, trajectory in flown.items()}
 
 

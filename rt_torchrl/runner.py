@@ -20,10 +20,11 @@ from tqdm import tqdm
 
 from rt_torchrl import checkpoint, figures, report
 from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.classical import ClassicalController
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.dashboard import Dashboard
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.evaluation import Baseline, Judged, UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation import Judged, UnseenEpisodes, exact_optimum
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
 from rt_torchrl.policies import SaturatedMLP
@@ -132,12 +133,12 @@ class Run:
         plant: Plant,
         *,
         plant_figures: PlantFigures = lambda snapshot: {},
-        baselines: dict[str, Baseline] | None = None,
+        baselines: dict[str, type[ClassicalController]] | None = None,
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
         self.asked, self.config = config, config.effective()
-        self.plant_figures, self.baselines, self.animate = plant_figures, baselines or {}, animate
+        self.plant_figures, self.animate = plant_figures, animate
         device = require_device(config.device)
         compiled = can_compile(device) if config.compiled is None else config.compiled
         if config.threads:
@@ -159,6 +160,7 @@ class Run:
             generator=generator,
         )
         self.unseen = UnseenEpisodes(plant, self.config.unseen, compiled=compiled, device=device)
+        self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
         self.episodes: list[dict[str, Any]] = []
         if config.resume:
             self.episodes = checkpoint.load(self.folder / "checkpoint.pt", self.algorithm)

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.classical import ClassicalController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.trajectory import Trajectory
 
 CONSTANTS = Path(__file__).parent / "data" / "nrel5mw_constants.json"
 
 
-class JonkmanController:
+class JonkmanController(ClassicalController):
     r"""Torque by regions of the generator speed, pitch by a gain-scheduled PI law.
 
     .. math::
@@ -22,17 +22,20 @@ class JonkmanController:
         P_r/\omega_F & 3\end{cases}, \qquad
         \beta = \frac{K_P(\omega_F - \omega_r) + K_I\int(\omega_F - \omega_r)\,dt}{1 + \beta/\beta_K}
 
-    of the low-passed generator speed ω_F. It has memory, so it is no ``policy(observation)``: :meth:`fly` steps the
-    plant with it.
+    of the low-passed generator speed ω_F. Its memory holds ω_F and the integral; its constants are published, so that
+    it has no gains to tune.
 
     Args:
         plant: the turbine; its actuators limit the rates.
+        compiled: compile the flight.
 
     Source: Jonkman et al., NREL/TP-500-38060, section 7; the variables are those of ``DISCON.F90``.
     """
 
-    def __init__(self, plant: WindTurbine):
-        self.plant = plant
+    memory_size = 2
+
+    def __init__(self, plant: WindTurbine, *, compiled: bool = False):
+        super().__init__(plant, compiled=compiled)
         c = json.loads(CONSTANTS.read_text(encoding="utf-8"))["jonkman_controller"]
         self.c = c
         self.alpha = math.exp(-plant.dt * c["CornerFreq_rad_s"])
@@ -42,26 +45,21 @@ class JonkmanController:
         root = math.sqrt(self.slope_25 * (self.slope_25 - 4.0 * c["VS_Rgn2K"] * self.synchronous))
         self.transition = (self.slope_25 - root) / (2.0 * c["VS_Rgn2K"])
 
-    @torch.no_grad()
-    def fly(self, initial_state: Float[Tensor, "batch 6"], exogenous: Float[Tensor, "batch n 1"]) -> Trajectory:
-        """Real episodes under this controller."""
-        plant, state = self.plant, initial_state
-        speed = plant.gear_ratio * state[:, 0]
+    def first_memory(self, state: Float[Tensor, "batch 6"]) -> Float[Tensor, "batch 2"]:
+        """The speed as it is, and the integral that holds the pitch it finds."""
         pitch = torch.deg2rad(state[:, 5])
-        # Starts with the integral that holds the pitch it finds.
         integral = pitch * (1.0 + pitch / self.c["PC_KK_rad"]) / self.c["PC_KI"]
-        states, actions = [state], []
-        for k in range(exogenous.shape[1]):
-            speed = (1.0 - self.alpha) * plant.gear_ratio * state[:, 0] + self.alpha * speed
-            torque = self.torque(speed, pitch)
-            pitch, integral = self.pitch(speed, pitch, integral)
-            t = torch.tensor(k * plant.dt, dtype=torch.float64, device=state.device)
-            command = torch.stack([torque, torch.rad2deg(pitch)], -1)
-            state, applied = plant.step(t, state, command, exogenous[:, k], plant.closure)
-            pitch = torch.deg2rad(applied[:, 1])
-            states.append(state)
-            actions.append(applied)
-        return Trajectory(torch.stack(states, 1), torch.stack(actions, 1))
+        return torch.stack([self.plant.gear_ratio * state[:, 0], integral], -1)
+
+    def act(
+        self, state: Float[Tensor, "batch 6"], memory: Float[Tensor, "batch 2"]
+    ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 2"]]:
+        speed, integral = memory.unbind(-1)
+        pitch = torch.deg2rad(state[:, 5])
+        speed = (1.0 - self.alpha) * self.plant.gear_ratio * state[:, 0] + self.alpha * speed
+        torque = self.torque(speed, pitch)
+        pitch, integral = self.pitch(speed, pitch, integral)
+        return torch.stack([torque, torch.rad2deg(pitch)], -1), torch.stack([speed, integral], -1)
 
     def torque(self, speed: Float[Tensor, " batch"], pitch: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
         """Generator torque [N m] at a filtered speed [rad/s]; region 3 also while the blades are pitched [rad]."""

@@ -1,0 +1,38 @@
+"""The classical controller of the drone, to compare learned policies with."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.classical import ClassicalController
+
+
+class TrimmedPD(ClassicalController):
+    r"""A proportional and derivative law of each axis around the trim in the mean wind.
+
+    .. math::
+        A_\phi = A_0 + K_{P,z}\,(z_f - z) - K_{D,z}\,\dot z, \qquad
+        \beta_w = \beta_0 - K_{P,x}\,(x_f - x) + K_{D,x}\,\dot x
+
+    with A_0 = 76.74 deg and β_0 = −12.50 deg, the trim in 1 m/s headwind. The wind itself is not measured, as for the
+    policies.
+
+    Started from ``placed_gains`` (a point mass with two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and
+    g of thrust per radian of β_w), :func:`rt_torchrl.tuning.tune` on twenty gusts goes for steeper ones:
+    full stroke until the target is near.
+    """
+
+    gain_units = {"K_Pz": "deg/m", "K_Dz": "deg s/m", "K_Px": "deg/m", "K_Dx": "deg s/m"}
+    placed_gains = (16.0, 16.0, 23.0, 23.0)
+    default_gains = (571.0, 397.0, 61.5, 44.0)
+    trim = (76.74, -12.50)
+
+    def act(
+        self, state: Float[Tensor, "batch 4"], memory: Float[Tensor, "batch 0"]
+    ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 0"]]:
+        K_Pz, K_Dz, K_Px, K_Dx = self.log_gains.exp().unbind()
+        e_x, e_z = (self.plant.target - state[..., :2]).unbind(-1)
+        v_x, v_z = state[..., 2:].unbind(-1)
+        amplitude = self.trim[0] + K_Pz * e_z - K_Dz * v_z
+        angle = self.trim[1] - K_Px * e_x + K_Dx * v_x
+        return torch.stack([amplitude, angle], -1), memory
