@@ -1,9 +1,11 @@
 """The real system in simulation: any plant as a TorchRL environment."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -32,6 +34,12 @@ class PlantEnv(EnvBase):
         seed: of the generator that draws initial states and exogenous inputs.
         device: where it runs.
         compiled: compile the step.
+        noise: standard deviation of the sensors as a share of what they read: every reported state is s(1 + noise·w),
+            w standard normal, and the observation is computed from it. The reward stays that of the true state.
+        wear: closure of the real system in each of its episodes, counted from 0; None for the plant's own in all.
+
+    Raises:
+        ValueError: if ``batch_size`` or ``noise`` is out of its range.
     """
 
     def __init__(
@@ -42,15 +50,25 @@ class PlantEnv(EnvBase):
         seed: int = 0,
         device: torch.device | str = "cpu",
         compiled: bool = False,
+        noise: float = 0.0,
+        wear: Callable[[int], nn.Module] | None = None,
     ):
         if batch_size < 1:
             raise ValueError(f"batch_size={batch_size} must be at least 1.")
+        if not 0.0 <= noise < 1.0:
+            raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
         super().__init__(device=torch.device(device), batch_size=torch.Size([batch_size]))
         self.plant = plant.to(device)
         self._transition = compiled_if(compiled, _transition)
         self._generator = torch.Generator(device=device)
         self._generator.manual_seed(seed)
+        self._noise, self._wear, self._episodes = noise, wear, 0
         self._make_specs()
+
+    @property
+    def closure(self) -> nn.Module:
+        """The true closure, as worn as in the episode that was flown last."""
+        return self.plant.closure if self._wear is None else self._wear(max(self._episodes - 1, 0)).to(self.device)
 
     def _make_specs(self) -> None:
         plant, batch = self.plant, self.batch_size
@@ -86,10 +104,11 @@ class PlantEnv(EnvBase):
 
     def state_dict(self, *args, **kwargs) -> dict:
         """Everything the next reset depends on."""
-        return {"generator": self._generator.get_state()}
+        return {"generator": self._generator.get_state(), "episodes": self._episodes}
 
     def load_state_dict(self, state: dict, *args, **kwargs) -> None:
         self._generator.set_state(state["generator"])
+        self._episodes = state["episodes"]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         batch = self.batch_size[0]
@@ -110,9 +129,13 @@ class PlantEnv(EnvBase):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if (self._step_count == 0).any():
+            # Counted here, because a collector may reset more than once before it steps.
+            self._episodes += 1
+            self._closure = self.closure
         t, exogenous = self._time(), self._now()
         command = tensordict["action"]
-        transition, cost = self._transition(self.plant, t, self._state, command, exogenous)
+        transition, cost = self._transition(self.plant, self._closure, t, self._state, command, exogenous)
         if not cost.isfinite().all() or not transition.state.isfinite().all():
             raise DivergenceError(
                 f"plant {self.plant.name!r} diverged at t = {t.max().item():g} s: state {self._state.tolist()}, "
@@ -134,9 +157,17 @@ class PlantEnv(EnvBase):
 
     def _observed(self, entries: dict[str, Tensor]) -> TensorDict:
         exogenous = self._now()
-        observation = self.plant.observe(self._time(), self._state, exogenous)
-        entries |= {"observation": observation, "state": self._state, "exogenous": exogenous}
+        state = self._measured()
+        observation = self.plant.observe(self._time(), state, exogenous)
+        entries |= {"observation": observation, "state": state, "exogenous": exogenous}
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _measured(self) -> Float[Tensor, "batch n_s"]:
+        """The state as the sensors report it."""
+        if self._noise == 0.0:
+            return self._state
+        like = {"dtype": torch.float64, "device": self.device}
+        return self._state * (1.0 + self._noise * torch.randn(self._state.shape, generator=self._generator, **like))
 
     def _time(self) -> Float[Tensor, " batch"]:
         # An integer times a float would be single precision.
@@ -149,7 +180,7 @@ class PlantEnv(EnvBase):
 
 
 def _transition(
-    plant: Plant, t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor
+    plant: Plant, closure: nn.Module, t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor
 ) -> tuple[Transition, Tensor]:
-    transition = plant.step(t, state, command, exogenous, plant.closure)
+    transition = plant.step(t, state, command, exogenous, closure)
     return transition, plant.running_cost(t, state, transition.applied, exogenous)

@@ -194,3 +194,50 @@ def test_divergence_is_raised_with_time_state_and_command():
 def test_batch_size_is_checked():
     with pytest.raises(ValueError, match="batch_size=0"):
         PlantEnv(LinearQuadratic(), batch_size=0)
+
+
+def test_sensors_err_by_a_share_of_what_they_read():
+    plant = LinearQuadratic(horizon=30.0, noise=0.0)
+    clean, noisy = (PlantEnv(plant, batch_size=40, seed=1, noise=noise) for noise in (0.0, 0.02))
+    true, read = (env.rollout(300, break_when_any_done=False) for env in (clean, noisy))
+    # The same start; the actions of a rollout without a policy are random, so only the first step compares.
+    start, seen = true["state"][:, 0], read["state"][:, 0]
+    ratio = (seen / start - 1.0) / 0.02
+    # Of 80 standard normals: mean within 3.5/√80, deviation within 3.5/√160.
+    assert ratio.mean().abs() < 0.4 and (ratio.std() - 1.0).abs() < 0.28
+    # On this plant the observation is the state, and what is read at the end of a step is what the next one sees.
+    assert torch.equal(read["observation"], read["state"])
+    assert torch.equal(read["next", "state"][:, :-1], read["state"][:, 1:])
+
+
+def test_a_reward_is_that_of_the_true_state():
+    plant = LinearQuadratic(noise=0.0)
+    clean, noisy = (PlantEnv(plant, batch_size=3, seed=1, noise=noise) for noise in (0.0, 0.3))
+    rewards = []
+    for env in (clean, noisy):
+        rewards.append(act(env, env.reset(), torch.full((3, 1), 0.5).double())["next", "reward"])
+    assert torch.equal(*rewards)
+
+
+def test_the_real_system_wears_from_episode_to_episode():
+    plant = LinearQuadratic()
+    worn = [LinearClosure(torch.full((2, 2), -0.1 * k)) for k in range(3)]
+    env, ends = PlantEnv(plant, seed=1, wear=lambda episode: worn[episode]), []
+    for k in range(3):
+        env.reset()
+        found = env.reset()  # as a collector does; no episode was flown in between
+        done = act(env, found, torch.zeros(1, 1).double())
+        assert env.closure is worn[k]
+        t, z = torch.zeros(1).double(), found["exogenous"]
+        expected = plant.step(t, found["state"], torch.zeros(1, 1).double(), z, worn[k]).state
+        torch.testing.assert_close(done["next", "state"], expected, rtol=1e-14, atol=1e-14)
+        ends.append(env.state_dict()["episodes"])
+    assert ends == [1, 2, 3]
+    env.load_state_dict({**env.state_dict(), "episodes": 1})
+    act(env, env.reset(), torch.zeros(1, 1).double())
+    assert env.closure is worn[1]
+
+
+def test_noise_out_of_range_is_refused():
+    with pytest.raises(ValueError, match=r"noise=1.5 of the sensors"):
+        PlantEnv(LinearQuadratic(), noise=1.5)

@@ -1,0 +1,125 @@
+"""Classical controllers: their laws, their flights against the plant's own step, and the search for their gains."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from test_model_free import optimal_gain
+
+from rt_torchrl.classical import ClassicalController
+from rt_torchrl.compilation import missing_for_compilation
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.evaluation import Judged
+from rt_torchrl.trajectory import control_cost
+from rt_torchrl.tuning import tune
+
+
+class PD(ClassicalController):
+    """a = −K_1 x − K_2 v, with a memory that counts the intervals."""
+
+    gain_units = {"K_1": "N/m", "K_2": "N s/m"}
+    default_gains = (0.3, 0.3)
+    memory_size = 1
+
+    def act(self, state, memory):
+        return -(self.log_gains.exp() * state).sum(-1, keepdim=True), memory + 1.0
+
+
+def episodes(plant, count=6, size=0.3):
+    generator = torch.Generator().manual_seed(0)
+    return size * plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+
+
+def test_a_flight_is_the_plants_steps_under_the_saturated_command():
+    plant = LinearQuadratic(horizon=3.0)
+    state, exogenous = episodes(plant, size=3.0)
+    flown = PD(plant, (2.0, 1.0)).fly(state, exogenous)
+    assert flown.states.shape == (6, 31, 2) and flown.actions.shape == (6, 30, 1)
+    for k in range(plant.n_steps):
+        command = (-2.0 * state[:, :1] - 1.0 * state[:, 1:]).clamp(-2.0, 2.0)
+        t = torch.tensor(k * plant.dt, dtype=torch.float64)
+        state, applied = plant.step(t, state, command, exogenous[:, k], plant.closure)
+        torch.testing.assert_close(flown.states[:, k + 1], state, rtol=1e-13, atol=1e-13)
+        torch.testing.assert_close(flown.actions[:, k], applied, rtol=1e-13, atol=1e-13)
+    assert (flown.actions.abs() == 2.0).any()
+
+
+COMPARISON = """
+import sys
+sys.path.insert(0, "tests")
+from test_classical import PD, LinearQuadratic, episodes
+
+plant = LinearQuadratic(horizon=3.0)
+eager, compiled = (PD(plant, compiled=flag).fly(*episodes(plant)) for flag in (False, True))
+assert (eager.states - compiled.states).abs().max() < 1e-13
+assert (eager.actions - compiled.actions).abs().max() < 1e-13
+print("compared")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
+def test_a_compiled_flight_is_the_eager_one():
+    root = Path(__file__).parent.parent
+    done = subprocess.run([sys.executable, "-c", COMPARISON], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]
+
+
+def test_tuning_finds_the_riccati_gain():
+    # 15 s are some ten time constants of the closed loop: the finite horizon hardly matters.
+    plant = LinearQuadratic(noise=0.0, horizon=15.0)
+    state, exogenous = episodes(plant)
+    controller, best = PD(plant), PD(plant, tuple(optimal_gain(1.0)[0].tolist()))
+    found = tune(controller, state, exogenous, evaluations=120)
+    least = control_cost(plant, best.fly(state, exogenous), exogenous).mean().item()
+    assert found.best == pytest.approx(least, rel=1e-3) and found.best < 0.9 * found.start
+    flown = controller.fly(state, exogenous)
+    assert control_cost(plant, flown, exogenous).mean().item() == pytest.approx(found.best, rel=1e-12)
+    # The simplex ends within 1 % of each gain; the cost is flat beyond that.
+    assert controller.log_gains.tolist() == pytest.approx(best.log_gains.tolist(), abs=0.05)
+
+
+def test_the_pd_law_holds_the_drone_at_its_target_in_the_mean_wind():
+    plant = FlappingWing(horizon=0.5)
+    hover = torch.tensor([[5.0, 5.0, 0.0, 0.0]], dtype=torch.float64)
+    flown = TrimmedPD(plant, TrimmedPD.placed_gains).fly(hover, torch.ones(1, plant.n_steps, 1, dtype=torch.float64))
+    # The trim is known to 0.3 deg, which 23 deg/m make 1.3 cm; the beat itself moves the body by some millimetres.
+    assert (flown.states[..., :2] - 5.0).abs().max() < 0.02
+
+
+def test_the_valve_opens_above_its_band_and_shuts_below_it():
+    valve, is_open, found = OnOffValve(CryogenicTank(), (150e3,)), torch.zeros(1, 1).double(), []
+    for error in (-2e3, 0.5e3, 1.5e3, 0.5e3, -0.5e3, -1.5e3, 0.5e3):
+        state = torch.tensor([[27.0, 42.0, 500e3 + error]], dtype=torch.float64)
+        command, is_open = valve.act(state, is_open)
+        found.append(round(command.item()))
+    assert found == [0, 0, 150_000, 150_000, 150_000, 0, 0]
+
+
+def test_the_integral_of_the_valve_stops_where_the_valve_does():
+    plant = CryogenicTank()
+    valve, memory = PIValve(plant, (1.0, 1e-3)), torch.zeros(1, 1).double()
+    high = torch.tensor([[27.0, 42.0, 540e3]], dtype=torch.float64)
+    for _ in range(1000):
+        command, memory = valve.act(high, memory)
+    assert memory.item() == 200e3 and command.item() == pytest.approx(240e3)
+    command, memory = valve.act(high - torch.tensor([0.0, 0.0, 80e3]), memory)
+    assert memory.item() == pytest.approx(200e3 - 1e-3 * 40e3 * 30.0)
+
+
+@pytest.mark.parametrize("gains", [(1.0,), (1.0, -1.0), (1.0, float("inf"))])
+def test_gains_that_do_not_fit_are_refused(gains):
+    with pytest.raises(ValueError, match=r"must be positive and finite: K_1 \[N/m\], K_2 \[N s/m\]"):
+        PD(LinearQuadratic(), gains)
+
+
+def test_statistics_are_of_the_chosen_episodes():
+    found = Judged(torch.tensor([1.0, 2.0, 9.0]).double(), {"m": torch.tensor([3.0, 5.0, 0.0]).double()})
+    chosen = found.statistics(torch.tensor([True, True, False]))
+    assert chosen["J_a"]["mean"] == 1.5 and chosen["merit"]["m"]["median"] == 3.0
