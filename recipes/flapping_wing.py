@@ -15,7 +15,8 @@ from rt_torchrl.exogenous import ExogenousConfig
 from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.runner import Run, RunConfig, main_of
+from rt_torchrl.run_config import RunConfig
+from rt_torchrl.runner import Run, main_of
 from rt_torchrl.switching import SwitchConfig
 
 PAPER = TwinningConfig(

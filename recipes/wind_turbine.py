@@ -16,7 +16,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.runner import Run, RunConfig, main_of
+from rt_torchrl.run_config import RunConfig
+from rt_torchrl.runner import Run, main_of
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.

@@ -7,7 +7,7 @@ import torch
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 
-FORMAT = 1
+FORMAT = 2
 
 
 def state_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:

@@ -11,6 +11,7 @@ TAGS = {
     "real_cost": "cost/real episode (live policy)",
     "J_a_model_based": "cost/J_a model-based (twin)",
     "J_a_model_free": "cost/J_a model-free (twin)",
+    "J_a_unseen": "cost/J_a live policy (real system, unseen episodes)",
     "J_a_plan_before": "cost/J_a before planning (twin)",
     "J_a_plan": "cost/J_a after planning (twin)",
     "plan_accepted": "switch/plan accepted",

@@ -61,7 +61,9 @@ class PlantEnv(EnvBase):
         self.plant = plant.to(device)
         self._transition = compiled_if(compiled, _transition)
         self._generator = torch.Generator(device=device)
-        self._generator.manual_seed(seed)
+        # Of their own, so that sensors of any quality see the same disturbances.
+        self._sensors = torch.Generator(device=device)
+        self._set_seed(seed)
         self._noise, self._wear, self._episodes = noise, wear, 0
         self._make_specs()
 
@@ -101,13 +103,16 @@ class PlantEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self._generator.manual_seed(seed)
+            self._sensors.manual_seed(seed + 1)
 
     def state_dict(self, *args, **kwargs) -> dict:
         """Everything the next reset depends on."""
-        return {"generator": self._generator.get_state(), "episodes": self._episodes}
+        generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
+        return generators | {"episodes": self._episodes}
 
     def load_state_dict(self, state: dict, *args, **kwargs) -> None:
         self._generator.set_state(state["generator"])
+        self._sensors.set_state(state["sensors"])
         self._episodes = state["episodes"]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -167,7 +172,7 @@ class PlantEnv(EnvBase):
         if self._noise == 0.0:
             return self._state
         like = {"dtype": torch.float64, "device": self.device}
-        return self._state * (1.0 + self._noise * torch.randn(self._state.shape, generator=self._generator, **like))
+        return self._state * (1.0 + self._noise * torch.randn(self._state.shape, generator=self._sensors, **like))
 
     def _time(self) -> Float[Tensor, " batch"]:
         # An integer times a float would be single precision.

@@ -20,6 +20,8 @@ UNSEEN_SEED = 1_000_000
 class UnseenEpisodes:
     """Real episodes with initial states and disturbances that no training has drawn.
 
+    The true closure is the plant's own; assign :attr:`closure` for a system that has worn.
+
     Args:
         plant: the real system.
         count: number of episodes, at least 2.
@@ -41,13 +43,14 @@ class UnseenEpisodes:
             raise ValueError(f"count={count} of unseen episodes must be at least 2 for a confidence interval.")
         generator = torch.Generator(device=device).manual_seed(seed)
         self.plant, self._compiled = plant, compiled
+        self.closure = plant.closure
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """The episodes under a policy, on the real system."""
-        rollout = Rollout(self.plant, self.plant.closure, policy, compiled=self._compiled)
+        rollout = Rollout(self.plant, self.closure, policy, compiled=self._compiled)
         return rollout(self.initial_state, self.exogenous)
 
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
@@ -116,7 +119,7 @@ def exact_optimum(
     found: list[tuple[float, nn.Module]] = []
     for _ in range(starts):
         policy = make_policy(generator).to(unseen.initial_state.device)
-        rollout = Rollout(unseen.plant, unseen.plant.closure, policy, compiled=unseen._compiled)
+        rollout = Rollout(unseen.plant, unseen.closure, policy, compiled=unseen._compiled)
 
         def cost(rollout: Rollout = rollout) -> Tensor:
             flown = rollout(unseen.initial_state, unseen.exogenous)

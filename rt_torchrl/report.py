@@ -65,7 +65,7 @@ def summary(
     J_p before and after are of the same episodes, flown by the final live policy.
     """
     closure, live = algorithm.twin.closure, algorithm.switch.live
-    laws = {"found": closure, "true": unseen.plant.closure, "start": initial_closure}
+    laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = unseen.control_costs(initial_policy)
     flown = unseen.fly(algorithm.policies[live])
     J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))

@@ -8,18 +8,16 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
 from matplotlib.figure import Figure
-from torch import nn
 from tqdm import tqdm
 
 from rt_torchrl import checkpoint, figures, report
-from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.classical import ClassicalController
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.dashboard import Dashboard
@@ -27,87 +25,9 @@ from rt_torchrl.environment import PlantEnv
 from rt_torchrl.evaluation import Judged, UnseenEpisodes, exact_optimum
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
-from rt_torchrl.policies import SaturatedMLP
+from rt_torchrl.run_config import RunConfig
 from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.trajectory import Engine
 from rt_torchrl.twin import DigitalTwin
-
-QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """Options every recipe has.
-
-    Args:
-        policy: paper for the plant's own, or mlp.
-        hidden: widths of the hidden layers of an mlp policy.
-        episodes: number of real episodes n_e.
-        seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
-        engine: gradient engine of steps 4 and 5: parallel (exact, fast), odeint_adjoint (the paper's continuous
-            adjoint, slow) or autograd (exact, slow).
-        compiled: compile with torch.compile; by default where this machine has what that needs, otherwise a notice
-            says so. Without it nothing has to be compiled first, and every step is several times slower.
-        device: where everything runs, such as cpu or cuda.
-        threads: number of CPU threads; 0 leaves torch's default.
-        log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
-        resume: go on from the checkpoint in log_dir.
-        overwrite: replace what an earlier run left in log_dir.
-        quick: a whole small run: 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
-        unseen: number of unseen episodes that twin and policies are judged on at the end.
-        reference: also compute what exact gradients on the true plant reach for this policy on the unseen episodes.
-        figures_every: draw the figures into the dashboard every so many episodes, and at the end; 0 only at the end.
-        twinning: hyper-parameters of the six steps.
-    """
-
-    policy: str = "paper"
-    hidden: tuple[int, ...] = (32, 32)
-    episodes: int = 20
-    seed: int = 0
-    engine: Engine = "parallel"
-    compiled: bool | None = None
-    device: str = "cpu"
-    threads: int = 0
-    log_dir: Path | None = None
-    resume: bool = False
-    overwrite: bool = False
-    quick: bool = False
-    unseen: int = 20
-    reference: bool = False
-    figures_every: int = 5
-    twinning: TwinningConfig = field(default_factory=TwinningConfig)
-
-    def __post_init__(self):
-        for argument, least in (("episodes", 1), ("threads", 0), ("unseen", 2), ("figures_every", 0)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
-        if self.resume and self.log_dir is None:
-            raise ValueError("resume needs log_dir, the folder of the run to go on with.")
-
-    def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
-        """The policy asked for, with random initial weights; override it for policies of your own.
-
-        Raises:
-            ValueError: if there is no policy of that name.
-        """
-        if self.policy == "paper":
-            return plant.make_policy(generator)
-        if self.policy == "mlp":
-            return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
-        raise ValueError(f"policy={self.policy!r} does not exist; choose paper or mlp.")
-
-    def effective(self) -> "RunConfig":
-        """With ``quick`` carried out."""
-        if not self.quick:
-            return self
-        model_free = dataclasses.replace(
-            self.twinning.model_free, critic_iterations=QUICK_ITERATIONS, actor_iterations=QUICK_ITERATIONS
-        )
-        twinning = dataclasses.replace(self.twinning, model_free=model_free)
-        return dataclasses.replace(
-            self, quick=False, episodes=QUICK_EPISODES, unseen=QUICK_UNSEEN, figures_every=0, twinning=twinning
-        )
-
 
 PlantFigures = Callable[[Snapshot], dict[str, Figure]]
 
@@ -118,6 +38,7 @@ class Run:
     Args:
         config: see :class:`RunConfig`.
         plant: the real system in simulation, and the twin's physics.
+        believed: the twin's physics where they are not those of the real system; None where they are.
         plant_figures: figures only this plant has.
         baselines: classical controllers to judge beside the policies, by name.
         animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
@@ -132,6 +53,7 @@ class Run:
         config: RunConfig,
         plant: Plant,
         *,
+        believed: Plant | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[ClassicalController]] | None = None,
         animate: Callable[[Snapshot, Path], None] | None = None,
@@ -150,10 +72,11 @@ class Run:
         model_based = self.make_policy(generator).to(device)
         closure = plant.make_closure(generator).to(device)
         self.initial_policy, self.initial_closure = copy.deepcopy(model_based), copy.deepcopy(closure)
-        env = PlantEnv(plant, seed=config.seed, device=device, compiled=compiled)
+        system = {"noise": config.noise, "wear": config.wear(plant)}
+        env = PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
         self.algorithm = ReinforcementTwinning(
             env,
-            DigitalTwin(plant, closure, engine=config.engine, compiled=compiled),
+            DigitalTwin(believed or plant, closure, engine=config.engine, compiled=compiled),
             model_free=copy.deepcopy(model_based),
             model_based=model_based,
             config=self.config.twinning,
@@ -187,6 +110,7 @@ class Run:
         if not self.episodes:
             raise SystemExit("interrupted before the first episode was done; nothing to report.")
         self._drop_half_an_episode()
+        self.unseen.closure = self.algorithm.env.closure
         judged = report.judge(self.unseen, self.algorithm.policies, self.baselines)
         metrics = self._results(gap, judged)
         self._draw(dashboard, judged)
@@ -199,6 +123,11 @@ class Run:
         live = self.algorithm.switch.live
         record = report.episode_record(self.algorithm.episode(), episode=len(self.episodes), live=live)
         record["closure"] = report.named_weights(self.algorithm.twin.closure)
+        every = self.config.unseen_every
+        if every and (len(self.episodes) + 1) % every == 0:
+            self.unseen.closure = self.algorithm.env.closure
+            acting = self.algorithm.policies[self.algorithm.switch.live]
+            record["J_a_unseen"] = self.unseen.control_costs(acting).mean().item()
         self.episodes.append(record)
         checkpoint.save(self.folder / "checkpoint.pt", self.algorithm, self.episodes)
         dashboard.episode(record)

@@ -5,15 +5,17 @@ import json
 
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.evaluation import mean_with_confidence
 from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.memory import LongTermMemoryConfig
 from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.runner import Run, RunConfig
+from rt_torchrl.run_config import RunConfig
+from rt_torchrl.runner import Run
 from rt_torchrl.switching import SwitchConfig
 
 SMALL = TwinningConfig(
@@ -70,6 +72,56 @@ def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
         costs[name] = total.mean().item()
     # Sums in another order: rounding only.
     assert found["J_a_ratio_model_based"] == pytest.approx(costs["after"] / costs["before"], rel=1e-12)
+
+
+def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
+    run = small_run(tmp_path, episodes=4, unseen_every=2)
+    metrics = run.train()
+    assert ["J_a_unseen" in record for record in metrics["episodes"]] == [False, True, False, True]
+    live = metrics["summary"]["live"]
+    assert metrics["episodes"][3]["J_a_unseen"] == metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
+
+
+class Worn(RunConfig):
+    """The real system loses its own stiffness from the second episode on."""
+
+    def wear(self, plant):
+        worn = LinearClosure(torch.zeros(2, 2))
+        return lambda episode: plant.closure if episode < 1 else worn
+
+
+def test_the_twin_follows_a_system_that_wears(tmp_path):
+    assimilation = AssimilationConfig(method="levenberg_marquardt", inputs="record")
+    twinning = dataclasses.replace(SMALL, assimilation=assimilation)
+    options = {"compiled": False, "unseen": 3, "figures_every": 0, "twinning": twinning, "episodes": 3}
+    run = Run(Worn(log_dir=tmp_path, **options), LinearQuadratic(horizon=4.0))
+    found = run.train()
+    closures = [torch.tensor(record["closure"]["matrix"]) for record in found["episodes"]]
+    # What one record of 40 samples shows of four weights, without noise: to rounding.
+    torch.testing.assert_close(closures[0], torch.tensor(LinearQuadratic.true_closure), rtol=0, atol=1e-6)
+    assert closures[1].abs().max() < 1e-6 and closures[2].abs().max() < 1e-6
+    assert found["summary"]["closure"]["true"] == {"matrix": [[0.0, 0.0], [0.0, 0.0]]}
+
+
+def test_noise_of_the_sensors_reaches_the_record(tmp_path):
+    starts = []
+    for noise in (0.0, 0.01):
+        run = small_run(tmp_path / str(noise), episodes=1, noise=noise)
+        run.train()
+        starts.append(run.algorithm.short_term[-1].states[0])
+    ratio = starts[1] / starts[0]
+    assert (ratio != 1.0).all() and (ratio - 1.0).abs().max() < 0.05
+
+
+def test_a_twin_may_believe_in_another_plant(tmp_path):
+    class Heavier(LinearQuadratic):
+        B = ((0.0,), (0.75,))
+
+    config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures_every=0, twinning=SMALL, episodes=1)
+    run = Run(config, Heavier(horizon=2.0), believed=LinearQuadratic(horizon=2.0))
+    run.train()
+    assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
+    assert isinstance(run.unseen.plant, Heavier)
 
 
 def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
