@@ -90,6 +90,27 @@ class Judged(NamedTuple):
         return {"J_a": mean_with_confidence(self.control_costs[chosen]), "merit": merit}
 
 
+@torch.no_grad()
+def untrained_costs(
+    unseen: UnseenEpisodes,
+    make_policy: Callable[[torch.Generator], nn.Module],
+    *,
+    starts: int = 20,
+    seed: int = UNSEEN_SEED,
+) -> Float[Tensor, " {starts}"]:
+    """Mean J_a of random initial policies, the scale that a training's cost is seen on whatever start it drew itself.
+
+    Args:
+        unseen: the episodes.
+        make_policy: draws a policy of the class.
+        starts: number of policies.
+        seed: of their weights.
+    """
+    device = unseen.initial_state.device
+    generator = torch.Generator(device=device).manual_seed(seed)
+    return torch.stack([unseen.control_costs(make_policy(generator).to(device)).mean() for _ in range(starts)])
+
+
 class Optimum(NamedTuple):
     """Best mean J_a found, the policy that has it, and the cost reached from every start."""
 

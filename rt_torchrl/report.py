@@ -3,8 +3,9 @@
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.classical import ClassicalController
@@ -58,6 +59,7 @@ def summary(
     initial_policy: nn.Module,
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
+    untrained: Float[Tensor, " starts"],
     optimum: Optimum | None,
 ) -> dict[str, Any]:
     """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
@@ -74,11 +76,13 @@ def summary(
     found = {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": (after[role] / before.mean()).item() for role in ROLES},
+        **{f"J_a_over_untrained_{role}": (after[role] / untrained.mean()).item() for role in ROLES},
         "unseen": {
             "episodes": len(before),
             "J_p": mean_with_confidence(J_p),
             "J_p_before": mean_with_confidence(J_p_before),
             "J_a_before": mean_with_confidence(before),
+            "J_a_untrained": mean_with_confidence(untrained),
             **results(unseen, judged),
         },
         "live": live,
@@ -137,6 +141,8 @@ def table(metrics: dict[str, Any]) -> str:
     for name, before, after, ratio in rows:
         means = f"{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}"
         lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{ratio:>10.3g}")
+    shares = ", ".join(f"{role.replace('_', '-')} {found[f'J_a_over_untrained_{role}']:.3g}" for role in ROLES)
+    lines.append(f"  over a random start's mean J_a of {unseen['J_a_untrained']['mean']:.4g}: {shares}")
     if "reference" in found:
         best, share = found["reference"]["J_a"], found["reference"]["better_over_reference"]
         lines.append(f"  exact gradients on the true plant: J_a {best:.5g}; the better policy is at {share:.3f} of it")

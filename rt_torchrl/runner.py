@@ -22,7 +22,7 @@ from rt_torchrl.classical import ClassicalController
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.dashboard import Dashboard
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.evaluation import Judged, UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation import Judged, UnseenEpisodes, exact_optimum, untrained_costs
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
 from rt_torchrl.run_config import RunConfig
@@ -142,8 +142,9 @@ class Run:
 
     def _results(self, gap: float, judged: dict[str, Judged]) -> dict[str, Any]:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
+        untrained = untrained_costs(self.unseen, self.make_policy)
         initial = self.initial_policy, self.initial_closure
-        summary = report.summary(self.algorithm, self.unseen, judged, *initial, self.episodes, optimum)
+        summary = report.summary(self.algorithm, self.unseen, judged, *initial, self.episodes, untrained, optimum)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = {"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary}

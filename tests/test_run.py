@@ -10,7 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
 from rt_torchrl.assimilation import AssimilationConfig
-from rt_torchrl.evaluation import mean_with_confidence
+from rt_torchrl.evaluation import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.memory import LongTermMemoryConfig
 from rt_torchrl.model_free import ModelFreeConfig
@@ -56,6 +56,11 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert logged == pytest.approx([record["J_p"] for record in metrics["episodes"]], rel=1e-6)
 
 
+def drawn_policies(plant, count):
+    generator = torch.Generator().manual_seed(UNSEEN_SEED)
+    return [plant.make_policy(generator) for _ in range(count)]
+
+
 def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
     run = small_run(tmp_path)
     found = run.train()["summary"]
@@ -70,6 +75,10 @@ def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
             total = total + plant.running_cost(t, s, a, z) / plant.n_steps
             s = plant.step(t, s, a, z, plant.closure).state
         costs[name] = total.mean().item()
+    untrained = [run.unseen.control_costs(pi).mean().item() for pi in drawn_policies(plant, 20)]
+    assert found["unseen"]["J_a_untrained"]["mean"] == pytest.approx(sum(untrained) / 20, rel=1e-12)
+    over = found["J_a_over_untrained_model_based"]
+    assert over == pytest.approx(costs["after"] / (sum(untrained) / 20), rel=1e-12)
     # Sums in another order: rounding only.
     assert found["J_a_ratio_model_based"] == pytest.approx(costs["after"] / costs["before"], rel=1e-12)
 
