@@ -1,12 +1,17 @@
 """Reinforcement twinning of the cryogenic tank (paper, sections 5.3 and 6.4)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
+
+import torch
+from torch import nn
 
 from rt_torchrl.algorithm import TwinningConfig
 from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.cryogenic_tank import figures
+from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.exogenous import ExogenousConfig
@@ -51,6 +56,7 @@ class Config(RunConfig):
         fluid: pure fluid in the tank, by its name in CoolProp.
         wall: how the wall temperature is integrated: explicit, or exponential for a light wall.
         wall_heat_capacity: m_s c_s [J/K].
+        model_error: the heat exchanger fouls; its U_HX falls by 2 % from episode to episode.
     """
 
     policy: Literal["paper", "mlp"] = "paper"
@@ -60,6 +66,7 @@ class Config(RunConfig):
     fluid: str = "Hydrogen"
     wall: Literal["explicit", "exponential"] = "explicit"
     wall_heat_capacity: float = 500e3
+    model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
@@ -71,6 +78,19 @@ class Config(RunConfig):
             wall=self.wall,
             wall_heat_capacity=self.wall_heat_capacity,
         )
+
+    def wear(self, plant: CryogenicTank) -> Callable[[int], nn.Module] | None:
+        if not self.model_error:
+            return None
+        worn = ConstantCoefficients.true()
+
+        def fouled(episode: int) -> ConstantCoefficients:
+            # In place: a module of its own for each episode would be compiled anew.
+            U_s, U_HX, K_JT = ConstantCoefficients.true_coefficients
+            worn.log_coefficients.copy_(torch.tensor([U_s, 0.98**episode * U_HX, K_JT]).log())
+            return worn
+
+        return fouled
 
 
 def main(config: Config) -> None:

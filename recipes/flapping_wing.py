@@ -41,6 +41,12 @@ PAPER = TwinningConfig(
 )
 
 
+class LighterWing(FlappingWing):
+    """A drone of which the real one is a third heavier."""
+
+    mass = 0.75 * FlappingWing.mass
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
@@ -52,6 +58,7 @@ class Config(RunConfig):
         mean_wind: mean headwind [m/s].
         wind_deviation: standard deviation of the headwind [m/s].
         peak: height of the window of J_a around the target: unit, or the printed one.
+        model_error: the twin believes in a body of 2.25 g, and the real one is 33 % heavier.
     """
 
     policy: Literal["paper", "mlp"] = "paper"
@@ -60,18 +67,24 @@ class Config(RunConfig):
     mean_wind: float = 1.0
     wind_deviation: float = 1.0
     peak: Literal["unit", "printed"] = "unit"
+    model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
-    def plant(self) -> FlappingWing:
+    def plant(self, kind: type[FlappingWing] = FlappingWing) -> FlappingWing:
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)
-        return FlappingWing(dt=self.dt, horizon=self.horizon, wind=wind, peak=self.peak)
+        return kind(dt=self.dt, horizon=self.horizon, wind=wind, peak=self.peak)
+
+    def believed(self) -> FlappingWing | None:
+        """The twin's physics, if it is wrong about them."""
+        return self.plant(LighterWing) if self.model_error else None
 
 
 def main(config: Config) -> None:
     Run(
         config,
         config.plant(),
+        believed=config.believed(),
         plant_figures=figures.figures_of,
         baselines={"PD": TrimmedPD},
         animate=save_animation,

@@ -1,5 +1,6 @@
 """Reinforcement twinning of the NREL 5-MW wind turbine (paper, sections 5.1 and 6.2)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -14,6 +15,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
+from rt_torchrl.envs.wind_turbine.wear import worn_table
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
 from rt_torchrl.run_config import RunConfig
@@ -39,6 +41,7 @@ class Config(RunConfig):
         mean_wind: mean wind speed U [m/s].
         turbulence: turbulence intensity σ/U [-].
         wind_files: TurbSim files (.hh or .bts) to draw the wind from instead.
+        model_error: from the middle of the training on the rotor is worn: 10 % less lift, 50 % more drag.
     """
 
     policy: Literal["paper", "bias", "mlp"] = "paper"
@@ -47,6 +50,7 @@ class Config(RunConfig):
     mean_wind: float = 11.0
     turbulence: float = 0.16
     wind_files: tuple[Path, ...] = ()
+    model_error: bool = False
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
     def plant(self) -> WindTurbine:
@@ -59,6 +63,12 @@ class Config(RunConfig):
         if self.policy != "bias":
             return super().make_policy(plant, generator)
         return plant.make_policy(generator, bias=True)
+
+    def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
+        if not self.model_error:
+            return None
+        worn, middle = worn_table(plant.closure), self.effective().episodes // 2
+        return lambda episode: plant.closure if episode < middle else worn
 
 
 def main(config: Config) -> None:
