@@ -29,6 +29,8 @@ class ClassicalController(nn.Module, ABC):
     gain_units: dict[str, str] = {}
     """Unit of each gain, by name."""
     default_gains: tuple[float, ...] = ()
+    placed_gains: tuple[float, ...] | None = None
+    """Gains by a rule of thumb, where a search is to start from them and not from the defaults."""
     memory_size: int = 0
 
     def __init__(self, plant: Plant, gains: tuple[float, ...] | None = None, *, compiled: bool = False):

@@ -102,6 +102,7 @@ def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]
     kinds = {name: chosen for name, chosen in unseen.categories().items() if chosen.sum() > 1}
     return {
         **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
+        "costs": {name: found.control_costs.tolist() for name, found in judged.items()},
         "merit": {role: overall[role]["merit"] for role in ROLES},
         "baselines": {name: found for name, found in overall.items() if name not in ROLES},
         "categories": {

@@ -1,0 +1,180 @@
+"""What reinforcement twinning is worth: every arm on every plant, classical controllers, and the best possible."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+from rt_torchrl.classical import ClassicalController
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.figures import study as charts
+from rt_torchrl.run_config import QUICK_UNSEEN
+from rt_torchrl.runner import main_of
+from rt_torchrl.study import page, report
+from rt_torchrl.study.findings import Entry, Results, acting_cost, arm_entry, weight_errors, yardstick_entry
+from rt_torchrl.study.training import VARIANTS, Training
+from rt_torchrl.study.yardsticks import classical, oracle
+
+ARMS = ("twinning", "model_free", "model_based")
+CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
+    "wind_turbine": {"Jonkman": JonkmanController},
+    "flapping_wing": {"PD": TrimmedPD},
+    "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Train every arm on every plant, tune the classical controllers, find the oracle, and write a report.
+
+    What is done already in the folder is kept: the same command goes on where it was interrupted.
+
+    Args:
+        plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
+        seeds: trainings of every arm.
+        variant_seeds: trainings of twinning under each kind of sensor noise and model error; 0 leaves them out.
+        jobs: trainings side by side, one thread each; 0 takes one for every core.
+        backend: of joblib; ray spreads over a Ray cluster and needs the extra ``ray``.
+        unseen: number of unseen episodes that everything is judged on.
+        folder: of the report and of all runs.
+        quick: the same report from one seed of short trainings, marked as such.
+    """
+
+    plants: tuple[str, ...] = ("all",)
+    seeds: int = 5
+    variant_seeds: int = 2
+    jobs: int = 0
+    backend: Literal["loky", "threading", "ray"] = "loky"
+    unseen: int = 100
+    folder: Path = Path("runs/study")
+    quick: bool = False
+
+    def __post_init__(self):
+        unknown = [name for name in self.plants if name not in (*CONTROLLERS, "all")]
+        if unknown or not self.plants:
+            raise ValueError(f"plants={self.plants} must be all, or some of {', '.join(CONTROLLERS)}.")
+        for argument, least in (("seeds", 1), ("variant_seeds", 0), ("jobs", 0), ("unseen", 2)):
+            if getattr(self, argument) < least:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
+
+    def chosen(self) -> list[str]:
+        """The plants, by folder."""
+        return list(CONTROLLERS) if "all" in self.plants else list(self.plants)
+
+    def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
+        """Of a plant: those of every variant and arm, a list over the seeds."""
+        seeds, others = (1, min(self.variant_seeds, 1)) if self.quick else (self.seeds, self.variant_seeds)
+        options = ("--quick",) if self.quick else ("--unseen", str(self.unseen))
+        recipe, base = Path(__file__).with_name(f"{plant}.py"), self.folder / "runs" / plant
+
+        def every(arm: str, variant: str, count: int) -> list[Training]:
+            place = base / variant.replace(" ", "-").replace("%", "percent") / arm
+            common = {"recipe": recipe, "arm": arm, "variant": variant, "options": (*options, "--unseen-every", "1")}
+            return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
+
+        found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
+        harder = [variant for variant in VARIANTS if variant != "nominal"] if others else []
+        return found | {(variant, "twinning"): every("twinning", variant, others) for variant in harder}
+
+    def yardsticks(self, plant: str) -> dict[str, Callable[[], dict[str, Any]]]:
+        """The oracle and the classical controllers of a plant; each is computed once and kept."""
+        place = self.folder / "yardsticks" / plant
+        unseen = QUICK_UNSEEN if self.quick else self.unseen
+        starts, iterations, evaluations, episodes = (1, 10, 5, 3) if self.quick else (3, 60, 80, 20)
+        found = {"oracle": partial(oracle, plant, place / "oracle.json", unseen=unseen)}
+        found["oracle"].keywords.update(starts=starts, iterations=iterations)
+        for name, kind in CONTROLLERS[plant].items():
+            measured = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
+            found[name] = partial(classical, plant, kind, place / f"{name}.json", **measured)
+        return found
+
+
+def compute(config: Config) -> None:
+    """Everything that is not done yet, side by side, with one progress bar."""
+    tasks = [task for plant in config.chosen() for task in config.yardsticks(plant).values()]
+    for plant in reversed(config.chosen()):  # the longest first
+        tasks += [training.run for group in config.trainings(plant).values() for training in group]
+    if config.backend == "ray":
+        try:
+            from ray.util.joblib import register_ray
+        except ImportError as error:
+            raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
+        register_ray()
+    jobs = config.jobs or os.cpu_count() or 1
+    ordered = "list" if config.backend == "ray" else "generator_unordered"
+    running = Parallel(n_jobs=jobs, backend=config.backend, return_as=ordered)(delayed(task)() for task in tasks)
+    for _ in tqdm(running, total=len(tasks), unit="task", desc="study"):
+        pass
+
+
+def entries_of(config: Config, plant: str) -> list[Entry]:
+    """Arms, then classical controllers, then the oracle."""
+    trainings = config.trainings(plant)
+    found = [arm_entry(arm, trainings["nominal", arm]) for arm in ARMS]
+    yardsticks = [yardstick_entry(name, task()) for name, task in config.yardsticks(plant).items()]
+    return found + yardsticks[1:] + yardsticks[:1]
+
+
+def gather(config: Config) -> Results:
+    """Everything the report is written from."""
+    results = Results({}, {}, {}, {})
+    for plant in config.chosen():
+        groups = {v: group for (v, arm), group in config.trainings(plant).items() if arm == "twinning"}
+        found = {variant: [training.metrics()["summary"] for training in group] for variant, group in groups.items()}
+        results.entries[plant], results.summaries[plant] = entries_of(config, plant), found["nominal"]
+        results.costs[plant] = {v: [acting_cost(summary) for summary in group] for v, group in found.items()}
+        results.errors[plant] = {v: weight_errors(group) for v, group in found.items()}
+    return results
+
+
+def draw(config: Config, results: Results) -> list[str]:
+    """Figures of the study and of the first twinning run of each plant, as Markdown with captions."""
+    folder = config.folder / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
+    if config.variant_seeds:
+        drawn["variants"] = charts.variants(results.costs)
+    found = []
+    for name, figure in drawn.items():
+        figure.savefig(folder / f"{name}.png", dpi=110)
+        found.append(page.figure(folder / f"{name}.png", config.folder, report.CAPTIONS[name]))
+    for plant in config.chosen():
+        first = config.trainings(plant)["nominal", "twinning"][0].folder / "figures"
+        for name, text in report.RUN_CAPTIONS.items():
+            copy = folder / f"{plant}_{name}.png"
+            shutil.copy(first / f"{name}.png", copy)
+            found.append(page.figure(copy, config.folder, f"{charts.shown(plant).capitalize()}, seed 0. {text}"))
+    return found
+
+
+def write(config: Config) -> Path:
+    """The report: Markdown, HTML, figures and ``study.json``; returns the page."""
+    results = gather(config)
+    sections = report.sections(results, figures=draw(config, results), quick=config.quick, command=command(config))
+    (config.folder / "study.json").write_text(json.dumps(report.numbers(results), indent=2) + "\n")
+    return page.write(config.folder, "What reinforcement twinning is worth", sections)[1]
+
+
+def command(config: Config) -> str:
+    """The command that makes this report."""
+    plants = " ".join(config.plants)
+    size = "--quick" if config.quick else f"--seeds {config.seeds} --variant-seeds {config.variant_seeds}"
+    return f"uv run recipes/study.py --plants {plants} {size} --unseen {config.unseen}"
+
+
+def main(config: Config) -> None:
+    compute(config)
+    print(f"report in {write(config)}")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,89 @@
+"""Figures of the study: how arms learn, and how they do on the unseen episodes."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, caption, legend_below, panels
+from rt_torchrl.study.findings import Entry
+
+ARMS = {"twinning": REAL, **ROLES}
+YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
+WIDEST_LINEAR = 5.0
+"""Ratio of the greatest to the least cost above which an axis is logarithmic."""
+
+
+def learning(entries: dict[str, list[Entry]]) -> Figure:
+    """J_a of the live policy on the unseen episodes over the real episodes: mean and range of the seeds, by plant.
+
+    Dashed is the oracle, thin the classical controllers.
+
+    Args:
+        entries: of each plant.
+    """
+    title = "Cost on unseen episodes while training; band: range of the seeds"
+    figure, axes = panels(1, len(entries), title=title, size=(4.6 * len(entries), 4.0))
+    for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
+        for entry in found:
+            if entry.curves and entry.curves[0]:
+                length = min(map(len, entry.curves))
+                curves = np.array([curve[:length] for curve in entry.curves])
+                episode, colour = np.arange(1, length + 1), ARMS[entry.name]
+                ax.plot(episode, curves.mean(0), color=colour, linewidth=1.8, label=shown(entry.name))
+                ax.fill_between(episode, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0.0)
+            elif entry.name == "oracle":
+                ax.axhline(entry.mean, label="oracle", **REFERENCE_LINE)
+            else:
+                ax.axhline(entry.mean, label="classical", linestyle=":", **YARDSTICK_LINE)
+        ax.set_yscale("log")
+        ax.set_xlabel("real episodes")
+        caption(ax, f"{shown(plant)}: $J_a$")
+    legend_below(figure, list(axes.flat))
+    return figure
+
+
+def robustness(entries: dict[str, list[Entry]]) -> Figure:
+    """Distribution of J_a over the unseen episodes (all seeds together), a violin for every arm and yardstick."""
+    title = "Cost over the unseen episodes; bar: mean"
+    figure, axes = panels(len(entries), title=title, size=(9.0, 2.9 * len(entries)))
+    for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
+        costs = [entry.costs.ravel() for entry in found]
+        violins = ax.violinplot(costs, showmeans=False, showextrema=True, widths=0.8)
+        for body, entry in zip(violins["bodies"], found, strict=True):
+            body.set_facecolor(ARMS.get(entry.name, REFERENCE))
+        _bars(ax, [values.mean() for values in costs])
+        together = np.concatenate(costs)
+        if together.min() > 0 and together.max() > WIDEST_LINEAR * together.min():
+            ax.set_yscale("log")
+        ax.set_xticks(range(1, len(found) + 1), [shown(entry.name) for entry in found])
+        caption(ax, f"{shown(plant)}: $J_a$")
+    return figure
+
+
+def variants(costs: dict[str, dict[str, list[float]]]) -> Figure:
+    """Mean J_a of twinning under sensor noise and model error over its nominal one, a point for every seed, by plant.
+
+    Args:
+        costs: of each plant and variant, a value for every seed; ``nominal`` is the reference.
+    """
+    title = "Twinning under noise and model error: $J_a$ over the nominal mean"
+    figure, axes = panels(1, len(costs), title=title, size=(4.6 * len(costs), 3.8), sharey=True)
+    for ax, (plant, found) in zip(axes.flat, costs.items(), strict=True):
+        nominal = float(np.mean(found["nominal"]))
+        for column, values in enumerate(found.values()):
+            ax.plot([column] * len(values), np.array(values) / nominal, "o", color=REAL, alpha=0.7)
+        ax.axhline(1.0, **REFERENCE_LINE)
+        ax.set_xticks(range(len(found)), list(found), rotation=30, ha="right")
+        ax.set_yscale("log")
+        caption(ax, shown(plant))
+    return figure
+
+
+def _bars(ax: Axes, means: list[float]) -> None:
+    for column, mean in enumerate(means, 1):
+        ax.plot([column - 0.3, column + 0.3], [mean, mean], color="0.1", linewidth=2.0)
+
+
+def shown(name: str) -> str:
+    """A name as it is read."""
+    return name.replace("_", " ")

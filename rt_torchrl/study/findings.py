@@ -1,0 +1,129 @@
+"""The study in numbers: costs of every arm and yardstick on the same unseen episodes, with honest intervals."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rt_torchrl.algorithm import Arm
+from rt_torchrl.study.training import Training
+
+RESAMPLES = 2000
+NEAR = 1.1
+"""Over the oracle's cost: what counts as having come near it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One row of a plant's table.
+
+    Args:
+        name: arm or yardstick.
+        costs: J_a of each seed (a single row for a yardstick) and unseen episode.
+        merit: the plant's own quantities, mean over seeds.
+        J_p_ratio: cost of the twin after over before, of each seed.
+        weight_error: greatest relative error of a closure's weight, of each seed.
+        curves: mean J_a of the live policy on the unseen episodes after each real episode, a list for each seed.
+    """
+
+    name: str
+    costs: Float[np.ndarray, "seeds episodes"]
+    merit: dict[str, float]
+    J_p_ratio: list[float] = field(default_factory=list)
+    weight_error: list[float] = field(default_factory=list)
+    curves: list[list[float]] = field(default_factory=list)
+
+    @property
+    def mean(self) -> float:
+        return float(self.costs.mean())
+
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the mean, by resampling seeds and episodes."""
+        return spread(self.costs)
+
+    def episodes_to(self, cost: float) -> list[int | None]:
+        """Real episodes after which the live policy first comes within ``NEAR`` of a cost, of each seed."""
+        reached = [[k + 1 for k, value in enumerate(curve) if value <= NEAR * cost] for curve in self.curves]
+        return [found[0] if found else None for found in reached]
+
+
+def spread(costs: Float[np.ndarray, "seeds episodes"]) -> tuple[float, float]:
+    """95 % percentile-bootstrap interval of the mean over seeds and episodes, both resampled."""
+    rng = np.random.default_rng(0)
+    seeds, episodes = costs.shape
+    rows = rng.integers(seeds, size=(RESAMPLES, seeds))
+    columns = rng.integers(episodes, size=(RESAMPLES, episodes))
+    means = [costs[np.ix_(r, c)].mean() for r, c in zip(rows, columns, strict=True)]
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def difference(first: Entry, second: Entry) -> tuple[float, float]:
+    """95 % interval of the mean of ``first`` minus that of ``second``, paired by episode, and by seed where both have.
+
+    Raises:
+        ValueError: if they were not judged on the same number of episodes.
+    """
+    if first.costs.shape[1] != second.costs.shape[1]:
+        raise ValueError(
+            f"{first.name} was judged on {first.costs.shape[1]} unseen episodes, {second.name} on "
+            f"{second.costs.shape[1]}; compare results of the same study."
+        )
+    if len(first.costs) != len(second.costs):
+        return spread(first.costs.mean(0, keepdims=True) - second.costs.mean(0, keepdims=True))
+    return spread(first.costs - second.costs)
+
+
+def arm_entry(arm: Arm, trainings: list[Training]) -> Entry:
+    """An arm from its trainings; it is judged by the policy that acts at the end."""
+    found = [training.metrics() for training in trainings]
+    summaries = [metrics["summary"] for metrics in found]
+    acting = [summary["live"] for summary in summaries]
+    merits = [summary["unseen"]["merit"][live] for summary, live in zip(summaries, acting, strict=True)]
+    trained = arm != "model_free"
+    return Entry(
+        name=arm,
+        costs=np.array([s["unseen"]["costs"][live] for s, live in zip(summaries, acting, strict=True)]),
+        merit={name: float(np.mean([merit[name]["mean"] for merit in merits])) for name in merits[0]},
+        J_p_ratio=[summary["J_p_ratio"] for summary in summaries] if trained else [],
+        weight_error=weight_errors(summaries) if trained else [],
+        curves=[[e["J_a_unseen"] for e in metrics["episodes"] if "J_a_unseen" in e] for metrics in found],
+    )
+
+
+def yardstick_entry(name: str, found: dict[str, Any]) -> Entry:
+    """An oracle or a classical controller."""
+    merit = {quantity: values["mean"] for quantity, values in found["merit"].items()}
+    return Entry(name=name, costs=np.array([found["costs"]]), merit=merit)
+
+
+def acting_cost(summary: dict[str, Any]) -> float:
+    """Mean J_a, on the unseen episodes, of the policy that acts at the end of a training."""
+    return summary["unseen"][f"J_a_{summary['live']}"]["mean"]
+
+
+def weight_errors(summaries: list[dict[str, Any]]) -> list[float]:
+    """Greatest relative error of a closure's weight, of each training whose real closure is of the same kind."""
+    return [error for summary in summaries if (error := weight_error(summary["closure"])) is not None]
+
+
+def weight_error(closure: dict[str, Any]) -> float | None:
+    """Greatest relative error of a weight; None where the real system's closure is of another kind."""
+    found, true = closure["found"], closure["true"] or {}
+    if not found or set(found) != set(true) or not all(isinstance(value, float) for value in found.values()):
+        return None
+    return max(abs(found[name] / true[name] - 1.0) for name in true)
+
+
+class Results(NamedTuple):
+    """Everything the report is written from, by plant.
+
+    ``entries`` of the tables, ``summaries`` of the nominal twinning runs, and by variant ``costs`` of the acting policy
+    and ``errors`` of the closure's weights, a value for each twinning run.
+    """
+
+    entries: dict[str, list[Entry]]
+    summaries: dict[str, list[dict[str, Any]]]
+    costs: dict[str, dict[str, list[float]]]
+    errors: dict[str, dict[str, list[float]]]

@@ -1,0 +1,158 @@
+"""What the study found, in sentences and tables."""
+
+from typing import Any
+
+import numpy as np
+
+from rt_torchrl.figures.study import shown
+from rt_torchrl.study.findings import Entry, Results, difference
+from rt_torchrl.study.page import table
+
+CLOSE = 1.05
+"""Twinning's mean over the oracle's that counts as having reached it."""
+PAPER = {
+    "wind_turbine": ("(2.1 ± 0.8)e-1", "(0.8 ± 0.5)e-1", "(1.3 ± 1.2)e-1"),
+    "flapping_wing": ("(3.2 ± 4.9)e-2", "(4.18 ± 0.01)e-1", "(2.01 ± 0.45)e-1"),
+    "cryogenic_tank": ("(3.15 ± 0.9)e-4", "(4.47 ± 2.68)e-1", "(4.80 ± 3.15)e-1"),
+}
+"""The paper's table of learning performance: ratios of J_p, of J_a model-based and of J_a model-free."""
+PAPER_TEXT = "Cost after training over the mean cost before, over the seeds of twinning; the paper has five."
+VARIANT_TEXT = (
+    "Sensors that err by a share of what they read, and what the twin does not know: a rotor that is worn from the "
+    "middle of the training on, a body a third heavier than the twin believes, a heat exchanger that fouls."
+)
+CAPTIONS = {
+    "learning": "Mean cost of the live policy on unseen episodes after each real episode, with the range of the seeds.",
+    "robustness": "Distribution of the cost over the unseen episodes, all seeds together.",
+    "variants": "Twinning under sensor noise and model error, over its nominal cost; a point for each seed.",
+}
+RUN_CAPTIONS = {
+    "learning_curves": "Costs, the twin's error and who was live; vertical lines are swaps and clones.",
+    "states": "The last real episode and the twin's replay of it.",
+    "actions": "Actions of the last real episode.",
+    "policy_contours": "Both policies after training.",
+    "unseen": "Every unseen episode under both policies and the classical controllers.",
+}
+
+
+def merit_table(entries: list[Entry]) -> str:
+    """Every arm and yardstick of a plant with J_a, its interval, the regret and the plant's own quantities."""
+    oracle = next(entry for entry in entries if entry.name == "oracle")
+    header = [
+        "",
+        "J_a",
+        "95 % interval",
+        "over oracle",
+        *oracle.merit,
+        "J_p ratio",
+        "weight error",
+        "episodes to 110 %",
+    ]
+    rows = []
+    for entry in entries:
+        low, high = entry.interval()
+        cells = [shown(entry.name), f"{entry.mean:.4g}", f"{low:.4g} … {high:.4g}", f"{entry.mean / oracle.mean:.3f}"]
+        cells += [f"{value:.4g}" for value in entry.merit.values()]
+        cells += [f"{np.mean(entry.J_p_ratio):.1e}" if entry.J_p_ratio else "–"]
+        cells += [f"{100 * max(entry.weight_error):.2g} %" if entry.weight_error else "–"]
+        reached = entry.episodes_to(oracle.mean)
+        cells += [", ".join("never" if k is None else str(k) for k in reached) if reached else "–"]
+        rows.append(cells)
+    return table(header, rows)
+
+
+def verdicts(entries: list[Entry]) -> str:
+    """The study's targets, each with what was found."""
+    named = {entry.name: entry for entry in entries}
+    twinning, oracle = named["twinning"], named["oracle"]
+    share = twinning.mean / oracle.mean
+    lines = [f"- Within 5 % of the oracle: **{'yes' if share <= CLOSE else 'no'}** ({share:.3f})."]
+    for half in ("model_based", "model_free"):
+        if half in named:
+            low, high = difference(twinning, named[half])
+            word = "worse" if low > 0 else "better" if high < 0 else "neither better nor worse"
+            lines.append(f"- Against {shown(half)} alone: **{word}** (difference {low:.3g} … {high:.3g}).")
+    for entry in entries:
+        if entry.name not in ("oracle", "twinning", "model_based", "model_free"):
+            low, high = difference(twinning, entry)
+            word = "better" if high < 0 else "worse" if low > 0 else "neither better nor worse"
+            lines.append(
+                f"- Against the classical {shown(entry.name)}: **{word}** (difference {low:.3g} … {high:.3g})."
+            )
+    return "\n".join(lines)
+
+
+def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:
+    """The paper's table of learning performance beside ours: cost after over mean cost before, over the seeds.
+
+    Args:
+        summaries: ``summary`` of ``metrics.json`` of every twinning run, by plant.
+    """
+    header = ["", "J_p, paper", "here", "J_a model-based, paper", "here", "J_a model-free, paper", "here"]
+    rows = []
+    for plant, found in summaries.items():
+        unseen = [summary["unseen"] for summary in found]
+        pairs = (("J_p_before", "J_p"), ("J_a_before", "J_a_model_based"), ("J_a_before", "J_a_model_free"))
+        cells = [shown(plant)]
+        for printed, (before, after) in zip(PAPER.get(plant, ("–",) * 3), pairs, strict=True):
+            start = np.mean([part[before]["mean"] for part in unseen])
+            ratios = np.array([part[after]["mean"] for part in unseen]) / start
+            deviation = ratios.std(ddof=1) if len(ratios) > 1 else float("nan")
+            cells += [printed, f"{ratios.mean():.2g} ± {deviation:.1g}"]
+        rows.append(cells)
+    return table(header, rows)
+
+
+def variant_table(costs: dict[str, dict[str, list[float]]], errors: dict[str, dict[str, list[float]]]) -> str:
+    """Twinning's mean J_a and the twin's greatest weight error under noise and model error."""
+    header = ["", "", "J_a, mean over seeds", "over nominal", "weight error"]
+    rows = []
+    for plant, found in costs.items():
+        nominal = np.mean(found["nominal"])
+        for variant, values in found.items():
+            error = errors[plant][variant]
+            cells = [shown(plant), variant, f"{np.mean(values):.4g}", f"{np.mean(values) / nominal:.3f}"]
+            rows.append([*cells, f"{100 * max(error):.2g} %" if error else "–"])
+    return table(header, rows)
+
+
+def sections(results: Results, *, figures: list[str], quick: bool, command: str) -> list[str]:
+    """The report's Markdown, section by section.
+
+    Args:
+        results: what was found.
+        figures: Markdown of every figure with its caption.
+        quick: mark the report as made from short trainings.
+        command: that makes the report.
+    """
+    found = [f"Made by `{command}`. Every cost is a mean over unseen episodes on the real plant, the same for all."]
+    if quick:
+        found.append("**Made with `--quick`, from short trainings: the report's form, but no result.**")
+    for plant, entries in results.entries.items():
+        found += [f"## {shown(plant).capitalize()}", merit_table(entries), verdicts(entries)]
+    found += ["## The paper's table of learning performance", PAPER_TEXT, paper_table(results.summaries)]
+    if any(len(costs) > 1 for costs in results.costs.values()):
+        found += ["## Sensor noise and model error", VARIANT_TEXT, variant_table(results.costs, results.errors)]
+    return [*found, "## Figures", *figures]
+
+
+def numbers(results: Results) -> dict[str, Any]:
+    """What ``study.json`` holds."""
+    return {
+        plant: {
+            "entries": {
+                entry.name: {
+                    "J_a": entry.mean,
+                    "confidence_interval": entry.interval(),
+                    "J_a_of_each_seed": entry.costs.mean(1).tolist(),
+                    "merit": entry.merit,
+                    "J_p_ratio": entry.J_p_ratio,
+                    "weight_error": entry.weight_error,
+                    "J_a_unseen": entry.curves,
+                }
+                for entry in entries
+            },
+            "variants": {"J_a": results.costs[plant], "weight_error": results.errors[plant]},
+        }
+        for plant, entries in results.entries.items()
+    }

@@ -1,0 +1,84 @@
+"""What trainings are measured against: the best that a class of policies can do, and tuned classical controllers."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rt_torchrl.catalogue import plants
+from rt_torchrl.classical import ClassicalController
+from rt_torchrl.compilation import missing_for_compilation
+from rt_torchrl.evaluation import UnseenEpisodes, exact_optimum
+from rt_torchrl.tuning import tune
+
+TRAINING_SEED = 0
+"""Seed of the disturbances that classical controllers are tuned on; the unseen episodes have another."""
+
+
+def kept(path: Path, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a file holds, or else what is computed now and written there."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(compute(), indent=2) + "\n")
+    return json.loads(path.read_text())
+
+
+def oracle(plant: str, path: Path, *, unseen: int, starts: int, iterations: int) -> dict[str, Any]:
+    """The plant's own policy, optimised with exact gradients on the true plant and on the unseen episodes themselves.
+
+    Args:
+        plant: folder of the plant under envs.
+        path: file to keep the result in.
+        unseen: number of unseen episodes.
+        starts: number of random initial weights.
+        iterations: gradients from each.
+
+    Returns:
+        ``J_a_of_each_start``, per-episode ``costs`` of the best and the statistics of :class:`Judged`.
+    """
+
+    def compute() -> dict[str, Any]:
+        torch.set_num_threads(1)
+        system = plants()[plant]()
+        episodes = UnseenEpisodes(system, unseen, compiled=missing_for_compilation() is None)
+        best = exact_optimum(episodes, system.make_policy, starts=starts, iterations=iterations)
+        found = episodes.judge(episodes.fly(best.policy))
+        costs = {"costs": found.control_costs.tolist(), "J_a_of_each_start": best.costs}
+        return costs | found.statistics()
+
+    return kept(path, compute)
+
+
+def classical(
+    plant: str, kind: type[ClassicalController], path: Path, *, unseen: int, episodes: int, evaluations: int
+) -> dict[str, Any]:
+    """A classical controller, tuned by a simplex search on training episodes and judged on the unseen ones.
+
+    Args:
+        plant: folder of the plant under envs.
+        kind: of the controller; one without gains is judged as it is.
+        path: file to keep the result in.
+        unseen: number of unseen episodes.
+        episodes: number of training episodes.
+        evaluations: flights of all of them that the search may take.
+
+    Returns:
+        ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`.
+    """
+
+    def compute() -> dict[str, Any]:
+        torch.set_num_threads(1)
+        system, compiled = plants()[plant](), missing_for_compilation() is None
+        start = {"gains": kind.placed_gains} if kind.placed_gains else {}
+        controller = kind(system, **start, compiled=compiled)
+        generator = torch.Generator().manual_seed(TRAINING_SEED)
+        if kind.gain_units:
+            state = system.draw_initial_state(episodes, generator)
+            tune(controller, state, system.draw_exogenous(episodes, generator), evaluations=evaluations)
+        judged = UnseenEpisodes(system, unseen, compiled=compiled)
+        found = judged.judge(controller.fly(judged.initial_state, judged.exogenous))
+        return {"gains": controller.named_gains(), "costs": found.control_costs.tolist()} | found.statistics()
+
+    return kept(path, compute)

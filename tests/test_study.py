@@ -1,0 +1,194 @@
+"""The study's numbers and report, from results that are written by hand, and the command of a training."""
+
+import base64
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+
+from rt_torchrl.study import page, report
+from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
+from rt_torchrl.study.training import VARIANTS, Training
+from rt_torchrl.study.yardsticks import kept
+
+EPISODES = 30
+RECIPES = Path(__file__).parent.parent / "recipes"
+
+
+def recipe(name):
+    """A recipe as a module; tyro reads its source for the help."""
+    spec = importlib.util.spec_from_file_location(f"recipe_{name}", RECIPES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def training(tmp_path, seed=0, **options):
+    arguments = {"recipe": tmp_path / "some_plant.py", "arm": "twinning", "variant": "nominal", "seed": seed}
+    return Training(**arguments | {"folder": tmp_path / f"seed-{seed}"} | options)
+
+
+def summary(costs, live="model_based"):
+    mean = {"mean": float(np.mean(costs))}
+    return {
+        "live": live,
+        "J_p_ratio": 1e-3,
+        "closure": {"found": {"a": 1.1, "b": 2.0}, "true": {"a": 1.0, "b": 2.0}},
+        "unseen": {
+            "costs": {"model_based": costs, "model_free": [2.0 * c for c in costs]},
+            "merit": {role: {"m [m]": mean} for role in ("model_based", "model_free")},
+            "J_a_before": {"mean": 10.0},
+            "J_a_model_based": mean,
+            "J_a_model_free": {"mean": 2.0 * mean["mean"]},
+            "J_p_before": {"mean": 1.0},
+            "J_p": {"mean": 1e-3},
+        },
+    }
+
+
+def finished(tmp_path, seed, shift, **options):
+    """A training whose results are there: costs about 1 + shift."""
+    costs = (1.0 + shift + 0.1 * np.random.default_rng(7).standard_normal(EPISODES)).tolist()
+    found = training(tmp_path, seed, **options)
+    found.folder.mkdir()
+    episodes = [{"J_a_unseen": 5.0}, {"J_a_unseen": 1.05}, {"J_a_unseen": 1.0}]
+    (found.folder / "metrics.json").write_text(json.dumps({"summary": summary(costs), "episodes": episodes}))
+    return found
+
+
+def test_the_command_of_a_training_can_be_repeated_by_hand(tmp_path):
+    found = training(tmp_path, 3, variant="noise 1 %", options=("--quick",))
+    command = " ".join(found.command())
+    assert "some_plant.py --seed 3 --twinning.arm twinning" in command and "--noise 0.01 --quick" in command
+    assert "--overwrite" in command and "--resume" not in command
+    found.folder.mkdir()
+    (found.folder / "checkpoint.pt").touch()
+    assert "--resume" in found.command() and "--overwrite" not in found.command()
+    with pytest.raises(ValueError, match="variant='rain' does not exist; choose one of nominal"):
+        training(tmp_path, variant="rain")
+
+
+def test_a_failed_training_says_why_and_a_finished_one_is_kept(tmp_path):
+    recipe = tmp_path / "fails.py"
+    recipe.write_text("print('working'); raise SystemExit('error: no rotor')")
+    failing = training(tmp_path, recipe=recipe)
+    with pytest.raises(RuntimeError, match="exit status 1; see .*training.log: error: no rotor"):
+        failing.run()
+    (failing.folder / "metrics.json").write_text("{}")
+    failing.run()
+
+
+def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
+    entry = arm_entry("twinning", [finished(tmp_path, seed, 0.1 * seed) for seed in range(3)])
+    assert entry.costs.shape == (3, EPISODES)
+    assert entry.mean == pytest.approx(entry.costs.mean(1).mean())
+    assert entry.weight_error == pytest.approx([0.1] * 3) and entry.J_p_ratio == [1e-3] * 3
+    assert entry.episodes_to(1.0) == [2, 2, 2] and entry.episodes_to(0.5) == [None] * 3
+    low, high = entry.interval()
+    assert low < entry.mean < high
+
+
+def test_intervals_cover_the_mean_as_often_as_they_say():
+    rng, hits = np.random.default_rng(0), 0
+    for _ in range(40):
+        low, high = spread(rng.standard_normal((1, 60)))
+        hits += low < 0.0 < high
+    # 95 % of 40 is 38; fewer than 33 has a probability of 1e-3.
+    assert hits >= 33
+
+
+def test_differences_are_paired_by_episode():
+    rng = np.random.default_rng(0)
+    hard = 10.0 * rng.random((1, 50))
+    first, second = (Entry(name=name, costs=hard + shift, merit={}) for name, shift in (("a", 0.1), ("b", 0.0)))
+    # Episodes differ by ten, the controllers by a tenth in each.
+    assert difference(first, second) == pytest.approx((0.1, 0.1))
+    with pytest.raises(ValueError, match="a was judged on 50 unseen episodes, c on 3"):
+        difference(first, Entry(name="c", costs=np.ones((1, 3)), merit={}))
+
+
+def test_a_closure_of_another_kind_has_no_weight_error():
+    assert weight_error({"found": {"a": 1.0}, "true": {"c1": 2.0}}) is None
+    assert weight_error({"found": {"a": 1.0}, "true": None}) is None
+
+
+def test_what_is_kept_is_not_computed_again(tmp_path):
+    calls = []
+    for _ in range(2):
+        assert kept(tmp_path / "deep" / "x.json", lambda: calls.append(1) or {"costs": [1.0]}) == {"costs": [1.0]}
+    assert len(calls) == 1
+
+
+def results(tmp_path):
+    trainings = [finished(tmp_path, seed, 0.0) for seed in range(2)]
+    twinning = arm_entry("twinning", trainings)
+    ruler = np.array(twinning.costs[0])
+    yardsticks = [
+        yardstick_entry(name, {"costs": (ruler * factor).tolist(), "merit": {"m [m]": {"mean": 1.0}}})
+        for name, factor in (("PD", 1.5), ("oracle", 0.98))
+    ]
+    halves = [Entry(name="model_free", costs=twinning.costs * 3.0, merit=twinning.merit)]
+    halves.append(Entry(name="model_based", costs=twinning.costs, merit=twinning.merit))
+    costs = {"nominal": [1.0, 1.1], "noise 1 %": [1.5]}
+    errors = {"nominal": [0.01, 0.02], "noise 1 %": []}
+    summaries = [t.metrics()["summary"] for t in trainings]
+    plant = "flapping_wing"
+    return Results({plant: [twinning, *halves, *yardsticks]}, {plant: summaries}, {plant: costs}, {plant: errors})
+
+
+def test_the_report_says_what_was_found(tmp_path):
+    found = results(tmp_path)
+    text = "\n\n".join(report.sections(found, figures=["FIGURE"], quick=True, command="uv run x"))
+    assert "Within 5 % of the oracle: **yes** (1.020)" in text
+    assert "Against model free alone: **better**" in text
+    assert "Against model based alone: **neither better nor worse**" in text
+    assert "Against the classical PD: **better**" in text
+    assert "(4.18 ± 0.01)e-1" in text and "no result" in text and "FIGURE" in text
+    assert "| flapping wing | noise 1 % | 1.5 | 1.429 | – |" in text
+    numbers = report.numbers(found)["flapping_wing"]
+    assert json.loads(json.dumps(numbers))["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
+
+
+def test_the_page_holds_its_figures(tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "a.png").write_bytes(b"\x89PNG")
+    shown = page.figure(tmp_path / "figures" / "a.png", tmp_path, "what is seen")
+    source, html = page.write(tmp_path, "Title", [page.table(["x", "y"], [["1", "2"]]), shown])
+    assert "![what is seen](figures/a.png)" in source.read_text()
+    text = html.read_text()
+    held = base64.b64encode(b"\x89PNG").decode()
+    assert "<table>" in text and f'src="data:image/png;base64,{held}"' in text
+    assert "figures/a.png" not in text
+
+
+@pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
+def test_every_variant_is_an_option_of_every_recipe(plant):
+    config = recipe(plant).Config
+    nominal = tyro.cli(config, args=[])
+    for name, options in VARIANTS.items():
+        harder = tyro.cli(config, args=list(options))
+        assert (harder == nominal) == (name == "nominal")
+        assert harder.model_error == (name == "model error")
+
+
+def test_a_plant_that_does_not_exist_is_refused():
+    config = recipe("study").Config
+    with pytest.raises(ValueError, match="must be all, or some of wind_turbine, flapping_wing, cryogenic_tank"):
+        config(plants=("moon",))
+    assert config(plants=("all",)).chosen() == ["wind_turbine", "flapping_wing", "cryogenic_tank"]
+
+
+def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
+    config = recipe("study").Config(seeds=3, variant_seeds=2, folder=tmp_path)
+    groups = config.trainings("flapping_wing")
+    assert {key: len(group) for key, group in groups.items() if key[0] == "nominal"} == {
+        ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based")
+    }
+    assert [key for key in groups if key[0] != "nominal"] == [(v, "twinning") for v in VARIANTS if v != "nominal"]
+    assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
+    assert len({t.folder for group in groups.values() for t in group}) == 3 * 3 + 4 * 2
