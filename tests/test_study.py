@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tyro
 
+from rt_torchrl.figures import study as charts
 from rt_torchrl.study import page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
 from rt_torchrl.study.training import VARIANTS, Training
@@ -152,6 +153,21 @@ def test_the_report_says_what_was_found(tmp_path):
     assert "| flapping wing | noise 1 % | 1.5 | 1.429 | – |" in text
     numbers = report.numbers(found)["flapping_wing"]
     assert json.loads(json.dumps(numbers))["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
+
+
+def test_the_figures_show_every_arm_and_yardstick(tmp_path):
+    found = results(tmp_path)
+    curves = charts.learning(found.entries)
+    texts = {text.get_text() for text in curves.legends[0].get_texts()}
+    assert texts == {"twinning", "oracle", "classical"}  # the halves of this example have no curves
+    (line,) = [line for line in curves.axes[0].lines if line.get_label() == "twinning"]
+    assert np.allclose(line.get_ydata(), [5.0, 1.05, 1.0])
+    violins = charts.robustness(found.entries)
+    labels = [label.get_text() for label in violins.axes[0].get_xticklabels()]
+    assert labels == ["twinning", "model free", "model based", "PD", "oracle"]
+    harder = charts.variants(found.costs).axes[0]
+    assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %"]
+    assert np.allclose(harder.lines[1].get_ydata(), 1.5 / 1.05)
 
 
 def test_the_page_holds_its_figures(tmp_path):

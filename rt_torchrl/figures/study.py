@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, caption, legend_below, panels
 from rt_torchrl.study.findings import Entry
@@ -22,7 +23,7 @@ def learning(entries: dict[str, list[Entry]]) -> Figure:
         entries: of each plant.
     """
     title = "Cost on unseen episodes while training; band: range of the seeds"
-    figure, axes = panels(1, len(entries), title=title, size=(4.6 * len(entries), 4.0))
+    figure, axes = panels(1, len(entries), title=title, size=(max(7.5, 4.6 * len(entries)), 4.0))
     for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
         for entry in found:
             if entry.curves and entry.curves[0]:
@@ -36,6 +37,7 @@ def learning(entries: dict[str, list[Entry]]) -> Figure:
             else:
                 ax.axhline(entry.mean, label="classical", linestyle=":", **YARDSTICK_LINE)
         ax.set_yscale("log")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_xlabel("real episodes")
         caption(ax, f"{shown(plant)}: $J_a$")
     legend_below(figure, list(axes.flat))
@@ -67,7 +69,8 @@ def variants(costs: dict[str, dict[str, list[float]]]) -> Figure:
         costs: of each plant and variant, a value for every seed; ``nominal`` is the reference.
     """
     title = "Twinning under noise and model error: $J_a$ over the nominal mean"
-    figure, axes = panels(1, len(costs), title=title, size=(4.6 * len(costs), 3.8), sharey=True)
+    size = (max(7.5, 4.6 * len(costs)), 3.8)
+    figure, axes = panels(1, len(costs), title=title, size=size, sharey=True)
     for ax, (plant, found) in zip(axes.flat, costs.items(), strict=True):
         nominal = float(np.mean(found["nominal"]))
         for column, values in enumerate(found.values()):

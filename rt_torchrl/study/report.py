@@ -97,8 +97,8 @@ def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:
         for printed, (before, after) in zip(PAPER.get(plant, ("–",) * 3), pairs, strict=True):
             start = np.mean([part[before]["mean"] for part in unseen])
             ratios = np.array([part[after]["mean"] for part in unseen]) / start
-            deviation = ratios.std(ddof=1) if len(ratios) > 1 else float("nan")
-            cells += [printed, f"{ratios.mean():.2g} ± {deviation:.1g}"]
+            deviation = f" ± {ratios.std(ddof=1):.1g}" if len(ratios) > 1 else ""
+            cells += [printed, f"{ratios.mean():.2g}{deviation}"]
         rows.append(cells)
     return table(header, rows)
 
