@@ -72,7 +72,7 @@ class LivePolicy(nn.Module):
         if self.strength == 0.0:
             return command
         fresh = torch.randn(command.shape, generator=self._generator, dtype=command.dtype, device=command.device)
-        if self._noise is None or self._memory == 0.0:
+        if self._noise is None:
             self._noise = fresh
         else:
             self._noise = self._memory * self._noise + math.sqrt(1.0 - self._memory**2) * fresh

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Text
+from figure_reading import draw, line, snapshot_of
 
 from rt_torchrl import figures as general
 from rt_torchrl.envs.cryogenic_tank import figures
@@ -14,7 +13,6 @@ from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.memory import Record
 from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.trajectory import Rollout
 
 FOUND = {"U_s": [8.0, 46.0], "U_HX": [12.0, 70.0], "K_JT": [90e9, 480e9]}
 TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}
@@ -23,35 +21,9 @@ TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}
 @pytest.fixture(scope="module")
 def snapshot() -> Snapshot:
     """The real tank, and a twin whose coefficients are some percent off."""
-    plant, generator = CryogenicTank(horizon=6 * 3600.0), torch.Generator().manual_seed(0)
-    policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = ConstantCoefficients(torch.tensor([found[-1] for found in FOUND.values()], dtype=torch.float64))
-    start, load = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure, policies["model_based"], engine="autograd")(start, load)
-        replayed = Rollout(plant, twin, engine="autograd")(start, load, flown.actions)
-    return Snapshot(
-        plant=plant,
-        closure=twin,
-        initial_closure=plant.make_closure(generator),
-        policies=policies,
-        live="model_based",
-        record=Record(flown.states[0], load[0], flown.actions[0]),
-        replay=replayed.states[0],
-        large_scale=load[0] + 10.0,
-        realisations=load,
-        episodes=[{"closure": {name: found[k] for name, found in FOUND.items()}} for k in range(2)],
-    )
-
-
-def draw(figure) -> set[str]:
-    """Draw it, which raises on broken mathtext; return every text."""
-    FigureCanvasAgg(figure).draw()
-    return {text.get_text() for text in figure.findobj(Text)}
-
-
-def line(ax, label):
-    return next(line for line in ax.lines if line.get_label() == label)
+    episodes = [{"closure": {name: found[k] for name, found in FOUND.items()}} for k in range(2)]
+    return snapshot_of(CryogenicTank(horizon=6 * 3600.0), twin, shift=10.0, episodes=episodes)
 
 
 def panel(figure, caption):

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from figure_reading import draw, line
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Text
 
 from rt_torchrl import figures
 from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
@@ -61,12 +60,6 @@ def turbine() -> Snapshot:
     return trained(WindTurbine(horizon=60.0))
 
 
-def draw(figure) -> set[str]:
-    """Draw it, which raises on broken mathtext; return every text."""
-    FigureCanvasAgg(figure).draw()
-    return {text.get_text() for text in figure.findobj(Text)}
-
-
 def clipped_texts(figure) -> list[str]:
     """Titles and axis labels that stick out of the canvas of a drawn figure."""
     texts = [figure._suptitle]
@@ -75,10 +68,6 @@ def clipped_texts(figure) -> list[str]:
     boxes = {text.get_text(): text.get_window_extent() for text in texts if text.get_text()}
     width, height = figure.bbox.size
     return [name for name, b in boxes.items() if b.x0 < 0 or b.y0 < 0 or b.x1 > width or b.y1 > height]
-
-
-def line(ax, label):
-    return next(line for line in ax.lines if line.get_label() == label)
 
 
 def same(line, values) -> bool:

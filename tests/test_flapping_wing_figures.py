@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Text
+from figure_reading import draw, line, snapshot_of
 from PIL import Image
 from torch import nn
 
@@ -17,7 +16,6 @@ from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.memory import Record
 from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.trajectory import Rollout
 
 SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
 
@@ -25,35 +23,8 @@ SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
 @pytest.fixture(scope="module")
 def snapshot() -> Snapshot:
     """Four beats of the real drone, and of a twin that has half the lift."""
-    plant, generator = FlappingWing(horizon=0.2), torch.Generator().manual_seed(0)
-    policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = QuasiSteadyPolar(torch.tensor([0.86, 0.05, 1.5], dtype=torch.float64))
-    start, wind = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure, policies["model_based"])(start, wind)
-        replayed = Rollout(plant, twin)(start, wind, flown.actions)
-    return Snapshot(
-        plant=plant,
-        closure=twin,
-        initial_closure=plant.make_closure(generator),
-        policies=policies,
-        live="model_based",
-        record=Record(flown.states[0], wind[0], flown.actions[0]),
-        replay=replayed.states[0],
-        large_scale=wind[0] + 0.1,
-        realisations=None,
-        episodes=[],
-    )
-
-
-def draw(figure) -> set[str]:
-    """Draw it, which raises on broken mathtext; return every text."""
-    FigureCanvasAgg(figure).draw()
-    return {text.get_text() for text in figure.findobj(Text)}
-
-
-def line(ax, label):
-    return next(line for line in ax.lines if line.get_label() == label)
+    return snapshot_of(FlappingWing(horizon=0.2), twin, shift=0.1, realisations=False)
 
 
 def panel(figure, caption):

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.disturbance import require_request
+
 
 @runtime_checkable
 class LoadModel(Protocol):
@@ -83,10 +85,7 @@ class CyclicLoad:
         Raises:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
-        if batch < 1 or n_steps < 1:
-            raise ValueError(f"batch={batch} and n_steps={n_steps} must be at least 1.")
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ValueError(f"dt={dt} s must be positive and finite.")
+        require_request(batch, n_steps, dt)
         like = {"dtype": torch.float64, "device": generator.device}
         t = dt * torch.arange(n_steps, **like)
         orbit = (t / self.period).floor().long()

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.disturbance import require_request
+
 
 @runtime_checkable
 class GustModel(Protocol):
@@ -83,10 +85,7 @@ class GaussianGust:
         Raises:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
-        if batch < 1 or n_steps < 1:
-            raise ValueError(f"batch={batch} and n_steps={n_steps} must be at least 1.")
-        if not (math.isfinite(dt) and dt > 0):
-            raise ValueError(f"dt={dt} s must be positive and finite.")
+        require_request(batch, n_steps, dt)
         like = {"dtype": torch.float64, "device": generator.device}
         reach = 9.0  # e^{−9²/2} = e^{−40}: where kernel and spectrum are below rounding
         period = n_steps * dt + reach * self.time_scale

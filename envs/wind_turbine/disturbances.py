@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.disturbance import require_request
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 
 CUT_IN_SPEED = 3.0
@@ -106,7 +107,7 @@ class KaimalWind:
         Raises:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
-        _check_request(batch, n_steps, dt, least_steps=2)
+        require_request(batch, n_steps, dt, least_steps=2)
         # Drawn with unit variance, so that a wind without turbulence is not scaled by 0/0.
         fluctuation = self._draw_unit_fluctuation(batch, n_steps, dt, generator)
         if self.scale_to_target:
@@ -174,7 +175,7 @@ class RecordedWind:
         Raises:
             ValueError: if an argument is out of its range, or a record is shorter than (n_steps − 1)·dt.
         """
-        _check_request(batch, n_steps, dt, least_steps=1)
+        require_request(batch, n_steps, dt)
         needed = (n_steps - 1) * dt
         for record in self.records:
             # Rounding of k·dt must not reject a record of exactly the length needed.
@@ -194,12 +195,3 @@ class RecordedWind:
             # The even grid, not the printed times, which a text file rounds to a millisecond.
             row[:] = np.interp(start + elapsed, record.step * np.arange(len(record.speed)), record.speed)
         return torch.from_numpy(wind).to(device).clamp_min(self.floor)
-
-
-def _check_request(batch: int, n_steps: int, dt: float, *, least_steps: int) -> None:
-    if batch < 1:
-        raise ValueError(f"batch={batch} must be at least 1.")
-    if n_steps < least_steps:
-        raise ValueError(f"n_steps={n_steps} must be at least {least_steps}; lengthen the episode or shorten dt.")
-    if not (math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt={dt} s must be positive and finite.")
