@@ -70,11 +70,16 @@ class Config:
         """The plants, by folder."""
         return list(CONTROLLERS) if "all" in self.plants else list(self.plants)
 
+    @property
+    def kept(self) -> Path:
+        """Where what is computed is kept; short trainings apart, or the whole study would take them for its own."""
+        return self.folder / "quick" if self.quick else self.folder
+
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Of a plant: those of every variant and arm, a list over the seeds."""
         seeds, others = (1, min(self.variant_seeds, 1)) if self.quick else (self.seeds, self.variant_seeds)
         options = ("--quick",) if self.quick else ("--unseen", str(self.unseen))
-        recipe, base = Path(__file__).with_name(f"{plant}.py"), self.folder / "runs" / plant
+        recipe, base = Path(__file__).with_name(f"{plant}.py"), self.kept / "runs" / plant
 
         def every(arm: str, variant: str, count: int) -> list[Training]:
             place = base / variant.replace(" ", "-").replace("%", "percent") / arm
@@ -87,14 +92,14 @@ class Config:
 
     def yardsticks(self, plant: str) -> dict[str, Callable[[], dict[str, Any]]]:
         """The oracle and the classical controllers of a plant; each is computed once and kept."""
-        place = self.folder / "yardsticks" / plant
+        place = self.kept / "yardsticks" / plant
         unseen = QUICK_UNSEEN if self.quick else self.unseen
         starts, iterations, evaluations, episodes = (1, 10, 5, 3) if self.quick else (3, 60, 80, 20)
-        found = {"oracle": partial(oracle, plant, place / "oracle.json", unseen=unseen)}
-        found["oracle"].keywords.update(starts=starts, iterations=iterations)
+        best = {"unseen": unseen, "starts": starts, "iterations": iterations}
+        tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
+        found = {"oracle": partial(oracle, plant, place / "oracle.json", **best)}
         for name, kind in CONTROLLERS[plant].items():
-            measured = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
-            found[name] = partial(classical, plant, kind, place / f"{name}.json", **measured)
+            found[name] = partial(classical, plant, kind, place / f"{name}.json", **tuned)
         return found
 
 

@@ -207,4 +207,8 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     }
     assert [key for key in groups if key[0] != "nominal"] == [(v, "twinning") for v in VARIANTS if v != "nominal"]
     assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
-    assert len({t.folder for group in groups.values() for t in group}) == 3 * 3 + 4 * 2
+    folders = {t.folder for group in groups.values() for t in group}
+    assert len(folders) == 3 * 3 + 4 * 2
+    short = recipe("study").Config(quick=True, folder=tmp_path).trainings("flapping_wing")
+    # What is kept of a quick study is never taken for a result of the whole one.
+    assert folders.isdisjoint(t.folder for group in short.values() for t in group)
