@@ -14,11 +14,13 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.environment import PlantEnv
 from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.flight import FlightCollector
 from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, ShortTermMemory
 from rt_torchrl.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
 from rt_torchrl.model_free import ModelFree, ModelFreeConfig
@@ -82,7 +84,7 @@ class ReinforcementTwinning:
 
     def __init__(
         self,
-        env: PlantEnv,
+        env: EnvBase,
         twin: DigitalTwin,
         *,
         model_free: nn.Module,
@@ -101,14 +103,7 @@ class ReinforcementTwinning:
         self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
         self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
         self.actor = LivePolicy(twin.plant, self.policies[self.switch.live], config.exploration, generator=generator)
-        self.collector = Collector(
-            env,
-            TensorDictModule(self.actor, in_keys=["observation"], out_keys=["action"]),
-            frames_per_batch=twin.plant.n_steps,
-            total_frames=-1,
-            reset_at_each_iter=True,
-            auto_register_policy_transforms=False,
-        )
+        self.collector = collector_of(env, self.actor, twin.plant.n_steps)
         self.episodes_done = 0
 
     def episode(self) -> TensorDict:
@@ -202,6 +197,15 @@ class ReinforcementTwinning:
         initial_state, exogenous = self.draw_virtual_episodes(self.config.virtual_episodes)
         flown = {role: self.twin.control(policy, initial_state, exogenous) for role, policy in self.policies.items()}
         return {role: control_cost(self.twin.plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+
+
+def collector_of(env: EnvBase, actor: LivePolicy, n_steps: int) -> Collector:
+    """TorchRL's collector of one episode a time; for a system in simulation the one that does not step in Python."""
+    if isinstance(env, PlantEnv):
+        return FlightCollector(env, actor)
+    policy = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
+    options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False, "total_frames": -1}
+    return Collector(env, policy, frames_per_batch=n_steps, **options)
 
 
 def findings(**values: float | Tensor) -> TensorDict:

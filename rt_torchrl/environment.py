@@ -1,6 +1,7 @@
 """The real system in simulation: any plant as a TorchRL environment."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -12,6 +13,14 @@ from torchrl.envs import EnvBase
 from rt_torchrl.compilation import compiled_if
 from rt_torchrl.plant import Plant, Transition
 from rt_torchrl.trajectory import DivergenceError
+
+
+class Draw(NamedTuple):
+    """Initial states and exogenous inputs of episodes, and what the sensors multiply their first state by."""
+
+    initial_state: Float[Tensor, "batch n_s"]
+    exogenous: Float[Tensor, "batch n n_z"]
+    sensor_factor: Float[Tensor, "batch n_s"]
 
 
 class PlantEnv(EnvBase):
@@ -64,7 +73,7 @@ class PlantEnv(EnvBase):
         # Of their own, so that sensors of any quality see the same disturbances.
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
-        self._noise, self._wear, self._episodes = noise, wear, 0
+        self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
         self._make_specs()
 
     @property
@@ -132,12 +141,23 @@ class PlantEnv(EnvBase):
         false = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
         return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
 
+    def begin_episode(self) -> nn.Module:
+        """Count an episode and give the closure it has.
+
+        Not counted by a reset, because a collector may reset more than once before it flies.
+        """
+        self._episodes += 1
+        return self.closure
+
+    @property
+    def drawn(self) -> "Draw":
+        """What the last reset has drawn."""
+        return Draw(self._state, self._exogenous, self._factor)
+
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if (self._step_count == 0).any():
-            # Counted here, because a collector may reset more than once before it steps.
-            self._episodes += 1
-            self._closure = self.closure
+            self._closure = self.begin_episode()
         t, exogenous = self._time(), self._now()
         command = tensordict["action"]
         transition, cost = self._transition(self.plant, self._closure, t, self._state, command, exogenous)
@@ -162,17 +182,18 @@ class PlantEnv(EnvBase):
 
     def _observed(self, entries: dict[str, Tensor]) -> TensorDict:
         exogenous = self._now()
-        state = self._measured()
+        self._factor = self.sensor_factor()
+        state = self._state * self._factor
         observation = self.plant.observe(self._time(), state, exogenous)
         entries |= {"observation": observation, "state": state, "exogenous": exogenous}
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
-    def _measured(self) -> Float[Tensor, "batch n_s"]:
-        """The state as the sensors report it."""
+    def sensor_factor(self) -> Float[Tensor, "batch n_s"]:
+        """What the sensors multiply the state by at the next reading, 1 + noise·w."""
         if self._noise == 0.0:
-            return self._state
+            return torch.ones_like(self._state)
         like = {"dtype": torch.float64, "device": self.device}
-        return self._state * (1.0 + self._noise * torch.randn(self._state.shape, generator=self._sensors, **like))
+        return 1.0 + self._noise * torch.randn(self._state.shape, generator=self._sensors, **like)
 
     def _time(self) -> Float[Tensor, " batch"]:
         # An integer times a float would be single precision.

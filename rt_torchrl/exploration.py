@@ -66,14 +66,18 @@ class LivePolicy(nn.Module):
         """Start an episode with the policy that is live now and ξ = ``strength``."""
         self.policy, self.strength, self._noise = policy, strength, None
 
-    @torch.no_grad()
-    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
-        command = self.policy(observation)
+    def draw_noise(self, shape: torch.Size | tuple[int, ...]) -> Float[Tensor, "*batch n_a"]:
+        """The noise of the next control interval; zeros, and no draw, where ξ is zero."""
         if self.strength == 0.0:
-            return command
-        fresh = torch.randn(command.shape, generator=self._generator, dtype=command.dtype, device=command.device)
+            return torch.zeros(shape, dtype=torch.float64, device=self.low.device)
+        fresh = torch.randn(shape, generator=self._generator, dtype=torch.float64, device=self.low.device)
         if self._noise is None:
             self._noise = fresh
         else:
             self._noise = self._memory * self._noise + math.sqrt(1.0 - self._memory**2) * fresh
-        return (command + self.strength * self._scale * self._noise).clamp(self.low, self.high)
+        return self.strength * self._scale * self._noise
+
+    @torch.no_grad()
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        command = self.policy(observation)
+        return (command + self.draw_noise(command.shape)).clamp(self.low, self.high)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.compilation import compiled_if
-from rt_torchrl.engines.parallel_adjoint import linearise
+from rt_torchrl.engines.parallel_adjoint import linearise, piecewise
 from rt_torchrl.engines.recurrence import march, march_by_scan
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
@@ -51,7 +51,7 @@ class Sensitivities:
         ends = self._march(self.interval, initial_state, drive)
         starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])
         names = tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
-        A = self._linearise(self.interval, starts, drive)
+        A = piecewise(self._linearise, self.interval, starts, drive)
         B = self._weight_jacobians(self.interval, names, starts, drive)
         return ends.transpose(0, 1), self._propagate(A, B).transpose(0, 1)
 

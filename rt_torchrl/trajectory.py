@@ -9,6 +9,7 @@ engine             gradient                                            for
 =================  ==================================================  ======================================
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -89,7 +90,7 @@ class Rollout:
         drive = drive_of(self.plant, exogenous, command, start=start)
         torch._dynamo.maybe_mark_dynamic(initial_state, 0)
         ends = self._engine.end_states(self.interval, initial_state.contiguous(), drive)
-        self._require_finite(ends, start)
+        require_finite(self.plant, ends, initial_state, [self.interval.closure, self.interval.policy], start=start)
         states = torch.cat([initial_state.unsqueeze(0), ends])
         # A function of the states, so that every engine differentiates the actions the same way.
         applied = self.plant.actuate(states[:-1], self.interval.command(states[:-1], drive))
@@ -117,18 +118,37 @@ class Rollout:
             if not value.isfinite().all():
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
 
-    def _require_finite(self, ends: Tensor, start: float) -> None:
-        if ends.isfinite().all():
-            return
-        k, realisation, component = (~ends.isfinite()).nonzero()[0].tolist()
-        last = ends[k - 1, realisation].tolist() if k else "the initial state"
-        weights = [type(m).__name__ for m in (self.interval.closure, self.interval.policy) if m is not None]
-        raise DivergenceError(
-            f"plant {self.plant.name!r} diverged in realisation {realisation} at t = "
-            f"{start + (k + 1) * self.plant.dt:g} s: {self.plant.states[component].name} is not finite; the state "
-            f"before was {last}, the weights those of {' and '.join(weights)}. Use a smaller dt, or weights nearer to "
-            "ones that are known to work."
-        )
+
+def require_finite(
+    plant: Plant,
+    ends: Float[Tensor, "n batch n_s"],
+    initial_state: Float[Tensor, "batch n_s"],
+    modules: Sequence[nn.Module | None],
+    *,
+    start: float = 0.0,
+) -> None:
+    """Refuse a trajectory that has left the finite numbers.
+
+    Args:
+        plant: the physics.
+        ends: states at the end of every interval.
+        initial_state: s_0.
+        modules: closure and policy it was computed with, for the message.
+        start: time of s_0 [s].
+
+    Raises:
+        DivergenceError: with plant, realisation, time and the last state that was finite.
+    """
+    if ends.isfinite().all():
+        return
+    k, realisation, component = (~ends.isfinite()).nonzero()[0].tolist()
+    last = (ends[k - 1] if k else initial_state)[realisation].tolist()
+    weights = [type(module).__name__ for module in modules if module is not None]
+    raise DivergenceError(
+        f"plant {plant.name!r} diverged in realisation {realisation} at t = {start + (k + 1) * plant.dt:g} s: "
+        f"{plant.states[component].name} is not finite; the state before was {last}, the weights those of "
+        f"{' and '.join(weights)}. Use a smaller dt, or weights nearer to ones that are known to work."
+    )
 
 
 def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float = 0.0) -> Drive:

@@ -12,6 +12,8 @@ Only the recurrence of the states and the (linear) one of λ are sequential. The
 trajectories are one batched call, and so is the sum over k.
 """
 
+from collections.abc import Callable
+
 import torch
 from hoptorch.scan import scan
 from torch import Tensor
@@ -20,6 +22,9 @@ from torch.autograd.function import once_differentiable
 from rt_torchrl.compilation import compiled_if
 from rt_torchrl.engines.recurrence import march, march_by_scan
 from rt_torchrl.interval import Drive, Interval
+
+PIECE = 40_000
+"""Intervals that are linearised at once: the products of many more fall out of the cache, and take twice the time."""
 
 
 class ParallelAdjoint:
@@ -57,7 +62,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def backward(ctx, cost_gradient):
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
-        jacobians = ctx.engine.linearise(ctx.interval, starts, drive)
+        jacobians = piecewise(ctx.engine.linearise, ctx.interval, starts, drive)
         costates = ctx.engine.costates(jacobians[1:], cost_gradient)  # λ_1 ... λ_n
         wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
         with torch.enable_grad():
@@ -83,6 +88,17 @@ def linearise(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
         return torch.func.jvp(lambda s: interval(s, drive), (starts,), (tangent,))[1]
 
     return torch.func.vmap(column, out_dims=-1)(basis)
+
+
+def piecewise(linearise: Callable, interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
+    """``linearise`` in pieces of equal length, of which the last overlaps the one before: one shape is compiled."""
+    n, length = len(starts), max(1, PIECE // starts.shape[1])
+    if n <= length:
+        return linearise(interval, starts, drive)
+    firsts = [*range(0, n - length, length), n - length]
+    found = [linearise(interval, starts[k : k + length], Drive(*(x[k : k + length] for x in drive))) for k in firsts]
+    found[-1] = found[-1][length - (n - firsts[-2] - length) :]
+    return torch.cat(found)
 
 
 def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:

@@ -1,0 +1,81 @@
+"""Episodes by one scan against the same episodes stepped by TorchRL's own collector."""
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+
+from rt_torchrl.catalogue import plants
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.flight import FlightCollector
+from rt_torchrl.trajectory import DivergenceError
+
+
+def system(plant, batch=1, **options):
+    """A real system, what acts on it, and the policy behind that; alike at every call."""
+    generator = torch.Generator().manual_seed(1)
+    policy = plant.make_policy(generator)
+    actor = LivePolicy(plant, policy, ExplorationConfig(correlation_time=3.0 * plant.dt), generator=generator)
+    return PlantEnv(plant, batch_size=batch, seed=5, **options), actor, policy
+
+
+def stepped(env, actor):
+    """TorchRL's own collector."""
+    policy = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
+    options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False, "total_frames": -1}
+    return Collector(env, policy, frames_per_batch=env.plant.n_steps * env.batch_size.numel(), **options)
+
+
+def episodes(collector, actor, policy, strengths):
+    for strength in strengths:
+        actor.begin(policy, strength=strength)
+        yield next(iter(collector))
+
+
+def compare(make, strengths=(1.0, 0.0), **tolerance):
+    found = []
+    for collector in (FlightCollector, stepped):
+        env, actor, policy = make()
+        found.append((env, list(episodes(collector(env, actor), actor, policy, strengths))))
+    (env, flown), (reference, expected) = found
+    for one, other in zip(flown, expected, strict=True):
+        other = other.exclude("collector")
+        assert set(one.keys(True, True)) == set(other.keys(True, True))
+        for key in other.keys(True, True):
+            torch.testing.assert_close(one[key], other[key], msg=lambda text, key=key: f"{key}: {text}", **tolerance)
+    for key, value in reference.state_dict().items():  # the same draws were made
+        assert torch.equal(torch.as_tensor(env.state_dict()[key]), torch.as_tensor(value)), key
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_every_entry_is_that_of_stepping(batch, noise):
+    # The same operations; batched sums of the observation may round in another order.
+    compare(lambda: system(LinearQuadratic(horizon=2.0), batch, noise=noise), rtol=1e-12, atol=1e-13)
+
+
+def test_every_entry_is_that_of_stepping_with_wear():
+    worn = [LinearClosure(torch.full((2, 2), -0.1 * k)) for k in range(3)]
+    make = lambda: system(LinearQuadratic(horizon=2.0), wear=lambda episode: worn[episode])  # noqa: E731
+    compare(make, (1.0, 0.5, 0.0), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", plants())
+def test_every_plant_flies_as_it_steps(name):
+    dt = plants()[name]().dt
+    # Rounding, amplified by the dynamics over 40 intervals.
+    compare(lambda: system(plants()[name](horizon=40 * dt)), rtol=1e-9, atol=1e-9)
+
+
+def test_a_flight_that_diverges_says_where():
+    class Explosive(LinearClosure):
+        def forward(self, features):
+            return 1e3 * features**3
+
+    plant = LinearQuadratic()
+    plant.closure = Explosive(plant.true_closure)
+    env, actor, policy = system(plant)
+    with pytest.raises(DivergenceError, match=r"'linear_quadratic' diverged in realisation 0 at t = .*Explosive and"):
+        list(episodes(FlightCollector(env, actor), actor, policy, [1.0]))
