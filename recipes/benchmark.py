@@ -27,6 +27,7 @@ class Config:
         repeats: gradients of each engine, in turn.
         engines: the engines; the ratio is to the last one.
         compiled: compile each engine.
+        eager: engines that are left uncompiled all the same, such as odeint_adjoint as torchdiffeq has it.
         threads: number of CPU threads; 0 leaves torch's default.
         output: JSON file for the result.
     """
@@ -37,12 +38,15 @@ class Config:
     repeats: int = 3
     engines: tuple[Engine, ...] = ("parallel", REFERENCE)
     compiled: bool = True
+    eager: tuple[Engine, ...] = ()
     threads: int = 0
     output: Path | None = None
 
     def __post_init__(self):
         if self.plant not in plants():
             raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(plants())}.")
+        if not set(self.eager) <= set(self.engines):
+            raise ValueError(f"eager={self.eager} must be some of engines={self.engines}.")
 
 
 def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
@@ -52,7 +56,7 @@ def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
     closure, policy = plant.make_closure(generator), plant.make_policy(generator)
     initial_state = plant.draw_initial_state(config.realisations, generator)
     exogenous = plant.draw_exogenous(config.realisations, generator)[:, : config.steps or plant.n_steps]
-    rollout = Rollout(plant, closure, policy, engine=engine, compiled=config.compiled)
+    rollout = Rollout(plant, closure, policy, engine=engine, compiled=config.compiled and engine not in config.eager)
     weights = [*closure.parameters(), *policy.parameters()]
 
     def compute() -> torch.Tensor:

@@ -30,6 +30,14 @@ CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "flapping_wing": {"PD": TrimmedPD},
     "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
 }
+POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
+    "wind_turbine": {
+        "twinning, gain-scheduled": ("--policy", "scheduled"),
+        "twinning, with bias": ("--policy", "bias"),
+        "twinning, perceptron": ("--policy", "mlp"),
+    },
+}
+"""Policies beside a plant's own that twinning trains too, as options of its recipe."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,12 +89,15 @@ class Config:
         options = ("--quick",) if self.quick else ("--unseen", str(self.unseen))
         recipe, base = Path(__file__).with_name(f"{plant}.py"), self.kept / "runs" / plant
 
-        def every(arm: str, variant: str, count: int) -> list[Training]:
-            place = base / variant.replace(" ", "-").replace("%", "percent") / arm
-            common = {"recipe": recipe, "arm": arm, "variant": variant, "options": (*options, "--unseen-every", "1")}
+        def every(arm: str, variant: str, count: int, *further: str, folder: str = "") -> list[Training]:
+            place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
+            every_option = (*options, "--unseen-every", "1", *further)
+            common = {"recipe": recipe, "arm": arm, "variant": variant, "options": every_option}
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
+        for name, policy in POLICIES.get(plant, {}).items():
+            found["nominal", name] = every("twinning", "nominal", seeds, *policy, folder="-".join(policy).strip("-"))
         harder = [variant for variant in VARIANTS if variant != "nominal"] if others else []
         return found | {(variant, "twinning"): every("twinning", variant, others) for variant in harder}
 
@@ -108,15 +119,23 @@ def compute(config: Config) -> None:
     tasks = [task for plant in config.chosen() for task in config.yardsticks(plant).values()]
     for plant in reversed(config.chosen()):  # the longest first
         tasks += [training.run for group in config.trainings(plant).values() for training in group]
-    if config.backend == "ray":
+    side_by_side(tasks, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
+
+
+def side_by_side(tasks: list[Callable[[], Any]], *, backend: str, jobs: int) -> None:
+    """Run tasks through joblib with a progress bar.
+
+    Raises:
+        ValueError: if the backend is Ray and there is none.
+    """
+    if backend == "ray":
         try:
             from ray.util.joblib import register_ray
         except ImportError as error:
             raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
         register_ray()
-    jobs = config.jobs or os.cpu_count() or 1
-    ordered = "list" if config.backend == "ray" else "generator_unordered"
-    running = Parallel(n_jobs=jobs, backend=config.backend, return_as=ordered)(delayed(task)() for task in tasks)
+    ordered = "list" if backend == "ray" else "generator_unordered"
+    running = Parallel(n_jobs=jobs, backend=backend, return_as=ordered)(delayed(task)() for task in tasks)
     for _ in tqdm(running, total=len(tasks), unit="task", desc="study"):
         pass
 
@@ -124,7 +143,7 @@ def compute(config: Config) -> None:
 def entries_of(config: Config, plant: str) -> list[Entry]:
     """Arms, then classical controllers, then the oracle."""
     trainings = config.trainings(plant)
-    found = [arm_entry(arm, trainings["nominal", arm]) for arm in ARMS]
+    found = [arm_entry(name, trainings["nominal", name]) for name in (*ARMS, *POLICIES.get(plant, {}))]
     yardsticks = [yardstick_entry(name, task()) for name, task in config.yardsticks(plant).items()]
     return found + yardsticks[1:] + yardsticks[:1]
 
@@ -154,7 +173,7 @@ def draw(config: Config, results: Results) -> list[str]:
         found.append(page.figure(folder / f"{name}.png", config.folder, report.CAPTIONS[name]))
     for plant in config.chosen():
         first = config.trainings(plant)["nominal", "twinning"][0].folder / "figures"
-        for name, text in report.RUN_CAPTIONS.items():
+        for name, text in (report.RUN_CAPTIONS | report.PLANT_CAPTIONS[plant]).items():
             copy = folder / f"{plant}_{name}.png"
             shutil.copy(first / f"{name}.png", copy)
             found.append(page.figure(copy, config.folder, f"{charts.shown(plant).capitalize()}, seed 0. {text}"))

@@ -12,6 +12,7 @@ from rt_torchrl.algorithm import TwinningConfig
 from rt_torchrl.descent import DescentConfig
 from rt_torchrl.envs.wind_turbine import figures
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
+from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
@@ -34,7 +35,9 @@ class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
-        policy: paper (affine in e1 and e2, no bias, 4 weights), bias (the same with bias, 6) or mlp.
+        policy: paper (affine in e1 and e2, no bias, 4 weights), bias (the same with bias, 6), mlp, or scheduled:
+            torque by the square of the speed and gain-scheduled PI pitch, observed by speed and pitch too, whose gains
+            start detuned.
         dt: control interval [s]; 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         mean_wind: mean wind speed U [m/s].
@@ -43,7 +46,7 @@ class Config(RunConfig):
         model_error: from the middle of the training on the rotor is worn: 10 % less lift, 50 % more drag.
     """
 
-    policy: Literal["paper", "bias", "mlp"] = "paper"
+    policy: Literal["paper", "bias", "mlp", "scheduled"] = "paper"
     dt: float = 0.5
     horizon: float = 600.0
     mean_wind: float = 11.0
@@ -56,12 +59,13 @@ class Config(RunConfig):
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
             wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
-        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind)
+        kind = InstrumentedTurbine if self.policy == "scheduled" else WindTurbine
+        return kind(dt=self.dt, horizon=self.horizon, wind=wind)
 
     def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:
-        if self.policy != "bias":
-            return super().make_policy(plant, generator)
-        return plant.make_policy(generator, bias=True)
+        if self.policy == "bias":
+            return plant.make_policy(generator, bias=True)
+        return plant.make_policy(generator) if self.policy == "scheduled" else super().make_policy(plant, generator)
 
     def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
         if not self.model_error:

@@ -29,6 +29,11 @@ def test_every_engine_is_timed_and_compared(tmp_path):
     assert found["gaps"]["parallel"] == pytest.approx(found["gaps"]["autograd"], rel=1e-6)
 
 
+def test_only_engines_that_are_timed_can_be_eager():
+    done = subprocess.run([sys.executable, str(RECIPE), "--eager", "autograd"], capture_output=True, text=True)
+    assert done.returncode != 0 and "must be some of" in done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
 def test_engines_agree_over_a_whole_episode(tmp_path, plant):

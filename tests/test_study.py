@@ -3,6 +3,7 @@
 import base64
 import importlib.util
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -133,8 +134,9 @@ def results(tmp_path):
         yardstick_entry(name, {"costs": (ruler * factor).tolist(), "merit": {"m [m]": {"mean": 1.0}}})
         for name, factor in (("PD", 1.5), ("oracle", 0.98))
     ]
-    halves = [Entry(name="model_free", costs=twinning.costs * 3.0, merit=twinning.merit)]
-    halves.append(Entry(name="model_based", costs=twinning.costs, merit=twinning.merit))
+    halves = [Entry(name="model_free", costs=twinning.costs * 3.0, merit=twinning.merit, curves=[[3.0]] * 2)]
+    halves.append(Entry(name="model_based", costs=twinning.costs, merit=twinning.merit, curves=twinning.curves))
+    halves.append(Entry(name="twinning, other", costs=twinning.costs * 2.0, merit=twinning.merit, curves=[[2.0]] * 2))
     costs = {"nominal": [1.0, 1.1], "noise 1 %": [1.5]}
     errors = {"nominal": [0.01, 0.02], "noise 1 %": []}
     summaries = [t.metrics()["summary"] for t in trainings]
@@ -148,23 +150,55 @@ def test_the_report_says_what_was_found(tmp_path):
     assert "Within 5 % of the oracle: **yes** (1.020)" in text
     assert "Against model free alone: **better**" in text
     assert "Against model based alone: **neither better nor worse**" in text
-    assert "Against the classical PD: **better**" in text
+    assert "Twinning against the classical PD: **better**" in text
+    assert "Twinning, other against the classical PD: **worse**" in text
     assert "(4.18 ± 0.01)e-1" in text and "no result" in text and "FIGURE" in text
     assert "| flapping wing | noise 1 % | 1.5 | 1.429 | – |" in text
     numbers = report.numbers(found)["flapping_wing"]
     assert json.loads(json.dumps(numbers))["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
 
 
+def computed(tmp_path, backend, jobs=2):
+    """What the study computes side by side from two trainings of a recipe that only writes its process."""
+    study = recipe("study")
+    script = tmp_path / "tiny.py"
+    script.write_text(
+        "import json, os, pathlib, sys\n"
+        "folder = pathlib.Path(sys.argv[sys.argv.index('--log-dir') + 1])\n"
+        "(folder / 'metrics.json').write_text(json.dumps({'parent': os.getppid()}))\n"
+    )
+    trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
+    study.side_by_side([t.run for t in trainings], backend=backend, jobs=jobs)
+    return [t.metrics()["parent"] for t in trainings]
+
+
+@pytest.mark.parametrize("backend", ["loky", "threading"])
+def test_trainings_run_side_by_side(tmp_path, backend):
+    # Threads start them from this process, loky from others.
+    assert (os.getpid() in computed(tmp_path, backend)) == (backend == "threading")
+
+
+def test_trainings_spread_over_ray(tmp_path):
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        parents = computed(tmp_path, "ray")
+        # Ray's workers start them, not this process.
+        assert os.getpid() not in parents
+    finally:
+        ray.shutdown()
+
+
 def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     found = results(tmp_path)
     curves = charts.learning(found.entries)
     texts = {text.get_text() for text in curves.legends[0].get_texts()}
-    assert texts == {"twinning", "oracle", "classical"}  # the halves of this example have no curves
+    assert texts == {"twinning", "model free", "model based", "twinning, other", "oracle", "classical"}
     (line,) = [line for line in curves.axes[0].lines if line.get_label() == "twinning"]
     assert np.allclose(line.get_ydata(), [5.0, 1.05, 1.0])
     violins = charts.robustness(found.entries)
     labels = [label.get_text() for label in violins.axes[0].get_xticklabels()]
-    assert labels == ["twinning", "model free", "model based", "PD", "oracle"]
+    assert labels == ["twinning", "model free", "model based", "twinning, other", "PD", "oracle"]
     harder = charts.variants(found.costs).axes[0]
     assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %"]
     assert np.allclose(harder.lines[1].get_ydata(), 1.5 / 1.05)
@@ -209,6 +243,10 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
     folders = {t.folder for group in groups.values() for t in group}
     assert len(folders) == 3 * 3 + 4 * 2
+    policies = [name for v, name in config.trainings("wind_turbine") if v == "nominal"][3:]
+    assert policies == ["twinning, gain-scheduled", "twinning, with bias", "twinning, perceptron"]
+    (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]
+    assert first.arm == "twinning" and " ".join(first.command()).endswith("--policy scheduled")
     short = recipe("study").Config(quick=True, folder=tmp_path).trainings("flapping_wing")
     # What is kept of a quick study is never taken for a result of the whole one.
     assert folders.isdisjoint(t.folder for group in short.values() for t in group)

@@ -45,14 +45,14 @@ class JonkmanController(ClassicalController):
         root = math.sqrt(self.slope_25 * (self.slope_25 - 4.0 * c["VS_Rgn2K"] * self.synchronous))
         self.transition = (self.slope_25 - root) / (2.0 * c["VS_Rgn2K"])
 
-    def first_memory(self, state: Float[Tensor, "batch 6"]) -> Float[Tensor, "batch 2"]:
+    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch 2"]:
         """The speed as it is, and the integral that holds the pitch it finds."""
         pitch = torch.deg2rad(state[:, 5])
         integral = pitch * (1.0 + pitch / self.c["PC_KK_rad"]) / self.c["PC_KI"]
         return torch.stack([self.plant.gear_ratio * state[:, 0], integral], -1)
 
     def act(
-        self, state: Float[Tensor, "batch 6"], memory: Float[Tensor, "batch 2"]
+        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 2"]
     ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 2"]]:
         speed, integral = memory.unbind(-1)
         pitch = torch.deg2rad(state[:, 5])

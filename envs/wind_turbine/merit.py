@@ -8,15 +8,17 @@ from rt_torchrl.plant import Plant
 
 def merit(
     plant: Plant,
-    states: Float[Tensor, "batch samples 6"],
+    states: Float[Tensor, "batch samples n_s"],
     applied: Float[Tensor, "batch n 2"],
     exogenous: Float[Tensor, "batch n 1"],
 ) -> dict[str, Float[Tensor, " batch"]]:
-    """Mean and deviation of the generator's power, its highest speed, and how far the blades pitch."""
+    """Mean and deviation of the generator's power, its speed above rated (RMS) and at most, travel of the blades."""
+    speed = plant.gear_ratio * states[..., 0]
     power = plant.generator_power(states[:, :-1], applied)
     return {
         "mean power [MW]": 1e-6 * power.mean(-1),
         "power deviation [MW]": 1e-6 * power.std(-1),
-        "top generator speed [rad/s]": plant.gear_ratio * states[..., 0].amax(-1),
+        "speed above rated [rad/s]": (speed - plant.rated_generator_speed).clamp(min=0.0).square().mean(-1).sqrt(),
+        "top generator speed [rad/s]": speed.amax(-1),
         "pitch travel [deg/s]": applied[..., 1].diff(dim=-1).abs().mean(-1) / plant.dt,
     }

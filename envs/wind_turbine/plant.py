@@ -144,11 +144,11 @@ class WindTurbine(Plant):
     def vector_field(
         self,
         t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 6"],
+        state: Float[Tensor, "*batch n_s"],
         action: Float[Tensor, "*batch 2"],
         exogenous: Float[Tensor, "*#batch 1"],
         closure: nn.Module,
-    ) -> Float[Tensor, "*batch 6"]:
+    ) -> Float[Tensor, "*batch n_s"]:
         r"""Rotor acceleration, paper eqs. (first_order_wt) and (tau_a), with the filters of eq. (etilde) as states.
 
         .. math::
@@ -197,14 +197,16 @@ class WindTurbine(Plant):
         return smoothstep((omega_g - start) / (2.0 * self.cut_in_band))
 
     def actuate(
-        self, state: Float[Tensor, "*batch 6"], command: Float[Tensor, "*batch 2"]
+        self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch 2"]:
         """Rate limits: torque and pitch move by at most their limit times dt from what was applied before."""
-        last = state[..., 4:]
+        last = state[..., 4:6]
         change = torch.maximum(torch.minimum(command - last, self.greatest_increment), -self.greatest_increment)
         return last + change
 
-    def latch(self, state: Float[Tensor, "*batch 6"], applied: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 6"]:
+    def latch(
+        self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch 2"]
+    ) -> Float[Tensor, "*batch n_s"]:
         """Remember the applied action for the rate limits of the next interval."""
         return torch.cat([state[..., :4], applied], -1)
 
@@ -223,20 +225,20 @@ class WindTurbine(Plant):
         """P̃ = min(P_N, K ω_g³) [W] (paper, eq. P_ref)."""
         return (self.optimal_gain * omega_g**3).clamp(max=self.rated_power)
 
-    def generator_power(self, state: Float[Tensor, "*batch 6"], applied: Float[Tensor, "*batch 2"]) -> Tensor:
+    def generator_power(self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch 2"]) -> Tensor:
         """Power at the generator shaft, τ_g ω_g [W]."""
         omega_g = self.gear_ratio * state[..., 0]
         return applied[..., 0] * self.cut_in(omega_g) * omega_g
 
     def observe(
-        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 6"], exogenous: Float[Tensor, "*#batch 1"]
+        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch n_s"], exogenous: Float[Tensor, "*#batch 1"]
     ) -> Float[Tensor, "*batch 2"]:
         return torch.stack([self.speed_error(state[..., 1], state[..., 2]), state[..., 3]], -1)
 
     def running_cost(
         self,
         t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 6"],
+        state: Float[Tensor, "*batch n_s"],
         applied: Float[Tensor, "*batch 2"],
         exogenous: Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch"]:
@@ -247,7 +249,7 @@ class WindTurbine(Plant):
         return 0.5 * (self.cost_weights[0] * e1**2 + self.cost_weights[1] * e_P**2)
 
     def discrepancy(
-        self, state: Float[Tensor, "*#batch 6"], measured: Float[Tensor, "*#batch 6"]
+        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
     ) -> Float[Tensor, "*batch"]:
         """½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
         return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
@@ -257,7 +259,7 @@ class WindTurbine(Plant):
 
     # Randomness
 
-    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 6"]:
+    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
         """Rotor between 70 % and 100 % of rated speed on the torque law K ω_g², blades at 0 deg, filters settled."""
         share = 0.7 + 0.3 * torch.rand(batch, generator=generator, dtype=torch.float64, device=generator.device)
         omega_r = share * self.rated_rotor_speed

@@ -29,8 +29,9 @@ def learning(entries: dict[str, list[Entry]]) -> Figure:
             if entry.curves and entry.curves[0]:
                 length = min(map(len, entry.curves))
                 curves = np.array([curve[:length] for curve in entry.curves])
-                episode, colour = np.arange(1, length + 1), ARMS[entry.name]
-                ax.plot(episode, curves.mean(0), color=colour, linewidth=1.8, label=shown(entry.name))
+                episode, colour = np.arange(1, length + 1), ARMS.get(entry.name)
+                (line,) = ax.plot(episode, curves.mean(0), color=colour, linewidth=1.8, label=shown(entry.name))
+                colour = line.get_color()
                 ax.fill_between(episode, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0.0)
             elif entry.name == "oracle":
                 ax.axhline(entry.mean, label="oracle", **REFERENCE_LINE)

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rt_torchrl.algorithm import Arm
 from rt_torchrl.study.training import Training
 
 RESAMPLES = 2000
@@ -75,19 +74,19 @@ def difference(first: Entry, second: Entry) -> tuple[float, float]:
     return spread(first.costs - second.costs)
 
 
-def arm_entry(arm: Arm, trainings: list[Training]) -> Entry:
-    """An arm from its trainings; it is judged by the policy that acts at the end."""
+def arm_entry(name: str, trainings: list[Training]) -> Entry:
+    """An arm, or an arm with another policy, from its trainings; it is judged by the policy that acts at the end."""
     found = [training.metrics() for training in trainings]
     summaries = [metrics["summary"] for metrics in found]
     acting = [summary["live"] for summary in summaries]
     merits = [summary["unseen"]["merit"][live] for summary, live in zip(summaries, acting, strict=True)]
-    trained = arm != "model_free"
+    twinned = trainings[0].arm != "model_free"
     return Entry(
-        name=arm,
+        name=name,
         costs=np.array([s["unseen"]["costs"][live] for s, live in zip(summaries, acting, strict=True)]),
         merit={name: float(np.mean([merit[name]["mean"] for merit in merits])) for name in merits[0]},
-        J_p_ratio=[summary["J_p_ratio"] for summary in summaries] if trained else [],
-        weight_error=weight_errors(summaries) if trained else [],
+        J_p_ratio=[summary["J_p_ratio"] for summary in summaries] if twinned else [],
+        weight_error=weight_errors(summaries) if twinned else [],
         curves=[[e["J_a_unseen"] for e in metrics["episodes"] if "J_a_unseen" in e] for metrics in found],
     )
 

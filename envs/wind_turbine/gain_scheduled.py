@@ -1,0 +1,94 @@
+r"""A turbine controller as wind engineers build it, whose gains are trained."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plant import Plant
+
+
+class GainScheduled(nn.Module):
+    r"""Torque by :math:`K\omega^2` below rated speed, at constant power above; pitch by a gain-scheduled PI law.
+
+    .. math::
+        \tau_g = (1 - s)\,K\omega_F^2 + s\,P_r/\omega_F, \qquad
+        s = \sigma\big((\omega_F - \omega_s + c\,\beta)/w_s\big), \\
+        \beta^+ = \beta + \Delta t\,\frac{K_P\,\dot\omega_F + K_I(\omega_F - \omega_{ref})}{1 + \beta/\beta_K}
+
+    The last line is the PI law by its increments: the pitch that was applied last is its integral, so that it winds up
+    no further than the blades turn. σ is the logistic function: it blends the regions where Jonkman's table switches.
+    Both commands are held to the ranges of the actions.
+
+    The weights are the logarithms of K, K_P, K_I and β_K over their values in ``NOMINAL``, those of Jonkman's
+    controller. The set-points are no weights: the reference power of the turbine's J_a, K ω_g³, is a fifth below what
+    the drivetrain gives at rated speed, and a set-point that follows J_a throws that power away. ω_ref lies 1.5 % above
+    rated speed, because a tighter speed than Jonkman's otherwise spills wind that his rotor stores.
+
+    Args:
+        plant: an :class:`InstrumentedTurbine`, for scales, ranges and the control interval.
+        detuning: the gains start from exp(U(−detuning, detuning)) times the nominal ones.
+        reference_speed: ω_ref [rad/s] of the pitch law.
+        switch_speed: ω_s [rad/s] at which the torque leaves region 2.
+        switch_width: w_s [rad/s] of that transition.
+        switch_pitch: c [rad/s per deg]; keeps region 3 while the blades are pitched.
+        generator: source of the detuning.
+
+    Raises:
+        ValueError: if the detuning is negative or the width of the transition is not positive.
+
+    Source: the regions and constants of Jonkman et al., NREL/TP-500-38060, section 7.
+    """
+
+    NOMINAL = {
+        "torque_gain": 2.332287,  # K [N m s²/rad²]
+        "proportional": math.degrees(0.01882681),  # K_P [deg s/rad]
+        "integral": math.degrees(0.008068634),  # K_I [deg/rad]
+        "schedule": math.degrees(0.1099965),  # β_K [deg]
+    }
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        detuning: float = math.log(2.0),
+        reference_speed: float = 124.8,
+        switch_speed: float = 120.0,
+        switch_width: float = 1.0,
+        switch_pitch: float = 1.0,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        if not detuning >= 0.0:
+            raise ValueError(f"detuning={detuning} of the gains must not be negative.")
+        if not switch_width > 0.0:
+            raise ValueError(f"switch_width={switch_width} rad/s must be positive; Jonkman's table takes about 1.")
+        share = torch.rand(len(self.NOMINAL), generator=generator, dtype=torch.float64, device=generator.device)
+        self.weights = nn.Parameter(detuning * (2.0 * share - 1.0))
+        like = {"dtype": torch.float64}
+        self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), **like))
+        for bound in ("low", "high"):
+            self.register_buffer(bound, torch.tensor([getattr(action, bound) for action in plant.actions], **like))
+        self.reference_speed, self.switch_speed = reference_speed, switch_speed
+        self.switch_width, self.switch_pitch = switch_width, switch_pitch
+        self.dt, self.fast_filter = plant.dt, plant.fast_filter
+        self.rated_speed, self.speed_scale = plant.rated_generator_speed, plant.speed_error_scale
+        self.power = plant.actions[0].high * plant.rated_generator_speed
+
+    def gains(self) -> dict[str, Tensor]:
+        """The gains by name, in the units of ``NOMINAL``."""
+        return dict(zip(self.NOMINAL, (self.nominal * torch.exp(self.weights)).unbind(), strict=True))
+
+    def forward(self, observation: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 2"]:
+        _, _, above, rate, pitch = observation.unbind(-1)
+        omega, beta = self.rated_speed + self.speed_scale * above, pitch * self.high[1]
+        g = self.gains()
+        share = torch.sigmoid((omega - self.switch_speed + self.switch_pitch * beta) / self.switch_width)
+        # Near standstill constant power has no torque; there is no region 3 there.
+        region_3 = self.power / torch.where(omega > 0.5 * self.rated_speed, omega, 0.5 * self.rated_speed)
+        torque = (1.0 - share) * g["torque_gain"] * omega**2 + share * region_3
+        push = g["proportional"] * self.fast_filter * self.speed_scale * rate
+        push = push + g["integral"] * (omega - self.reference_speed)
+        command = beta + self.dt * push / (1.0 + beta / g["schedule"])
+        return torch.stack([torque, command], -1).clamp(self.low, self.high)

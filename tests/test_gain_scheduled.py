@@ -1,0 +1,112 @@
+"""The gain-scheduled turbine policy against its formula and against Jonkman's controller; the plant it observes."""
+
+import pytest
+import torch
+
+from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
+from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.trajectory import Rollout, control_cost
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def tensor(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def nominal(plant, **options):
+    return GainScheduled(plant, detuning=0.0, generator=generator(), **options)
+
+
+def observed(plant, omega, beta, rate=0.0):
+    """Observation at a fast-filtered speed [rad/s], a pitch [deg] and a speed above the filtered one [rad/s]."""
+    state = tensor(0.0, 0.0, 11.0, 0.0, 0.0, beta, omega)
+    state[0] = (omega + rate) / plant.gear_ratio
+    return plant.observe(torch.zeros(()).double(), state, tensor(11.0))
+
+
+def test_torque_is_the_square_law_far_below_and_constant_power_far_above():
+    plant = InstrumentedTurbine()
+    policy = nominal(plant)
+    # The logistic blend leaves e^-20 of the other region.
+    below, above = (policy(observed(plant, omega, 0.0))[0].item() for omega in (100.0, 140.0))
+    assert below == pytest.approx(2.332287 * 100.0**2, rel=1e-6)
+    assert above == pytest.approx(43_093.55 * 122.9096 / 140.0, rel=1e-6)
+    # A pitched blade keeps region 3: at 20 deg the switch lies 20 rad/s lower.
+    assert policy(observed(plant, 115.0, 20.0))[0].item() == pytest.approx(43_093.55, rel=1e-6)
+
+
+@pytest.mark.parametrize(("omega", "rate", "beta"), [(126.0, 0.0, 5.0), (124.8, 0.7, 12.0), (123.0, -0.4, 8.0)])
+def test_pitch_moves_by_the_increment_of_the_scheduled_law(omega, rate, beta):
+    plant = InstrumentedTurbine()
+    push = 1.0787 * 1.570796 * rate + 0.462299 * (omega - 124.8)  # K_P and K_I in degrees
+    expected = beta + 0.5 * push / (1.0 + beta / 6.302335)
+    # The constants above have seven digits.
+    assert nominal(plant)(observed(plant, omega, beta, rate))[1].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_commands_stay_in_their_ranges_and_gains_start_detuned():
+    plant = InstrumentedTurbine()
+    policy = plant.make_policy(generator(3))
+    seen = torch.stack([observed(plant, w, b, r) for w in (0.0, 90.0, 200.0) for b in (0.0, 30.0) for r in (-9.0, 9.0)])
+    commands = policy(seen)
+    for column, action in zip(commands.unbind(-1), plant.actions, strict=True):
+        assert column.min() >= action.low and column.max() <= action.high and column.isfinite().all()
+    factors = tensor(*[policy.gains()[name].item() / value for name, value in policy.NOMINAL.items()])
+    assert factors.log().abs().max() <= torch.log(tensor(2.0)) and factors.log().abs().min() > 0.0
+
+
+def test_instruments_change_nothing_of_the_turbine():
+    rich, plain = InstrumentedTurbine(horizon=50.0), WindTurbine(horizon=50.0)
+    state, wind = rich.draw_initial_state(3, generator()), rich.draw_exogenous(3, generator())
+    low, high = (tensor(*[getattr(a, bound) for a in plain.actions]) for bound in ("low", "high"))
+    command = low + (high - low) * torch.rand(3, rich.n_steps, 2, generator=generator(1), dtype=torch.float64)
+    found = Rollout(rich, rich.closure)(state, wind, command).states
+    expected = Rollout(plain, plain.closure)(state[:, :6], wind, command).states
+    # The same operations on the same numbers.
+    torch.testing.assert_close(found[..., :6], expected, rtol=1e-13, atol=1e-13)
+    # An exact low-pass of a speed that is about linear over an interval. Random commands bend it: by the rotor's time
+    # constant of 16 s, some Δt²/8·(1 rad/s²) = 0.03 rad/s within it, which the filter hands on.
+    speed, filtered = rich.gear_ratio * found[..., 0], found[..., 6]
+    decay = torch.exp(tensor(-0.5 * rich.fast_filter))
+    ramp = (1.0 - decay) / (0.5 * rich.fast_filter)
+    exact = decay * filtered[:, :-1] + (ramp - decay) * speed[:, :-1] + (1.0 - ramp) * speed[:, 1:]
+    torch.testing.assert_close(filtered[:, 1:], exact, rtol=0.0, atol=0.1)
+
+
+def test_with_jonkmans_constants_it_flies_as_his_controller():
+    plant = InstrumentedTurbine()
+    state, wind = plant.draw_initial_state(4, generator(5)), plant.draw_exogenous(4, generator(5))
+    flown = Rollout(plant, plant.closure, nominal(plant, reference_speed=122.9096))(state, wind)
+    power, expected = (
+        plant.merit(f.states, f.actions, wind)["mean power [MW]"]
+        for f in (flown, JonkmanController(plant).fly(state, wind))
+    )
+    # The blend and the incremental integral differ from his table and his integrator.
+    torch.testing.assert_close(power, expected, rtol=0.015, atol=0.0)
+
+
+def test_the_exact_gradient_of_the_gains_is_that_of_finite_differences():
+    plant = InstrumentedTurbine(horizon=60.0)
+    state, wind = plant.draw_initial_state(2, generator(2)), plant.draw_exogenous(2, generator(2)) + 2.0
+    policy = plant.make_policy(generator(4))
+    rollout = Rollout(plant, plant.closure, policy)
+
+    def cost():
+        return control_cost(plant, rollout(state, wind), wind).mean()
+
+    (gradient,) = torch.autograd.grad(cost(), policy.weights)
+    for k in range(len(gradient)):
+        values = []
+        for step in (1e-5, -1e-5):
+            with torch.no_grad():
+                policy.weights[k] += step
+                values.append(cost().item())
+                policy.weights[k] -= step
+        # Central differences of a cost of order 0.1: rounding 1e-11, truncation below it but for kinks of the limits.
+        assert gradient[k].item() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-4, abs=1e-8)
+    assert gradient.abs().min() > 0.0
