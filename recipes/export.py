@@ -39,6 +39,10 @@ class Config:
         unknown = [name for name in self.formats if name not in WRITERS]
         if unknown or not self.formats:
             raise ValueError(f"formats={self.formats} must be some of {', '.join(WRITERS)}.")
+        if self.name is not None and not (self.name.isascii() and self.name.isidentifier()):
+            raise ValueError(
+                f"name={self.name!r} must be a name in C, such as blade_controller; give --output a folder."
+            )
 
 
 def main(config: Config) -> None:
@@ -49,7 +53,10 @@ def main(config: Config) -> None:
     run = FinishedRun.load(config.run, config_class_of(recipe))
     policy, name = run.policy(config.role), config.name or f"{plant}_{config.role}"
     output = config.output or config.run / "exported"
-    output.mkdir(parents=True, exist_ok=True)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"output={output} cannot be written ({error}); choose another.") from error
     for kind in config.formats:
         path = output / f"{name}.{kind}"
         named = {"function": name} if kind == "c" else {}

@@ -7,6 +7,7 @@ import pickle
 import sys
 import types
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,8 @@ def config_class_of(recipe: Path) -> type[RunConfig]:
 
 
 def rebuilt(kind: Any, value: Any) -> Any:
-    """A value of a type from what JSON holds of it: dataclasses from objects, tuples from lists, paths from strings.
+    """A value of a type from what JSON holds of it: dataclasses from objects, tuples from lists, paths from
+    strings.
 
     An option that is new since then has its default.
 
@@ -151,7 +153,8 @@ def rebuilt(kind: Any, value: Any) -> Any:
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
         (kind,) = (argument for argument in arguments if argument is not type(None))
         return None if value is None else rebuilt(kind, value)
-    if typing.get_origin(kind) is tuple:
-        kinds = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+    if typing.get_origin(kind) in (tuple, Sequence):
+        alike = typing.get_origin(kind) is Sequence or arguments[-1] is Ellipsis
+        kinds = arguments[:1] * len(value) if alike else arguments
         return tuple(rebuilt(each, entry) for each, entry in zip(kinds, value, strict=True))
     return Path(value) if kind is Path else value

@@ -19,11 +19,11 @@ SEED = 20_250_131
 
 
 def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED) -> Float[Tensor, "{count} n_o"]:
-    """Random observations, the first of which is the one nearest to zero within the ranges.
+    """Random observations, the first of which is as near to zero as the ranges let it.
 
-    Uniform over a signal's range, and over twice the distance from a single bound. A signal without bounds, scaled to
-    order one as observations are, is normal with a deviation drawn from 0.1 … 30: the middle of a policy and its
-    saturated ends.
+    Uniform over a signal's range. Without one or both of its bounds a signal, scaled to order one as observations are,
+    is normal (its absolute value added to the bound) with a deviation drawn from 0.1 ... 30: that covers the middle of
+    a policy and its saturated ends.
     """
     generator, columns = torch.Generator().manual_seed(seed), []
     for signal in signals:
@@ -45,11 +45,11 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
     """A copy on the CPU, in evaluation mode and without gradients, that is proved to be a policy of the plant.
 
     Raises:
-        ValueError: if it does not map observations of the plant to its actions, in double precision.
+        ValueError: if it does not map observations of the plant to its actions, in double precision, or changes itself.
     """
     policy = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
     name, n_o, n_a = type(policy).__name__, len(plant.observations), len(plant.actions)
-    observations = sample_observations(plant.observations, 3)
+    observations, before = sample_observations(plant.observations, 3), copy.deepcopy(dict(policy.named_buffers()))
     try:
         actions = policy(observations)
     except Exception as error:  # of whatever the user's module is made of
@@ -61,6 +61,12 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
         raise ValueError(
             f"policy {name} returns {found} for 3 observations of plant {plant.name!r}; it must return torch.float64 "
             f"(3, {n_a}). A module in single precision becomes double by .double()."
+        )
+    changed = [buffer for buffer, value in policy.named_buffers() if not value.equal(before[buffer])]
+    if changed:
+        raise ValueError(
+            f"policy {name} changes its buffers {', '.join(changed)} when it is called; only a function of the "
+            "observation alone can be exported."
         )
     return policy
 

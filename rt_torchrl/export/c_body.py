@@ -28,6 +28,11 @@ class Elements:
         return Elements(self.array, places)
 
 
+def counted(shape: Sequence[int]) -> Int[Tensor, "*shape"]:
+    """The places of a new array, row by row."""
+    return torch.arange(torch.Size(shape).numel()).view(tuple(shape))
+
+
 class CBody:
     """Collects constants and statements; every result is a new array."""
 
@@ -49,10 +54,10 @@ class CBody:
         for known, elements in self._known:
             if known is value:
                 return elements
-        name = self._new(label)
+        name = self._new(f"c_{label}")
         numbers = ", ".join(literal(number) for number in value.double().flatten().tolist())
         self._declare(f"static const double {name}[{value.numel()}] = {{", numbers)
-        self._known.append((value, Elements(name, _counted(value.shape))))
+        self._known.append((value, Elements(name, counted(value.shape))))
         return self._known[-1][1]
 
     def read(self, elements: Elements, shape: Sequence[int]) -> str:
@@ -72,7 +77,7 @@ class CBody:
     @staticmethod
     def later(shape: Sequence[int]) -> Elements:
         """Stands for what the expression of another result will hold."""
-        return Elements("", _counted(shape))
+        return Elements("", counted(shape))
 
     def sum(
         self, factors: Sequence[Elements], shape: Sequence[int], *, start: str = "0.0", scale: str = "1.0"
@@ -117,7 +122,7 @@ class CBody:
         self.statements += [head, *(f"    {line}" for line in lines), "}"]
 
     def _local(self, shape: Sequence[int]) -> Elements:
-        places, name = _counted(shape), self._new(f"v_{self._name}")
+        places, name = counted(shape), self._new(f"v_{self._name}")
         self.statements.append(f"double {name}[{places.numel()}];")
         return Elements(name, places)
 
@@ -142,7 +147,7 @@ class CBody:
         self.constants.append("\n".join([head, *(f"    {line}" for line in wrapped), "};"]))
 
     def _new(self, label: str) -> str:
-        """A name of its own, such as linear_weight of linear.weight."""
+        """A name of its own; the letter in front keeps it apart from the words of C and math.h."""
         stem = re.sub(r"[^0-9A-Za-z_]", "_", label)[:LONGEST_NAME]
         name, number = stem, 1
         while name in self._taken:
@@ -150,7 +155,3 @@ class CBody:
             name = f"{stem}_{number}"
         self._taken.add(name)
         return name
-
-
-def _counted(shape: Sequence[int]) -> Int[Tensor, "*shape"]:
-    return torch.arange(torch.Size(shape).numel()).view(tuple(shape))

@@ -66,12 +66,15 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
 
 def _source(written: CFunction, header: str, function: str) -> str:
     body = written.body
+    # A compiler warns of an argument that a policy does not read.
+    unread = [] if any("observation[" in line for line in body.statements) else ["(void)observation;"]
+    lines = [*unread, *body.statements]
     parts = [
         f"/* See {header} for what goes in and out. Written by rt_torchrl; do not edit. */",
         f'#include "{header}"\n\n#include <math.h>',
         *body.constants,
         f"void {function}(const double *observation, double *action)\n{{\n    "
-        + "\n    ".join(line.replace("\n", "\n    ") for line in body.statements)
+        + "\n    ".join(line.replace("\n", "\n    ") for line in lines)
         + "\n}\n",
     ]
     return "\n\n".join(parts)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.export import ExportedProgram, default_decompositions
 from torch.fx import Node
 
-from rt_torchrl.export.c_body import CBody, Elements
+from rt_torchrl.export.c_body import CBody, Elements, counted
 from rt_torchrl.export.c_operators import (
     CHECKS,
     DECOMPOSED,
@@ -49,21 +49,15 @@ class CFunction:
         targets = {spec.arg.name: spec.target for spec in program.graph_signature.input_specs}
         for node in program.graph.nodes:
             if node.op == "placeholder":
-                self._labels[node] = targets[node.name] or "observation"
-                self._values[node] = self._given(node, held.get(targets[node.name]))
+                target, shape = targets[node.name], node.meta["val"].shape
+                self._labels[node] = target or "observation"
+                self._values[node] = held[target].detach() if target else Elements("observation", counted(shape))
             elif node.op == "output":
                 shape = node.args[0][0].meta["val"].shape
                 self.body.finish(self._operand(node.args[0][0], shape), shape.numel())
             else:
                 self._labels[node] = "_".join([*map(self._labels.get, node.all_input_nodes), _name(node)])
                 self._values[node] = self._computed(node)
-
-    @staticmethod
-    def _given(node: Node, held: Tensor | None) -> Elements | Tensor:
-        if held is not None:
-            return held.detach()
-        shape = node.meta["val"].shape
-        return Elements("observation", torch.arange(shape.numel()).view(shape))
 
     def _computed(self, node: Node) -> Any:
         args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), self._values.get)
@@ -118,7 +112,7 @@ class CFunction:
             return literal(value.flatten()[0].item())
         return self.body.read(self._as_elements(argument), shape)
 
-    def _elementwise(self, node: Node, name: str) -> Elements | None:
+    def _elementwise(self, node: Node, name: str) -> Elements:
         shape = node.meta["val"].shape
         keywords = {key: self._operand(argument, shape) for key, argument in node.kwargs.items()}
         expression = ELEMENTWISE[name](*(self._operand(argument, shape) for argument in node.args), **keywords)

@@ -12,7 +12,7 @@ import torch
 aten = torch.ops.aten
 
 
-def literal(value: float) -> str:
+def literal(value: float | int) -> str:
     """A number in C, read back to the bit."""
     value = float(value)
     if math.isnan(value):

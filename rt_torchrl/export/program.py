@@ -25,13 +25,14 @@ def trace(policy: nn.Module, plant: Plant, *, batch: int | None = None) -> Expor
         batch: number of observations; None for any.
 
     Raises:
-        ValueError: if torch.export cannot trace it, it draws random numbers or it changes its own buffers.
+        ValueError: if torch.export cannot trace it, or it draws random numbers.
     """
     name, observations = type(policy).__name__, sample_observations(plant.observations, batch or 3)
     shapes = None if batch else ({0: Dim("batch")},)
     try:
         program = torch.export.export(policy, (observations,), dynamic_shapes=shapes)
-        functional = program.run_decompositions({})
+        # Without any operator taken apart; it takes out what does nothing in evaluation, such as dropout.
+        program = program.run_decompositions({})
     except Exception as error:  # torch.export has many, of several modules
         raise ValueError(
             f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
@@ -40,12 +41,6 @@ def trace(policy: nn.Module, plant: Plant, *, batch: int | None = None) -> Expor
     for node in program.graph.nodes:
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
             raise ValueError(f"{layer_of(node, name)} draws random numbers ({node.target}); export its mean instead.")
-    changed = functional.graph_signature.buffers_to_mutate
-    if changed:
-        raise ValueError(
-            f"policy {name} changes its buffers {', '.join(sorted(changed.values()))} when it is called; only a "
-            "function of the observation alone can be exported."
-        )
     return program
 
 
