@@ -76,6 +76,10 @@ def test_onnx_models_take_any_batch(plant, policy, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["policy.onnx"]  # the weights are in it
     model = onnx.load(tmp_path / "policy.onnx")
     onnx.checker.check_model(model, full_check=True)
+    assert [d.dim_param or d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] == [
+        "batch",
+        len(plant.observations),
+    ]
     described = {entry.key: entry.value for entry in model.metadata_props}["interface.json"]
     assert [signal["name"] for signal in json.loads(described)["action"]] == [s.name for s in plant.actions]
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
@@ -89,6 +93,21 @@ def test_onnx_without_its_packages_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(onnx_model, "NEEDED", ("onnx_of_no_one",))
     with pytest.raises(ValueError, match=r"package onnx_of_no_one.*pip install 'rt_torchrl\[onnx\]'"):
         export_onnx(LinearGain([[0.1, 0.2]]), tmp_path / "policy.onnx", LinearQuadratic())
+
+
+def test_what_onnxruntime_cannot_run_is_refused(tmp_path, monkeypatch):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+
+    def lacking(*args, **kwargs):  # as onnxruntime 1.31 of the double-precision Elu
+        raise NotImplementedError("Could not find an implementation for Elu(6)")
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", lacking)
+    with pytest.raises(
+        ValueError, match=r"onnxruntime cannot run policy LinearGain .*Elu\(6\)\. Use the \.pt2 program or C"
+    ):
+        export_onnx(LinearGain([[0.1, 0.2]]), tmp_path / "policy.onnx", LinearQuadratic())
+    assert not list(tmp_path.iterdir())
 
 
 def test_exporting_leaves_the_policy_as_it_was(tmp_path):

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from linear_quadratic import LinearQuadratic
+from test_run import SMALL
 
 from rt_torchrl.finished_run import FinishedRun, config_class_of, rebuilt
 from rt_torchrl.run_config import RunConfig
+from rt_torchrl.runner import Run
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 PLANTS = ("cryogenic_tank", "flapping_wing", "wind_turbine")
@@ -46,6 +49,24 @@ def test_a_run_is_rebuilt(name, tmp_path):
         found = run.closure if role == "closure" else run.policy(role)
         assert found.state_dict().keys() == part.state_dict().keys()
         assert all(torch.equal(found.state_dict()[key], value) for key, value in part.state_dict().items())
+
+
+class OracleConfig(RunConfig):
+    def plant(self):
+        return LinearQuadratic(horizon=2.0)
+
+
+def test_what_a_training_leaves_is_read_back(tmp_path):
+    config = OracleConfig(
+        episodes=1, log_dir=tmp_path, compiled=False, unseen=2, figures_every=0, twinning=SMALL, noise=0.01
+    )
+    training = Run(config, config.plant())
+    training.train()
+    found = FinishedRun.load(tmp_path, OracleConfig)
+    assert found.config == config
+    for role, policy in training.algorithm.policies.items():
+        assert torch.equal(found.policy(role).gain, policy.gain)
+    assert torch.equal(found.closure.matrix, training.algorithm.twin.closure.matrix)
 
 
 def test_the_default_options_of_every_recipe_survive_json():

@@ -1,7 +1,6 @@
 """The policy as a C99 file and its header, that need nothing but the C library's mathematics."""
 
 import ctypes
-import importlib.metadata
 import math
 import re
 import shutil
@@ -84,8 +83,7 @@ def _header(policy: nn.Module, plant: Plant, function: str) -> str:
     guard = f"{function.upper()}_H"
     kind = type(plant)
     lines = [
-        f"{function}: a policy of the plant {plant.name} ({type(policy).__name__}),",
-        f"exported by rt_torchrl {importlib.metadata.version('rt_torchrl')}.",
+        f"{function}: a policy of the plant {plant.name} ({type(policy).__name__}), written by rt_torchrl.",
         "",
         f"Call it once every {plant.dt:g} s, the plant's control interval, and hold the action in between.",
         "It has no memory, allocates nothing, may be called from several threads, and needs only math.h.",

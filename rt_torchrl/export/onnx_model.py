@@ -19,9 +19,10 @@ NEEDED = ("onnx", "onnxscript", "onnxruntime")
 
 
 def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
-    """Write a policy as an ONNX model: input ``observation``, output ``action``, any batch size, double precision.
+    """Write a policy as an ONNX model, input ``observation`` and output ``action``.
 
-    The model's metadata hold ``interface.json``, names, units and ranges. The weights are in the one file.
+    They have the shapes (batch, n_o) and (batch, n_a), with any batch, in double precision. The model's metadata hold
+    ``interface.json``, names, units and ranges. The weights are in the one file.
 
     Args:
         policy: any ``policy(observation) -> action`` in double precision.
@@ -45,7 +46,9 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
             shapes = {"dynamic_shapes": ({0: "batch"},)}
             model = torch.onnx.export(program, (), dynamo=True, verbose=False, **names, **shapes).model_proto
     except Exception as error:  # of the exporter, of several kinds
-        raise ValueError(f"policy {name} has no ONNX form: {error} Use the .pt2 program or C instead.") from error
+        raise ValueError(
+            f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
+        ) from error
     entry = model.metadata_props.add()
     entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
     error = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
@@ -75,7 +78,8 @@ def _runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
         session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's are of no common class
         raise ValueError(
-            f"onnxruntime cannot run policy {policy} in double precision: {error} Use the .pt2 program or C instead."
+            f"onnxruntime cannot run policy {policy} in double precision: {str(error).strip()}. Use the .pt2 program "
+            "or C instead."
         ) from error
 
     def run(observations: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 import io
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from torch.export import Dim, ExportedProgram
 
 from rt_torchrl.export.agreement import detached, require_agreement, sample_observations
 from rt_torchrl.plant import Plant
+from rt_torchrl.signal import Signal
 
 INTERFACE = "interface.json"
 """Name of the extra file of a program that describes its observations and actions."""
@@ -55,10 +58,11 @@ def layer_of(node: torch.fx.Node, policy: str) -> str:
 def interface(plant: Plant) -> dict[str, Any]:
     """What a user of an exported policy must know of it, as JSON can hold it; an absent bound is None."""
 
-    def described(signals):
-        bounds = ("low", "high")
-        finite = [{b: v if abs(v := getattr(s, b)) < float("inf") else None for b in bounds} for s in signals]
-        return [{"name": s.name, "unit": s.unit} | range_ for s, range_ in zip(signals, finite, strict=True)]
+    def described(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+        return [{"name": s.name, "unit": s.unit, "low": finite(s.low), "high": finite(s.high)} for s in signals]
+
+    def finite(bound: float) -> float | None:
+        return bound if math.isfinite(bound) else None
 
     return {
         "plant": plant.name,
@@ -69,7 +73,7 @@ def interface(plant: Plant) -> dict[str, Any]:
 
 
 def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
-    """Write a policy as a program of torch.export, with any batch size, double precision.
+    """Write a policy as a program of torch.export, of (batch, n_o) -> (batch, n_a) in double precision.
 
     It is used without this library, and its extra file ``interface.json`` names and bounds what goes in and out::
 
