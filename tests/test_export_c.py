@@ -57,7 +57,8 @@ def policies_of_the_plants():
         yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
         mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(8, 5), generator=generator())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
-    yield pytest.param(plant, plant.make_policy(generator(), bias=True), id="wind_turbine-bias")  # it is the last
+    turbine = plants()["wind_turbine"]()
+    yield pytest.param(turbine, turbine.make_policy(generator(), bias=True), id="wind_turbine-bias")
 
 
 @needs_compiler
@@ -268,9 +269,8 @@ def test_a_refusal_names_the_layer(tmp_path):
 
 def test_a_machine_without_compiler_says_that_nothing_was_checked(tmp_path, monkeypatch):
     monkeypatch.setattr(c_file, "COMPILERS", ("no_such_compiler",))
-    plant = LinearQuadratic()
     with pytest.warns(UserWarning, match="not checked against the policy: there is no C compiler"):
-        assert export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", plant) is None
+        assert export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", LinearQuadratic()) is None
     assert (tmp_path / "policy.c").exists() and (tmp_path / "policy.h").exists()
 
 
