@@ -1,0 +1,69 @@
+"""Takes a trained policy out of a run folder: as C99, as an ONNX model, as a PyTorch program."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from rt_torchrl.export import export_c, export_onnx, export_program
+from rt_torchrl.export.onnx_model import require_packages
+from rt_torchrl.finished_run import FinishedRun, config_class_of, read_settings
+from rt_torchrl.runner import main_of
+
+WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Export a trained policy; every file is compared with the policy on random observations before it is written.
+
+    Args:
+        run: run folder of any recipe.
+        role: model_based or model_free.
+        formats: some of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
+        output: folder for the files; by default RUN/exported.
+        name: of the files and the C function; by default PLANT_ROLE.
+        recipe: the recipe that made the run; by default the one beside this file that is named as the plant.
+    """
+
+    run: Annotated[Path, Positional]
+    role: str = "model_based"
+    formats: tuple[str, ...] = ("c", "pt2")
+    output: Path | None = None
+    name: str | None = None
+    recipe: Path | None = None
+
+    def __post_init__(self):
+        unknown = [name for name in self.formats if name not in WRITERS]
+        if unknown or not self.formats:
+            raise ValueError(f"formats={self.formats} must be some of {', '.join(WRITERS)}.")
+        if self.name is not None and not (self.name.isascii() and self.name.isidentifier()):
+            raise ValueError(
+                f"name={self.name!r} must be a name in C, such as blade_controller; give --output a folder."
+            )
+
+
+def main(config: Config) -> None:
+    if "onnx" in config.formats:
+        require_packages()
+    plant = read_settings(config.run)["plant"]
+    recipe = config.recipe or Path(__file__).with_name(f"{plant}.py")
+    run = FinishedRun.load(config.run, config_class_of(recipe))
+    policy, name = run.policy(config.role), config.name or f"{plant}_{config.role}"
+    output = config.output or config.run / "exported"
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"output={output} cannot be written ({error}); choose another.") from error
+    for kind in config.formats:
+        path = output / f"{name}.{kind}"
+        named = {"function": name} if kind == "c" else {}
+        error = WRITERS[kind](policy, path, run.plant, **named)
+        found = "not checked" if error is None else f"within {error:.1e} of the actions' ranges"
+        print(f"{path}: {found}")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

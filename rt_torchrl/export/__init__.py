@@ -1,0 +1,10 @@
+"""Takes a trained policy away from the library: as a PyTorch program, an ONNX model or a C99 file.
+
+Every export is compared with the policy on random observations before a file is written, see :mod:`.agreement`.
+"""
+
+from rt_torchrl.export.c_file import export_c
+from rt_torchrl.export.onnx_model import export_onnx
+from rt_torchrl.export.program import export_program
+
+__all__ = ["export_c", "export_onnx", "export_program"]

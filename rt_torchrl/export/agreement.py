@@ -1,0 +1,109 @@
+"""Whether what was exported acts as the policy does."""
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plant import Plant
+from rt_torchrl.signal import Signal
+
+TOLERANCE = 1e-6
+"""Greatest difference allowed, as a share of the action's range; what is computed in double precision needs 1e-12."""
+OBSERVATIONS = 1000
+SEED = 20_250_131
+"""Of the observations: the same for every export, and of no training."""
+
+
+def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED) -> Float[Tensor, "{count} n_o"]:
+    """Random observations, the first of which is as near to zero as the ranges let it.
+
+    Uniform over a signal's range. Without one or both of its bounds a signal, scaled to order one as observations are,
+    is normal (its absolute value added to the bound) with a deviation drawn from 0.1 ... 30: that covers the middle of
+    a policy and its saturated ends.
+    """
+    generator, columns = torch.Generator().manual_seed(seed), []
+    for signal in signals:
+        like = {"generator": generator, "dtype": torch.float64}
+        uniform, normal, exponent = torch.rand(count, **like), torch.randn(count, **like), torch.rand(count, **like)
+        unbounded = normal * 0.1 * 300.0**exponent
+        if math.isfinite(signal.low) and math.isfinite(signal.high):
+            column = signal.low + (signal.high - signal.low) * uniform
+        elif math.isfinite(signal.low):
+            column = signal.low + unbounded.abs()
+        else:
+            column = signal.high - unbounded.abs() if math.isfinite(signal.high) else unbounded
+        column[0] = min(max(0.0, signal.low), signal.high)
+        columns.append(column)
+    return torch.stack(columns, -1)
+
+
+def detached(policy: nn.Module, plant: Plant) -> nn.Module:
+    """A copy on the CPU, in evaluation mode and without gradients, that is proved to be a policy of the plant.
+
+    Raises:
+        ValueError: if it does not map observations of the plant to its actions, in double precision, or changes itself.
+    """
+    policy = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
+    name, n_o, n_a = type(policy).__name__, len(plant.observations), len(plant.actions)
+    observations, before = sample_observations(plant.observations, 3), copy.deepcopy(dict(policy.named_buffers()))
+    try:
+        actions = policy(observations)
+    except Exception as error:  # of whatever the user's module is made of
+        raise ValueError(
+            f"policy {name} cannot take float64 observations of shape (3, {n_o}) of plant {plant.name!r}: {error}"
+        ) from error
+    if not isinstance(actions, Tensor) or actions.shape != (3, n_a) or actions.dtype != torch.float64:
+        found = f"{actions.dtype} {tuple(actions.shape)}" if isinstance(actions, Tensor) else type(actions).__name__
+        raise ValueError(
+            f"policy {name} returns {found} for 3 observations of plant {plant.name!r}; it must return torch.float64 "
+            f"(3, {n_a}). A module in single precision becomes double by .double()."
+        )
+    changed = [buffer for buffer, value in policy.named_buffers() if not value.equal(before[buffer])]
+    if changed:
+        raise ValueError(
+            f"policy {name} changes its buffers {', '.join(changed)} when it is called; only a function of the "
+            "observation alone can be exported."
+        )
+    return policy
+
+
+def require_agreement(
+    policy: nn.Module, exported: Callable[[Float[Tensor, "n n_o"]], Tensor], plant: Plant, *, what: str
+) -> float:
+    """Compare on random observations, one, two and many at a time.
+
+    Args:
+        policy: the original.
+        exported: what a user of the exported file would compute.
+        plant: whose observations and ranges of actions.
+        what: the exported thing, for the message.
+
+    Returns:
+        Greatest difference of an action as a share of its range, or of its greatest size where it has none.
+
+    Raises:
+        ValueError: if it exceeds ``TOLERANCE``, or the policy's actions are not finite.
+    """
+    observations = sample_observations(plant.observations, OBSERVATIONS)
+    with torch.no_grad():
+        expected = policy(observations)
+        found = torch.cat([exported(part) for part in observations.split([1, 2, OBSERVATIONS - 3])])
+    if not expected.isfinite().all():
+        worst = observations[(~expected.isfinite()).any(-1)][0].tolist()
+        raise ValueError(f"policy {type(policy).__name__} gives actions that are not finite at observation {worst}.")
+    ranges = torch.tensor([action.high - action.low for action in plant.actions], dtype=torch.float64)
+    size = torch.where(ranges.isfinite(), ranges, expected.abs().amax(0).clamp(min=torch.finfo(torch.float64).tiny))
+    errors = ((found - expected).abs() / size).nan_to_num(nan=math.inf)
+    if errors.max() > TOLERANCE:
+        row, column = divmod(int(errors.argmax()), len(plant.actions))
+        raise ValueError(
+            f"{what} of policy {type(policy).__name__} differs from it by {errors.max().item():.2g} of the range of "
+            f"{plant.actions[column].name!r} at observation {observations[row].tolist()}; at most {TOLERANCE:g} is "
+            "allowed, and nothing was written. A policy must be a function of the observation alone: no random number, "
+            "no memory, no use of the batch as a whole."
+        )
+    return errors.max().item()

@@ -1,0 +1,102 @@
+"""The policy as an ONNX model, for the run-time systems of other languages and machines."""
+
+import contextlib
+import importlib
+import json
+import logging
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from rt_torchrl.export.agreement import detached, require_agreement
+from rt_torchrl.export.program import INTERFACE, interface, trace
+from rt_torchrl.plant import Plant
+
+NEEDED = ("onnx", "onnxscript", "onnxruntime")
+
+
+def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
+    """Write a policy as an ONNX model, input ``observation`` and output ``action``.
+
+    They have the shapes (batch, n_o) and (batch, n_a), with any batch, in double precision. The model's metadata hold
+    ``interface.json``, names, units and ranges. The weights are in the one file.
+
+    Args:
+        policy: any ``policy(observation) -> action`` in double precision.
+        path: file to write, such as ``policy.onnx``.
+        plant: whose observations and actions these are.
+
+    Returns:
+        Greatest difference from the policy as onnxruntime computes it, see :func:`require_agreement`.
+
+    Raises:
+        ValueError: if the packages of the extra ``onnx`` are missing, it is no policy of the plant, has no ONNX form,
+            onnxruntime cannot run it, or the model does not agree with it.
+    """
+    require_packages()
+    policy = detached(policy, plant)
+    program = trace(policy, plant)
+    name = type(policy).__name__
+    try:
+        with _quiet():
+            names = {"input_names": ["observation"], "output_names": ["action"]}
+            shapes = {"dynamic_shapes": ({0: "batch"},)}
+            model = torch.onnx.export(program, (), dynamo=True, verbose=False, **names, **shapes).model_proto
+    except Exception as error:  # of the exporter, of several kinds
+        raise ValueError(
+            f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
+        ) from error
+    entry = model.metadata_props.add()
+    entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
+    error = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
+    Path(path).write_bytes(model.SerializeToString())
+    return error
+
+
+def require_packages() -> None:
+    """The packages of the extra ``onnx``.
+
+    Raises:
+        ValueError: if one is not installed.
+    """
+    for package in NEEDED:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ValueError(
+                f"ONNX needs the package {package}, which is not installed; pip install 'rt_torchrl[onnx]'."
+            ) from error
+
+
+def _runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
+    import onnxruntime
+
+    try:
+        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's are of no common class
+        raise ValueError(
+            f"onnxruntime cannot run policy {policy} in double precision: {str(error).strip()}. Use the .pt2 program "
+            "or C instead."
+        ) from error
+
+    def run(observations: Tensor) -> Tensor:
+        return torch.from_numpy(session.run(["action"], {"observation": observations.numpy()})[0])
+
+    return run
+
+
+@contextlib.contextmanager
+def _quiet():
+    """Without the exporter's notices, that torchvision is not installed and what torch itself should no longer use."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(level)

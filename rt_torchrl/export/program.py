@@ -1,0 +1,100 @@
+"""The policy as a PyTorch program: a file that torch alone can load."""
+
+import io
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torch.export import Dim, ExportedProgram
+
+from rt_torchrl.export.agreement import detached, require_agreement, sample_observations
+from rt_torchrl.plant import Plant
+from rt_torchrl.signal import Signal
+
+INTERFACE = "interface.json"
+"""Name of the extra file of a program that describes its observations and actions."""
+
+
+def trace(policy: nn.Module, plant: Plant, *, batch: int | None = None) -> ExportedProgram:
+    """The graph of a policy, ``(batch, n_o) -> (batch, n_a)``.
+
+    Args:
+        policy: as :func:`detached` gives it.
+        plant: whose observations it takes.
+        batch: number of observations; None for any.
+
+    Raises:
+        ValueError: if torch.export cannot trace it, or it draws random numbers.
+    """
+    name, observations = type(policy).__name__, sample_observations(plant.observations, batch or 3)
+    shapes = None if batch else ({0: Dim("batch")},)
+    try:
+        program = torch.export.export(policy, (observations,), dynamic_shapes=shapes)
+        # Without any operator taken apart; it takes out what does nothing in evaluation, such as dropout.
+        program = program.run_decompositions({})
+    except Exception as error:  # torch.export has many, of several modules
+        raise ValueError(
+            f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
+            "torch.where, and sizes such that any batch can be passed."
+        ) from error
+    for node in program.graph.nodes:
+        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            raise ValueError(f"{layer_of(node, name)} draws random numbers ({node.target}); export its mean instead.")
+    return program
+
+
+def layer_of(node: torch.fx.Node, policy: str) -> str:
+    """The module a node of a graph comes from, in words."""
+    stack = list((node.meta.get("nn_module_stack") or {}).values())
+    path, kind = stack[-1] if stack else ("", policy)
+    kind = kind if isinstance(kind, str) else kind.__name__
+    return f"layer {path!r} ({kind.rpartition('.')[2]}) of policy {policy}" if path else f"policy {policy}"
+
+
+def interface(plant: Plant) -> dict[str, Any]:
+    """What a user of an exported policy must know of it, as JSON can hold it; an absent bound is None."""
+
+    def described(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+        return [{"name": s.name, "unit": s.unit, "low": finite(s.low), "high": finite(s.high)} for s in signals]
+
+    def finite(bound: float) -> float | None:
+        return bound if math.isfinite(bound) else None
+
+    return {
+        "plant": plant.name,
+        "control_interval_s": plant.dt,
+        "observation": described(plant.observations),
+        "action": described(plant.actions),
+    }
+
+
+def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
+    """Write a policy as a program of torch.export, of (batch, n_o) -> (batch, n_a) in double precision.
+
+    It is used without this library, and its extra file ``interface.json`` names and bounds what goes in and out::
+
+        policy = torch.export.load("policy.pt2").module()
+        action = policy(observation)
+
+    Args:
+        policy: any ``policy(observation) -> action`` in double precision.
+        path: file to write, such as ``policy.pt2``.
+        plant: whose observations and actions these are.
+
+    Returns:
+        Greatest difference from the policy, see :func:`require_agreement`.
+
+    Raises:
+        ValueError: if it is no policy of the plant, cannot be traced, or the program does not agree with it.
+    """
+    policy = detached(policy, plant)
+    file = io.BytesIO()
+    torch.export.save(trace(policy, plant), file, extra_files={INTERFACE: json.dumps(interface(plant), indent=2)})
+    loaded = torch.export.load(io.BytesIO(file.getvalue())).module()
+    error = require_agreement(policy, loaded, plant, what="the exported program")
+    Path(path).write_bytes(file.getvalue())
+    return error

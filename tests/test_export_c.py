@@ -1,0 +1,300 @@
+"""The C file: against the policy in torch, in closed form, and in a C program that includes it."""
+
+import ctypes
+import math
+import re
+import shutil
+import subprocess
+
+import pytest
+import torch
+from linear_quadratic import LinearGain, LinearQuadratic
+from torch import nn
+
+from rt_torchrl.catalogue import plants
+from rt_torchrl.export import c_file, export_c
+from rt_torchrl.export.c_operators import literal
+from rt_torchrl.policies import SaturatedAffine, SaturatedMLP, SmoothClip
+from rt_torchrl.signal import Signal
+
+COMPILER = next(filter(None, map(shutil.which, c_file.COMPILERS)), None)
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
+# The same operations in double precision; sums in another order and another libm: a few ulp per operation.
+ROUNDING = 1e-12
+
+
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def plant_of(n_observations, actions):
+    """The oracle plant with other signals; only these matter here."""
+    names = [Signal(symbol="e", name=f"error_{k}", unit="-") for k in range(n_observations)]
+    return type("Other", (LinearQuadratic,), {"observations": tuple(names), "actions": tuple(actions)})()
+
+
+def unbounded(n):
+    return [Signal(symbol="a", name=f"action_{k}", unit="N") for k in range(n)]
+
+
+def build(path, function):
+    """Compiled with all warnings as errors, called without the library's own loader."""
+    library = path.with_suffix(".so")
+    subprocess.run([COMPILER, "-std=c99", *STRICT, "-shared", "-fPIC", path, "-o", library, "-lm"], check=True)
+    return getattr(ctypes.CDLL(str(library)), function)
+
+
+def called(function, observation, n_actions):
+    action = (ctypes.c_double * n_actions)()
+    function((ctypes.c_double * len(observation))(*observation), action)
+    return torch.tensor(action, dtype=torch.float64)
+
+
+def policies_of_the_plants():
+    for name, kind in plants().items():
+        plant = kind()
+        yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
+        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(8, 5), generator=generator())
+        yield pytest.param(plant, mlp, id=f"{name}-mlp")
+    turbine = plants()["wind_turbine"]()
+    yield pytest.param(turbine, turbine.make_policy(generator(), bias=True), id="wind_turbine-bias")
+
+
+@needs_compiler
+@pytest.mark.parametrize(("plant", "policy"), list(policies_of_the_plants()))
+def test_policies_of_the_plants(plant, policy, tmp_path):
+    with torch.no_grad():
+        for weight in policy.parameters():  # biases too, as a training leaves them
+            weight.add_(0.5 * torch.randn(weight.shape, generator=generator(), dtype=torch.float64))
+    assert export_c(policy, tmp_path / "policy.c", plant, function="act") < ROUNDING
+    function = build(tmp_path / "policy.c", "act")
+    ranges = torch.tensor([action.high - action.low for action in plant.actions], dtype=torch.float64)
+    for observation in 2.0 * torch.randn(50, len(plant.observations), generator=generator(), dtype=torch.float64):
+        error = (called(function, observation.tolist(), len(plant.actions)) - policy(observation)).abs() / ranges
+        assert error.max() < ROUNDING
+
+
+@needs_compiler
+def test_an_affine_law_is_its_closed_form(tmp_path):
+    plant = plants()["wind_turbine"]()
+    policy = SaturatedAffine(2, plant.actions, generator=generator())
+    with torch.no_grad():
+        policy.linear.weight.copy_(torch.tensor([[1.0, -2.0], [0.5, 3.0]]))
+        policy.linear.bias.copy_(torch.tensor([0.25, -1.0]))
+    export_c(policy, tmp_path / "policy.c", plant)
+    function = build(tmp_path / "policy.c", "wind_turbine_policy")
+    torque, pitch = called(function, [0.3, 0.1], 2).tolist()
+    assert torque == pytest.approx(0.5 * (math.tanh(0.3 - 0.2 + 0.25) + 1.0) * 43_093.55, rel=ROUNDING)
+    assert pitch == pytest.approx(0.5 * (math.tanh(0.15 + 0.3 - 1.0) + 1.0) * 30.0, rel=ROUNDING)
+    # Saturated, and beyond what exp can hold.
+    assert called(function, [1e6, -1e6], 2).tolist() == [43_093.55, 0.0]
+
+
+@needs_compiler
+def test_a_program_in_c_that_includes_the_header(tmp_path):
+    plant = plants()["flapping_wing"]()
+    policy = SaturatedMLP(4, plant.actions, hidden=(6,), generator=generator())
+    export_c(policy, tmp_path / "wing.c", plant, function="fly")
+    header = (tmp_path / "wing.h").read_text()
+    for signal in (*plant.observations, *plant.actions):
+        assert signal.name in header and f"[{signal.unit}]" in header
+    assert re.search(r"action\[0\] +flapping_amplitude +\[deg\] +50 \.\.\. 88", header)
+    assert "every 0.0005 s" in header
+    # The examples of the header, computed by a program that a user would write.
+    observation, action = re.findall(r"\{(.*)\} -> \{(.*)\}", header)[1]
+    (tmp_path / "main.c").write_text(
+        '#include "wing.h"\n#include <stdio.h>\n'
+        f"int main(void) {{ const double e[FLY_OBSERVATIONS] = {{{observation}}}; double a[FLY_ACTIONS]; fly(e, a);\n"
+        '    printf("%.9g, %.9g", a[0], a[1]); return 0; }\n'
+    )
+    sources = [tmp_path / "main.c", tmp_path / "wing.c"]
+    subprocess.run([COMPILER, "-std=c99", *STRICT, *sources, "-o", tmp_path / "main", "-lm"], check=True)
+    printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True).stdout
+    assert [float(x) for x in printed.split(",")] == pytest.approx([float(x) for x in action.split(",")], rel=1e-8)
+
+
+class Formula(nn.Module):
+    """A policy of one formula of the observation e, a matrix and a vector of weights."""
+
+    def __init__(self, formula):
+        super().__init__()
+        self.formula = formula
+        self.W = nn.Parameter(torch.randn(4, 4, generator=generator(), dtype=torch.float64))
+        self.b = nn.Parameter(torch.randn(4, generator=generator(), dtype=torch.float64))
+
+    def forward(self, e):
+        return self.formula(e, self.W, self.b)
+
+
+FORMULAS = {
+    "power and scale": lambda e, W, b: 0.5 * e**2 - 2 * e**3 + e.abs() ** 1.5,
+    "weights that are computed": lambda e, W, b: e * torch.exp(W).sum(0) + torch.stack(b.unbind()[::-1]),
+    "select and stack": lambda e, W, b: torch.stack(
+        [e[..., 0] * e[..., 1], e[..., 3], b[0] * e[..., 2], e[..., 0]], -1
+    ),
+    "slice and concatenate": lambda e, W, b: torch.cat([e[..., 1:3], b[:1].expand(len(e), 1), e[..., :1].tanh()], -1),
+    "choose by index": lambda e, W, b: e[..., [2, 0, 3, 3]] + e.flip(-1) + e.roll(1, -1),
+    "unbind and chunk": lambda e, W, b: torch.cat([torch.hypot(*e.chunk(2, -1)), *e.split([1, 3], -1)[:1] * 2], -1),
+    "broadcast product": lambda e, W, b: (e.unsqueeze(-2) * W).sum(-1) + b,
+    "matrix times vector": lambda e, W, b: (W @ e.unsqueeze(-1)).squeeze(-1),
+    "einsum": lambda e, W, b: torch.einsum("ij,...j,i->...i", W, e, b),
+    "quadratic form": lambda e, W, b: ((e @ W) * e).sum(-1, keepdim=True) * b,
+    "mean and norm": lambda e, W, b: (
+        (e - e.mean(-1, keepdim=True)) / (1.0 + torch.linalg.norm(e, dim=-1, keepdim=True))
+    ),
+    "outer product of two that vary": lambda e, W, b: torch.bmm(e.unsqueeze(-1), e.tanh().unsqueeze(-2)).sum(-2),
+    "clamps": lambda e, W, b: e.clamp(-0.5, 0.7) + e.clamp(min=0.1) - e.clamp(max=0.2) + e.clamp(b, b.abs() + 1.0),
+    "where": lambda e, W, b: torch.where((e > 0.1) & ~(e > 0.5) | (e < b), e, -2.0 * e.sign()),
+    "extrema": lambda e, W, b: torch.maximum(e, b) + torch.minimum(e, e.flip(-1)),
+    "functions": lambda e, W, b: e.sin() + e.cos() + torch.atan2(e, b) + e.square().log1p() + (-e.abs()).exp(),
+    "roots": lambda e, W, b: (1.0 + e**2).sqrt() - (2.0 + e**2).rsqrt() + (3.0 + e**2).reciprocal(),
+    "a constant": lambda e, W, b: torch.zeros_like(e) + b,
+    "a tensor of the formula": lambda e, W, b: e * torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64),
+    "truth values as numbers": lambda e, W, b: (e > b).double() * e,
+}
+
+
+def named(values):
+    """An action for every element of every value, named after it: an error then tells where it is."""
+    names = [f"{name.replace(' ', '_')}_{k}" for name, value in values.items() for k in range(value.shape[-1])]
+    return [Signal(symbol="a", name=name, unit="-") for name in names]
+
+
+@needs_compiler
+def test_formulas(tmp_path):
+    def every(e, W, b):
+        return {name: formula(e, W, b) for name, formula in FORMULAS.items()}
+
+    policy = Formula(lambda e, W, b: torch.cat(list(every(e, W, b).values()), -1))
+    plant = plant_of(4, named(every(torch.zeros(1, 4, dtype=torch.float64), policy.W, policy.b)))
+    assert export_c(policy, tmp_path / "formulas.c", plant) < ROUNDING
+    build(tmp_path / "formulas.c", "linear_quadratic_policy")
+
+
+ACTIVATIONS = [
+    *(nn.ReLU(), nn.SiLU(), nn.GELU(), nn.GELU(approximate="tanh"), nn.ELU(0.7), nn.SELU(), nn.CELU(), nn.Softplus()),
+    *(nn.LeakyReLU(0.2), nn.Sigmoid(), nn.Softsign(), nn.Hardtanh(-0.4, 0.6), nn.Hardswish(), nn.Mish(), nn.ReLU6()),
+    *(nn.LogSigmoid(), nn.PReLU(dtype=torch.float64), nn.Dropout(), nn.Identity(), nn.Tanhshrink(), nn.Hardsigmoid()),
+    *(nn.LayerNorm(5, dtype=torch.float64), nn.RMSNorm(5, dtype=torch.float64), nn.Threshold(0.1, 2.0)),
+]
+
+
+class Layers(nn.Module):
+    """All activations of one linear layer, side by side."""
+
+    def __init__(self):
+        super().__init__()
+        self.linear = nn.Linear(2, 5, dtype=torch.float64)
+        self.activations = nn.ModuleList(ACTIVATIONS)
+
+    def every(self, e):
+        return {f"{type(module).__name__}_{k}": module(self.linear(e)) for k, module in enumerate(self.activations)}
+
+    def forward(self, e):
+        return torch.cat(list(self.every(e).values()), -1)
+
+
+@needs_compiler
+def test_activations_and_normalisations(tmp_path):
+    torch.manual_seed(0)  # torch's own initialisation of layers
+    policy = Layers().eval()
+    plant = plant_of(2, named(policy.every(torch.zeros(1, 2, dtype=torch.float64))))
+    assert export_c(policy, tmp_path / "layers.c", plant) < ROUNDING
+    build(tmp_path / "layers.c", "linear_quadratic_policy")
+
+
+@needs_compiler
+def test_a_users_own_perceptron_with_normalised_inputs(tmp_path):
+    normalisation = nn.BatchNorm1d(2, affine=False, dtype=torch.float64)
+    mean, variance = torch.tensor([[0.5, -1.0], [2.0, 0.1]], dtype=torch.float64)
+    normalisation.running_mean.copy_(mean)
+    normalisation.running_var.copy_(variance)
+    torch.manual_seed(0)
+    layers = nn.Linear(2, 64, dtype=torch.float64), nn.SiLU(), nn.Linear(64, 1, bias=False, dtype=torch.float64)
+    plant = LinearQuadratic()
+    policy = nn.Sequential(normalisation, *layers, SmoothClip(plant.actions))
+    assert export_c(policy, tmp_path / "own.c", plant) < ROUNDING
+    function = build(tmp_path / "own.c", "linear_quadratic_policy")
+    e = torch.tensor([[0.7, -0.8]], dtype=torch.float64)
+    hidden = (e - mean) / (variance + 1e-5).sqrt() @ layers[0].weight.T + layers[0].bias
+    expected = 2.0 * torch.tanh((hidden * hidden.sigmoid()) @ layers[2].weight.T)
+    assert called(function, e[0].tolist(), 1).item() == pytest.approx(expected.item(), rel=ROUNDING)
+
+
+@needs_compiler
+def test_a_broken_sensor_is_not_hidden(tmp_path):
+    activations = nn.ReLU(), nn.Hardtanh(), nn.Softplus(), nn.ReLU6(), nn.LeakyReLU(), nn.ELU()
+    policy = Formula(lambda e, W, b: torch.cat([module(e) for module in activations] + [torch.maximum(e, b[:2])], -1))
+    export_c(policy, tmp_path / "policy.c", plant_of(2, unbounded(14)), function="act")
+    found = called(build(tmp_path / "policy.c", "act"), [math.nan, 0.5], 14)
+    assert found[::2].isnan().all()
+    expected = policy(torch.tensor([[0.5, 0.5]], dtype=torch.float64))[0, 1::2]
+    torch.testing.assert_close(found[1::2], expected.detach(), rtol=ROUNDING, atol=0)
+
+
+@pytest.mark.parametrize("number", [0.1, -1 / 3, 1e-300, 43_093.55, -0.0, math.inf, -math.inf, 5e-324, 1.7e308])
+def test_literals_are_read_back_to_the_bit(number):
+    text = literal(number).strip("()").replace("INFINITY", "inf")
+    assert float(text).hex() == float(number).hex()
+    assert text.endswith("inf") or "." in text or "e" in text  # a double, not an int
+
+
+HEAD = nn.Sequential(nn.Linear(4, 1, dtype=torch.float64), nn.Softmax(-1))
+REFUSED = {
+    "softmax": (lambda e, W, b: HEAD(e), "policy Formula uses '_softmax', .*export_program.*export_onnx"),
+    "sort": (lambda e, W, b: e.sort(-1).values[..., :1], "policy Formula uses 'sort'"),
+    "single precision": (
+        lambda e, W, b: e.float().double()[..., :1],
+        "policy Formula uses '_to_copy in torch.float32'",
+    ),
+    "integers": (lambda e, W, b: (e > 0).sum(-1, keepdim=True).double(), "'sum in torch.int64'"),
+    "rounding": (lambda e, W, b: torch.div(e, 2.0, rounding_mode="floor")[..., :1], "uses 'div'"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_has_no_c_form_is_refused(name, tmp_path):
+    formula, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        export_c(Formula(formula), tmp_path / "policy.c", plant_of(4, unbounded(1)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refusal_names_the_layer(tmp_path):
+    policy = nn.Sequential(nn.Sequential(nn.Linear(2, 1, dtype=torch.float64), nn.Softmax(-1)), nn.Tanh())
+    with pytest.raises(ValueError, match=r"layer '0\.1' \(Softmax\) of policy Sequential uses '_softmax'"):
+        export_c(policy, tmp_path / "policy.c", LinearQuadratic())
+
+
+def test_a_machine_without_compiler_says_that_nothing_was_checked(tmp_path, monkeypatch):
+    monkeypatch.setattr(c_file, "COMPILERS", ("no_such_compiler",))
+    with pytest.warns(UserWarning, match="not checked against the policy: there is no C compiler"):
+        assert export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", LinearQuadratic()) is None
+    assert (tmp_path / "policy.c").exists() and (tmp_path / "policy.h").exists()
+
+
+@needs_compiler
+def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
+    right = c_file._source
+    monkeypatch.setattr(c_file, "_source", lambda *parts: right(*parts).replace("0.25", "0.2500004"))
+    with pytest.raises(ValueError, match=r"the C function of policy LinearGain differs from it by .*'force'"):
+        export_c(LinearGain([[0.25, 1.0]]), tmp_path / "policy.c", LinearQuadratic())
+    assert not list(tmp_path.iterdir())
+
+
+@needs_compiler
+def test_a_word_of_c_is_refused_as_a_name(tmp_path):
+    with pytest.raises(ValueError, match="could not be compiled"):
+        export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", LinearQuadratic(), function="double")
+
+
+@pytest.mark.parametrize("function", ["2fast", "my-policy", "", "régulateur"])
+def test_a_name_that_is_none_is_refused(function, tmp_path):
+    with pytest.raises(ValueError, match="function=.*must be a name in C"):
+        export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", LinearQuadratic(), function=function)
+
+
+def test_a_path_without_its_suffix_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"path=.*must end in \.c"):
+        export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.cpp", LinearQuadratic())

@@ -1,0 +1,157 @@
+"""A run folder read back, and the recipe that exports from it."""
+
+import dataclasses
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from test_run import SMALL
+
+from rt_torchrl.finished_run import FinishedRun, config_class_of, rebuilt
+from rt_torchrl.run_config import RunConfig
+from rt_torchrl.runner import Run
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+PLANTS = ("cryogenic_tank", "flapping_wing", "wind_turbine")
+OPTIONS = {"cryogenic_tank": "mlp", "flapping_wing": "paper", "wind_turbine": "bias"}
+
+
+def recipe(name):
+    spec = importlib.util.spec_from_file_location(f"recipe_{name}_of_the_test", RECIPES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def leave_run(folder, name, **options):
+    """What Run.train writes of a run, as it writes it, with random weights."""
+    config = config_class_of(RECIPES / f"{name}.py")(seed=3, log_dir=folder, **options)
+    plant, generator = config.plant(), torch.Generator().manual_seed(7)
+    parts = {role: config.make_policy(plant, generator) for role in ("model_based", "model_free")}
+    parts["closure"] = plant.make_closure(generator)
+    folder.mkdir(exist_ok=True)
+    settings = dataclasses.asdict(config) | {"plant": plant.name}
+    (folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
+    torch.save({role: part.state_dict() for role, part in parts.items()}, folder / "weights.pt")
+    return config, parts
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_run_is_rebuilt(name, tmp_path):
+    config, parts = leave_run(tmp_path, name, policy=OPTIONS[name], horizon=3000.0, model_error=True, hidden=(3,))
+    run = FinishedRun.load(tmp_path, type(config))
+    assert run.config == config and run.plant.horizon == 3000.0
+    for role, part in parts.items():
+        found = run.closure if role == "closure" else run.policy(role)
+        assert found.state_dict().keys() == part.state_dict().keys()
+        assert all(torch.equal(found.state_dict()[key], value) for key, value in part.state_dict().items())
+
+
+class OracleConfig(RunConfig):
+    def plant(self):
+        return LinearQuadratic(horizon=2.0)
+
+
+def test_what_a_training_leaves_is_read_back(tmp_path):
+    config = OracleConfig(
+        episodes=1, log_dir=tmp_path, compiled=False, unseen=2, figures_every=0, twinning=SMALL, noise=0.01
+    )
+    training = Run(config, config.plant())
+    training.train()
+    found = FinishedRun.load(tmp_path, OracleConfig)
+    assert found.config == config
+    for role, policy in training.algorithm.policies.items():
+        assert torch.equal(found.policy(role).gain, policy.gain)
+    assert torch.equal(found.closure.matrix, training.algorithm.twin.closure.matrix)
+
+
+def test_the_default_options_of_every_recipe_survive_json():
+    for name in PLANTS:
+        config = config_class_of(RECIPES / f"{name}.py")()
+        assert rebuilt(type(config), json.loads(json.dumps(dataclasses.asdict(config), default=str))) == config
+
+
+def test_the_recipe_writes_every_format(tmp_path, capsys):
+    pytest.importorskip("onnxruntime"), pytest.importorskip("onnxscript")
+    _, parts = leave_run(tmp_path, "wind_turbine", policy="bias")
+    export = recipe("export")
+    export.main(export.Config(run=tmp_path, role="model_free", formats=("c", "onnx", "pt2")))
+    written = {path.name for path in (tmp_path / "exported").iterdir()}
+    assert written == {f"wind_turbine_model_free.{suffix}" for suffix in ("c", "h", "onnx", "pt2")}
+    loaded = torch.export.load(tmp_path / "exported" / "wind_turbine_model_free.pt2").module()
+    e = torch.tensor([[0.2, -0.4]], dtype=torch.float64)
+    assert torch.equal(loaded(e), parts["model_free"](e)) and not torch.equal(loaded(e), parts["model_based"](e))
+    assert "void wind_turbine_model_free(" in (tmp_path / "exported" / "wind_turbine_model_free.h").read_text()
+    assert capsys.readouterr().out.count("of the actions' ranges") >= 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"role": "oracle"}, "role='oracle' does not exist in this run; choose model_based or model_free"),
+        ({"formats": ("jar",)}, r"formats=\('jar',\) must be some of c, onnx, pt2"),
+        ({"formats": ()}, r"formats=\(\) must be some of"),
+        ({"name": "../up"}, "name='../up' must be a name in C"),
+        ({"recipe": Path("nowhere.py")}, "recipe=nowhere.py does not exist"),
+        ({"recipe": RECIPES / "study.py"}, "has no class Config derived from RunConfig"),
+        ({"recipe": RECIPES / "flapping_wing.py"}, "cannot be carried out.*no option.*turbulence"),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)
+def test_bad_options_are_refused(options, message, tmp_path):
+    leave_run(tmp_path, "wind_turbine")
+    export = recipe("export")
+    with pytest.raises(ValueError, match=message):
+        export.main(export.Config(run=tmp_path, **options))
+    assert not (tmp_path / "exported").exists()
+
+
+def test_folders_that_hold_no_run_are_refused(tmp_path):
+    config, _ = leave_run(tmp_path / "run", "wind_turbine")
+
+    def refusal(folder, message):
+        with pytest.raises(ValueError, match=message):
+            FinishedRun.load(folder, type(config))
+
+    refusal(tmp_path, "is no run folder: it has no config.json")
+    for damage, message in {
+        "unfinished": "has no weights.pt: it is not finished.*--resume",
+        "torn": "weights.pt is damaged",
+        "no json": "config.json is damaged",
+        "no plant": "does not name a plant",
+        "other plant": "is a run of plant 'balloon', the recipe is of 'wind_turbine'",
+        "other policy": "weights of 'model_based' .* do not fit",
+        "other option": "has no option colour; it is of another version",
+        "lost wind": "cannot be carried out: .*gone.hh",
+    }.items():
+        folder = shutil.copytree(tmp_path / "run", tmp_path / damage.replace(" ", "_"))
+        damage_run(folder, damage)
+        refusal(folder, message)
+
+
+def damage_run(folder, damage):
+    settings = json.loads((folder / "config.json").read_text())
+    changes = {
+        "no json": None,
+        "no plant": {key: value for key, value in settings.items() if key != "plant"},
+        "other plant": settings | {"plant": "balloon"},
+        "other policy": settings | {"policy": "mlp"},
+        "other option": settings | {"colour": "red"},
+        "lost wind": settings | {"wind_files": ["gone.hh"]},
+    }
+    if damage == "unfinished":
+        (folder / "weights.pt").unlink()
+    elif damage == "torn":
+        (folder / "weights.pt").write_bytes((folder / "weights.pt").read_bytes()[:500])
+    else:
+        (folder / "config.json").write_text("{" if damage == "no json" else json.dumps(changes[damage]))
+
+
+def test_a_recipe_that_makes_no_plant_is_refused(tmp_path):
+    leave_run(tmp_path, "wind_turbine")
+    with pytest.raises(ValueError, match=r"RunConfig has no method plant\(\)"):
+        FinishedRun.load(tmp_path, RunConfig)
