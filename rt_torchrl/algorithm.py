@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.environment import PlantEnv
@@ -82,7 +83,7 @@ class ReinforcementTwinning:
 
     def __init__(
         self,
-        env: PlantEnv,
+        env: PlantEnv | EnvBase,
         twin: DigitalTwin,
         *,
         model_free: nn.Module,
