@@ -130,7 +130,9 @@ class Identification:
         plant = self.twin.plant
         misfit = Misfit(self.twin, segments, self._initial(segments, self.free), weights=False, compiled=self._compiled)
         if self.free:
-            LevenbergMarquardt(misfit.initial).run(misfit.normal_equations, INITIAL_ITERATIONS)
+            LevenbergMarquardt(misfit.initial, tolerance=NOISE_TOLERANCE).run(
+                misfit.normal_equations, INITIAL_ITERATIONS
+            )
         states = [replayed.states for replayed in misfit.replays()]
         measured = [segment.record.states for segment in segments]
         J_p = sum(plant.dt * plant.discrepancy(s, m).sum().item() for s, m in zip(states, measured, strict=True))

@@ -13,7 +13,10 @@ from rt_torchrl.plant import Plant
 from rt_torchrl.signal import Signal
 
 TIME = "time"
-COLUMN = re.compile(r"(?P<header>.+)=(?P<signal>\w+)(?:\*(?P<factor>[^*+]+?))?(?P<offset>(?<![eE])[+-].+)?")
+NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
+COLUMN = re.compile(
+    rf"(?P<header>.+)=(?P<signal>\w+)(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?", re.DOTALL
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +133,7 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Log:
 
     Args:
         path: a file ending in ``.csv`` or ``.parquet``. The time is a number of seconds on the plant's clock, or a
-            date and time of day, which is counted from the first row.
+            date and time of day (ISO 8601), which is counted from the first row.
         plant: names the signals.
         columns: those whose header is not the name of their signal, or whose unit is another.
 
@@ -205,9 +208,11 @@ def _read(path: Path) -> Any:
 def _values(series: Any, column: Column, path: Path) -> Float[np.ndarray, " rows"]:
     """Numbers of a column in the signal's unit; a date becomes the seconds since the first."""
     pd = pandas()
+    if series.empty:
+        return np.empty(0)
     try:
         if column.signal == TIME and not pd.api.types.is_numeric_dtype(series):
-            instants = pd.to_datetime(series, utc=True)
+            instants = pd.to_datetime(series, utc=True, format="ISO8601")
             numbers = (instants - instants.iloc[0]).dt.total_seconds()
         else:
             numbers = pd.to_numeric(series)

@@ -6,7 +6,7 @@ A sensor's first sample is as noisy as any other, and a system that forgets slow
 segment. The initial states are therefore unknowns beside the weights, and their samples count as any other.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -95,24 +95,28 @@ class Misfit:
         return total
 
     @torch.no_grad()
-    def replays(self) -> Iterator[Replayed]:
+    def replays(self) -> list[Replayed]:
         """Every segment under the present unknowns.
 
         Raises:
             DivergenceError: if a state is not finite.
         """
-        for number, ((start, record), first) in enumerate(zip(self.segments, self.initial(), strict=True)):
-            ends, S = self._sensitivities(
-                first[None], record.exogenous[None], record.actions[None], start=start, initial=True
-            )
-            self._require_finite(ends[0], start)
-            states = torch.cat([first[None], ends[0]])
-            at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
-            S = torch.cat([at_start[None], S[0]])
-            by_initial = S[..., self.weight_count :] @ self.initial.unit.T
-            g, H = discrepancy_derivatives(self.plant, states[None], record.states[None])
-            yield Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
+        return [self._replay(*numbered) for numbered in enumerate(zip(self.segments, self.initial(), strict=True))]
 
+    def _replay(self, number: int, given: tuple[Segment, Tensor]) -> Replayed:
+        (start, record), first = given
+        ends, S = self._sensitivities(
+            first[None], record.exogenous[None], record.actions[None], start=start, initial=True
+        )
+        self._require_finite(ends[0], start)
+        states = torch.cat([first[None], ends[0]])
+        at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
+        S = torch.cat([at_start[None], S[0]])
+        by_initial = S[..., self.weight_count :] @ self.initial.unit.T
+        g, H = discrepancy_derivatives(self.plant, states[None], record.states[None])
+        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
+
+    @torch.no_grad()
     def normal_equations(self) -> NormalEquations:
         """J_p, its gradient and its Gauss-Newton matrix by all unknowns."""
         count = self._shown + self.initial.offsets.numel()
