@@ -56,7 +56,9 @@ class Config:
     seed: int = 0
     compiled: bool | None = None
     folder: Path | None = None
-    identification: IdentificationConfig = field(default_factory=IdentificationConfig)
+    identification: Annotated[IdentificationConfig, tyro.conf.arg(name="")] = field(
+        default_factory=IdentificationConfig
+    )
 
     def make_plant(self) -> Plant:
         """The plant, with the control interval that was asked for."""

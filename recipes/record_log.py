@@ -36,6 +36,7 @@ class Config:
         role: which policy of the training.
         states: names of the states that are logged; by default all.
         seed: of the episode and of a policy's first weights.
+        horizon: length of the episode [s]; by default the plant's.
         jitter: greatest difference of a control interval from dt, as a share of dt.
         noise: standard deviation of the sensors of the states, as a share of what they read.
         gap: share of the log that is missing from its middle on.
@@ -48,6 +49,7 @@ class Config:
     role: Literal["model_based", "model_free"] = "model_based"
     states: tuple[str, ...] = ()
     seed: int = 0
+    horizon: float | None = None
     jitter: float = 0.4
     noise: float = 0.005
     gap: float = 0.02
@@ -62,12 +64,18 @@ class Config:
 
 
 def main(config: Config) -> None:
-    plant, generator = plants()[config.plant](), torch.Generator().manual_seed(config.seed)
+    plant, generator = make_plant(config), torch.Generator().manual_seed(config.seed)
     law = law_of(config, plant, generator)
     log = with_gap(recorded(plant, law, generator, jitter=config.jitter, noise=config.noise), config.gap)
     log = log.without([s.name for s in logged_states(plant) if config.states and s.name not in config.states])
     log.write(config.log)
     print(f"{len(log.times)} rows of plant {plant.name!r} in {config.log}: {', '.join(log.columns)}")
+
+
+def make_plant(config: Config) -> Plant:
+    """The plant, with the horizon that was asked for."""
+    kind = plants()[config.plant]
+    return kind() if config.horizon is None else kind(horizon=config.horizon)
 
 
 def law_of(config: Config, plant: Plant, generator: torch.Generator) -> Law:

@@ -31,9 +31,10 @@ LEAST_EIGENVALUE = 1e-12
 @torch.no_grad()
 def covariance(misfit: Misfit) -> Float[Tensor, "n_w n_w"]:
     """Of the closure's weights at a minimum of J_p; inf on the diagonal for a weight that the segments do not show."""
-    H = misfit.normal_equations().matrix
+    replays = misfit.replays()
+    H = misfit.normal_equations(replays).matrix
     M, samples = torch.zeros_like(H), 0
-    for replayed in misfit.replays():
+    for replayed in replays:
         scores = misfit.plant.dt * torch.einsum("ki,kiw->kw", replayed.gradient, replayed.sensitivity)
         index = replayed.index
         M[index[:, None], index] += newey_west(scores)

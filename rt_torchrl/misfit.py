@@ -117,12 +117,12 @@ class Misfit:
         return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
 
     @torch.no_grad()
-    def normal_equations(self) -> NormalEquations:
-        """J_p, its gradient and its Gauss-Newton matrix by all unknowns."""
+    def normal_equations(self, replays: Sequence[Replayed] | None = None) -> NormalEquations:
+        """J_p, its gradient and its Gauss-Newton matrix by all unknowns, of ``replays`` that were made already."""
         count = self._shown + self.initial.offsets.numel()
         gradient, matrix = self.initial.measured.new_zeros(count), self.initial.measured.new_zeros(count, count)
         cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
-        for replayed, segment in zip(self.replays(), self.segments, strict=True):
+        for replayed, segment in zip(replays or self.replays(), self.segments, strict=True):
             S, i = replayed.sensitivity, replayed.index
             cost = cost + dt * self.plant.discrepancy(replayed.states, segment.record.states).sum()
             gradient[i] += dt * torch.einsum("ki,kiw->w", replayed.gradient, S)
