@@ -58,11 +58,6 @@ class Judgement(NamedTuple):
     rms: Float[Tensor, " n_s"]
     states: list[Tensor]
 
-    @property
-    def mean(self) -> float:
-        """Mean of L_p, which does not depend on the length."""
-        return self.J_p / self.seconds
-
 
 class Identified(NamedTuple):
     """What an identification found; the closure itself is trained in place."""

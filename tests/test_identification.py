@@ -1,4 +1,4 @@
-"""Identification from a log: derivatives against backpropagation, fits and errors against linear regression."""
+"""Identification from a log: derivatives against backpropagation, fits against linear regression."""
 
 import math
 import subprocess
@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from torch import nn
+from straight_line import Line, Slope, flown, line_segment, noise_of
 
 from rt_torchrl.compilation import missing_for_compilation
-from rt_torchrl.covariance import covariance, named_values, newey_west, standard_errors
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -26,89 +25,10 @@ from rt_torchrl.identification import (
 )
 from rt_torchrl.memory import Record
 from rt_torchrl.misfit import InitialStates, Misfit
-from rt_torchrl.plant import Plant
 from rt_torchrl.recorder import policy_law, recorded
 from rt_torchrl.resampling import Segment, hold_out, resample
-from rt_torchrl.signal import Signal
-from rt_torchrl.trajectory import DivergenceError, Rollout
+from rt_torchrl.trajectory import DivergenceError
 from rt_torchrl.twin import DigitalTwin
-
-
-class Slope(nn.Module):
-    """ẋ = w_0, and what a second weight does that only the input shows."""
-
-    def __init__(self):
-        super().__init__()
-        self.w = nn.Parameter(torch.tensor([0.5, 0.3], dtype=torch.float64))
-
-    def forward(self, features):
-        return self.w[:1] + self.w[1:] * features
-
-
-class Line(Plant):
-    """x = x_0 + (w_0 + w_1 z) t: identification is linear regression."""
-
-    name = "line"
-    states = (Signal(symbol="x", name="position", unit="m"),)
-    actions = (Signal(symbol="a", name="nothing", unit="-", low=-1.0, high=1.0),)
-    inputs = (Signal(symbol="z", name="wind", unit="-"),)
-    observations = states
-
-    def __init__(self, dt=0.1, horizon=10.0):
-        super().__init__(dt=dt, horizon=horizon, closure=Slope())
-
-    def vector_field(self, t, state, action, exogenous, closure):
-        return closure(exogenous).expand_as(state)
-
-    def discrepancy(self, state, measured):
-        return 0.5 * ((state - measured) ** 2).sum(-1)
-
-    observe = running_cost = draw_initial_state = draw_exogenous = make_closure = None
-
-
-def line_segment(values, wind=0.0, start=0.0):
-    n = len(values) - 1
-    exogenous = torch.full((n, 1), wind, dtype=torch.float64)
-    return Segment(
-        start, Record(torch.as_tensor(values).reshape(-1, 1).double(), exogenous, torch.zeros(n, 1).double())
-    )
-
-
-def noise_of(n, seed, *, smooth=False):
-    """White noise of unit deviation, or the mean of neighbours of it."""
-    values = np.random.default_rng(seed).normal(size=n + 1)
-    return 0.5 * (values[1:] + values[:-1]) if smooth else values[1:]
-
-
-def regression_error(n, dt, *, smooth):
-    """Standard error of the slope of a line through n samples with such noise, by (XᵀX)⁻¹XᵀΩX(XᵀX)⁻¹."""
-    X = np.stack([np.ones(n), dt * np.arange(n)], -1)
-    omega = np.eye(n)
-    if smooth:
-        omega = 0.5 * np.eye(n) + 0.25 * (np.eye(n, k=1) + np.eye(n, k=-1))
-    inverse = np.linalg.inv(X.T @ X)
-    return math.sqrt((inverse @ X.T @ omega @ X @ inverse)[1, 1])
-
-
-def flown(plant, generator, lengths):
-    """Segments of one true episode, cut at these steps, with their starts on its clock."""
-    start, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
-    share = 0.3 + 0.4 * torch.rand(1, plant.n_steps, len(plant.actions), generator=generator, dtype=torch.float64)
-    with torch.no_grad():
-        found = Rollout(plant, plant.closure)(start, exogenous, low + share * (high - low))
-    segments, k = [], 0
-    for n in lengths:
-        record = Record(found.states[0, k : k + n + 1], exogenous[0, k : k + n], found.actions[0, k : k + n])
-        segments.append(Segment(k * plant.dt, record))
-        k += n
-    return segments
-
-
-def slope_misfit(segments, free=(0,)):
-    plant = Line()
-    initial = InitialStates(segments, free, torch.ones(1).double())
-    return Misfit(DigitalTwin(plant, Slope()), segments, initial)
 
 
 @pytest.mark.parametrize("kind", [LinearQuadratic, FlappingWing])
@@ -164,66 +84,6 @@ def test_a_line_is_fitted_as_by_regression():
     # No wind blew: nothing is known of the second weight, and it stays.
     assert math.isinf(found.weights["w[1]"]["standard_error"])
     assert found.weights["w[1]"]["after"] == found.weights["w[1]"]["before"] == 0.3
-
-
-@pytest.mark.parametrize("smooth", [False, True])
-def test_standard_errors_are_those_of_regression(smooth):
-    """Mean over draws of the estimated variance against the exact one, for white and for smoothed noise."""
-    n, found = 300, []
-    for seed in range(10):
-        segment = line_segment(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=smooth))
-        misfit = slope_misfit([segment])
-        slope, first = np.polyfit(0.1 * np.arange(n), segment.record.states[:, 0].numpy(), 1)
-        with torch.no_grad():
-            misfit.twin.closure.w[0] = slope
-            misfit.initial.offsets[:] = first - segment.record.states[0]
-        found.append(covariance(misfit)[0, 0].item())
-    expected = regression_error(n, 0.1, smooth=smooth)
-    # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
-    # that in the error; the window takes another few per cent of the correlation and of the trend.
-    assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
-
-
-def test_scatter_over_logs_is_the_standard_error():
-    """Monte Carlo on the oracle plant: noise drawn anew, weights fitted anew."""
-    plant, config = LinearQuadratic(horizon=4.0), IdentificationConfig(iterations=4)
-    (clean,) = flown(plant, torch.Generator().manual_seed(0), (40,))
-    estimates, errors = [], []
-    for seed in range(12):
-        generator = torch.Generator().manual_seed(100 + seed)
-        noise = 0.02 * torch.randn(clean.record.states.shape, generator=generator, dtype=torch.float64)
-        segment = Segment(0.0, clean.record._replace(states=clean.record.states + noise))
-        closure = LinearClosure(plant.true_closure)
-        task = Identification(plant, closure, free=(0, 1), config=config)
-        task._descend(misfit := Misfit(task.twin, [segment], task._initial([segment], (0, 1))), config.iterations)
-        estimates.append(closure.matrix.detach().flatten().clone())
-        errors.append(torch.tensor(list(standard_errors(misfit).values())))
-    z = (torch.stack(estimates) - torch.tensor(plant.true_closure).double().flatten()) / torch.stack(errors)
-    # 48 standard normal numbers, four at a time correlated: their mean square is 1 within 0.4 or so. With 41 samples
-    # of two states and 4 lags the errors themselves are low by some 10 %.
-    assert 0.5 < (z**2).mean() < 2.2
-
-
-def test_scores_of_white_noise_sum_to_their_variance():
-    scores = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = newey_west(scores)
-    # Fourteen lags of 20 000 samples: 2·14·2/3/20 000 is a scatter of 3 %.
-    torch.testing.assert_close(found / 20_000, torch.eye(2).double(), rtol=0, atol=0.12)
-
-
-def test_named_errors_follow_from_those_of_the_logarithms():
-    """Of a = e^w to first order, σ_a = a σ_w."""
-    plant = FlappingWing(horizon=0.03)
-    segments = flown(plant, torch.Generator().manual_seed(0), (60,))
-    closure = QuasiSteadyPolar.true().requires_grad_(True)
-    noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    noisy = [Segment(0.0, segments[0].record._replace(states=segments[0].record.states + noise))]
-    misfit = Misfit(DigitalTwin(plant, closure), noisy, InitialStates(noisy, (), torch.ones(4).double()))
-    expected = closure.coefficients.detach() * covariance(misfit).diagonal().sqrt()
-    found = standard_errors(misfit)
-    assert list(found) == ["a", "b", "c"]
-    assert list(found.values()) == pytest.approx(expected.tolist(), rel=1e-9)
-    assert list(named_values(LinearClosure(torch.zeros(2, 2)))) == [f"matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]
 
 
 @pytest.fixture(scope="module")
