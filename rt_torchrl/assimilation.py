@@ -12,6 +12,7 @@ from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
 from rt_torchrl.memory import Record
+from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import identification_cost
 from rt_torchrl.twin import DigitalTwin
 
@@ -100,12 +101,19 @@ class Assimilation:
         """J_p, its gradient and its Gauss-Newton matrix with respect to the closure's weights."""
         states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions)
         plant, target = self.twin.plant, measured[:, 1:]
-        pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
-        curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
         share = plant.dt / len(measured)
-        g, H = pointwise(states, target), curvature(states, target)
+        g, H = discrepancy_derivatives(plant, states, target)
         return NormalEquations(
             share * plant.discrepancy(states, target).sum(),
             share * torch.einsum("bki,bkiw->w", g, S),
             share * torch.einsum("bkiv,bkij,bkjw->vw", S, H, S),
         )
+
+
+def discrepancy_derivatives(
+    plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
+) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
+    """Gradient and Hessian of L_p with respect to every state."""
+    pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
+    curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
+    return pointwise(states, measured), curvature(states, measured)

@@ -158,6 +158,32 @@ class Plant(nn.Module, ABC):
         """Kinds of episodes, by name, that results are also shown apart for; here none."""
         return {}
 
+    def complete_states(
+        self,
+        measured: dict[str, Float[Tensor, " samples"]],
+        exogenous: Float[Tensor, "n n_z"],
+        actions: Float[Tensor, "n n_a"],
+    ) -> Float[Tensor, "samples n_s"]:
+        """All states at n + 1 samples, from those that a log holds; here it must hold all.
+
+        A plant overrides it for states that no sensor gives but that follow from the rest, such as filters.
+
+        Args:
+            measured: states that were logged, by name.
+            exogenous: inputs of the n intervals between.
+            actions: applied actions of the n intervals between.
+
+        Raises:
+            ValueError: with the names of the states that are missing.
+        """
+        missing = [state.name for state in self.states if state.name not in measured]
+        if missing:
+            raise ValueError(
+                f"log of plant {self.name!r} holds no {', '.join(missing)}, and the plant does not say how to complete "
+                "its states; log them, name their columns, or override Plant.complete_states."
+            )
+        return torch.stack([measured[state.name] for state in self.states], -1)
+
     # Randomness, always from the generator that is passed in
 
     @abstractmethod

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.compilation import compiled_if
 from rt_torchrl.engines.parallel_adjoint import linearise, piecewise
-from rt_torchrl.engines.recurrence import march, march_by_scan
+from rt_torchrl.engines.recurrence import march, march_by_scan, march_by_step
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import drive_of
@@ -28,12 +28,13 @@ class Sensitivities:
     Args:
         plant: the physics.
         closure: its trainable weights are what is varied, flattened in the order of ``parameters()``.
-        compiled: compile recurrences and Jacobians.
+        compiled: compile recurrences and Jacobians, for trajectories that all have the same length.
+        compiled_step: compile one interval instead, which then serves trajectories of any length.
     """
 
-    def __init__(self, plant: Plant, closure: nn.Module, *, compiled: bool = False):
+    def __init__(self, plant: Plant, closure: nn.Module, *, compiled: bool = False, compiled_step: bool = False):
         self.interval = Interval(plant, closure, None)
-        self._march = compiled_if(compiled, march_by_scan, march)
+        self._march = march_by_step if compiled_step else compiled_if(compiled, march_by_scan, march)
         self._linearise = compiled_if(compiled, linearise)
         self._weight_jacobians = compiled_if(compiled, weight_jacobians)
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
@@ -44,15 +45,29 @@ class Sensitivities:
         initial_state: Float[Tensor, "batch n_s"],
         exogenous: Float[Tensor, "batch n n_z"],
         actions: Float[Tensor, "batch n n_a"],
+        *,
+        start: float = 0.0,
+        initial: bool = False,
     ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_w"]]:
-        """States s_1 ... s_n and their sensitivities S_1 ... S_n."""
-        drive = drive_of(self.interval.plant, exogenous, actions)
+        """States s_1 ... s_n and their sensitivities S_1 ... S_n.
+
+        Args:
+            initial_state: s_0 of each trajectory.
+            exogenous: z, held over each interval.
+            actions: held likewise.
+            start: time of s_0 [s].
+            initial: append n_s columns, ds_k/ds_0.
+        """
+        drive = drive_of(self.interval.plant, exogenous, actions, start=start)
         initial_state = initial_state.clone(memory_format=torch.contiguous_format)
         ends = self._march(self.interval, initial_state, drive)
         starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])
         names = tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
         A = piecewise(self._linearise, self.interval, starts, drive)
-        B = self._weight_jacobians(self.interval, names, starts, drive)
+        B = self._weight_jacobians(self.interval, names, starts, drive) if names else A[..., :0]
+        if initial:
+            # s_0 acts like weights that are used in the first interval alone.
+            B = torch.cat([B, torch.cat([A[:1], torch.zeros_like(A[1:])])], -1)
         return ends.transpose(0, 1), self._propagate(A, B).transpose(0, 1)
 
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.envs.wind_turbine.completion import completed
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.merit import merit
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
@@ -256,6 +257,12 @@ class WindTurbine(Plant):
 
     def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
         return merit(self, states, applied, exogenous)
+
+    def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
+        """From the rotor speed alone: the filters start settled, the last actions are those of the record."""
+        if "rotor_speed" not in measured:
+            return super().complete_states(measured, exogenous, actions)
+        return completed(self, measured, exogenous, actions)
 
     # Randomness
 

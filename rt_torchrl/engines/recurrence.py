@@ -4,6 +4,7 @@ import torch
 from hoptorch.scan import scan
 from torch import Tensor
 
+from rt_torchrl.compilation import compiled_if
 from rt_torchrl.interval import Drive, Interval
 
 
@@ -27,3 +28,17 @@ def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Te
     # A slice with a batch of one counts as contiguous whatever its strides are; a copy has the ones scan wants.
     start = initial_state.clone(memory_format=torch.contiguous_format)
     return scan(body, start, tuple(drive))[1]
+
+
+def march_by_step(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    """The same by a loop over one compiled interval: slower than the scan, but compiled once for all lengths."""
+    step = compiled_if(True, _one_interval)
+    state, states = initial_state, []
+    for k in range(drive.t.shape[0]):
+        state = step(interval, state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
+        states.append(state)
+    return torch.stack(states)
+
+
+def _one_interval(interval: Interval, state: Tensor, drive: Drive) -> Tensor:
+    return interval(state, drive)

@@ -89,9 +89,13 @@ def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
 
 def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
     """Times of the samples in s, min or h, whichever is read best, and the axis label."""
-    horizon = plant.dt * samples
-    unit, length = ("s", 1.0) if horizon <= 1500.0 else ("min", 60.0) if horizon <= 10_800.0 else ("h", 3600.0)
+    unit, length = time_unit(plant.dt * samples)
     return plant.dt / length * np.arange(samples), f"time [{unit}]"
+
+
+def time_unit(seconds: float) -> tuple[str, float]:
+    """Unit in which a length of time is read best, and its length [s]."""
+    return ("s", 1.0) if seconds <= 1500.0 else ("min", 60.0) if seconds <= 10_800.0 else ("h", 3600.0)
 
 
 def with_unit(value: float, unit: str) -> str:

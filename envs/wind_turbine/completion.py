@@ -1,0 +1,55 @@
+r"""The turbine's filters and last actions, from the signals that a turbine logs: rotor speed, actions and wind.
+
+The filters are first-order lags :math:`T\dot{\hat y} = y - \hat y`, settled at the start of the record:
+
+.. math:: \hat y_{k+1} = e^{-\Delta t/T}\hat y_k + (1 - e^{-\Delta t/T})\,\bar y_k
+
+with :math:`\bar y_k` the held wind, or the mean of the speeds at both ends of the interval.
+"""
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from scipy.signal import lfilter
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+
+
+def completed(
+    plant: "WindTurbine",
+    measured: dict[str, Float[Tensor, " samples"]],
+    exogenous: Float[Tensor, "n 1"],
+    actions: Float[Tensor, "n 2"],
+) -> Float[Tensor, "samples 6"]:
+    """All six states; a filter that was logged itself is taken as it is."""
+    omega_g = plant.gear_ratio * measured["rotor_speed"]
+    wind = exogenous[:, 0]
+    constant = 1.0 / (2.0 * math.pi * plant.filter_frequency)
+
+    def filtered(name: str, start: Tensor, driving: Tensor, time_constant: float) -> Tensor:
+        return measured[name] if name in measured else lag(start, driving, plant.dt / time_constant)
+
+    omega_hat = filtered("filtered_generator_speed", omega_g[0], between(omega_g), constant)
+    u_hat = filtered("filtered_wind_speed", wind[0], wind, constant)
+    e1 = plant.speed_error(omega_hat, u_hat)
+    window = 2.0 * math.pi / plant.rated_rotor_speed
+    e2 = filtered("speed_error_integral", e1[0], between(e1), window)
+    # What was applied before the record is not known; the first action leaves the rate limits free.
+    last = torch.cat([actions[:1], actions])
+    return torch.cat([torch.stack([measured["rotor_speed"], omega_hat, u_hat, e2], -1), last], -1)
+
+
+def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:
+    """Mean of both ends of every interval."""
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def lag(start: Tensor, driving: Float[Tensor, " n"], steps: float) -> Float[Tensor, " samples"]:
+    """First-order lag from ``start``, with dt ``steps`` of its time constant."""
+    decay = math.exp(-steps)
+    ends, _ = lfilter([1.0 - decay], [1.0, -decay], driving.numpy(), zi=[decay * start.item()])
+    return torch.cat([start.reshape(1), torch.from_numpy(ends)])

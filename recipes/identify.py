@@ -1,0 +1,174 @@
+"""Train a plant's twin on a recorded log, without control: ``identify.py log.csv --plant wind_turbine``."""
+
+import json
+import math
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from rt_torchrl.catalogue import plants
+from rt_torchrl.figures import identification as charts
+from rt_torchrl.identification import (
+    Identification,
+    IdentificationConfig,
+    Identified,
+    held_back,
+    measured_states,
+)
+from rt_torchrl.log import Column, checked, read_log
+from rt_torchrl.plant import Plant
+from rt_torchrl.resampling import Resampled, hold_out, resample
+from rt_torchrl.runner import can_compile, main_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Train a plant's twin on a recorded log, without control.
+
+    Args:
+        log: CSV or Parquet file with a column for the time, each action, each exogenous input and the states that are
+            measured.
+        plant: name of the folder under envs that holds the physics.
+        columns: columns that are not named as their signal or have another unit, as HEADER=SIGNAL*FACTOR+OFFSET.
+        drop: leave out rows with a missing value or one out of range; they become gaps.
+        dt: control interval of the twin [s]; by default the plant's own.
+        gap: longest time between two rows that is bridged [s]; by default three sampling intervals.
+        shortest: control intervals below which a part between gaps is left out.
+        held_out: share at the end of the log that the twin is judged on and not trained on.
+        seed: of the closure's first weights, where these are random.
+        compiled: compile with torch.compile; by default for 500 control intervals or more, where this machine can.
+        folder: of the results; by default runs/identify/PLANT/TIME.
+        identification: how the weights are found.
+    """
+
+    log: Annotated[Path, tyro.conf.Positional]
+    plant: str
+    columns: tuple[str, ...] = ()
+    drop: bool = False
+    dt: float | None = None
+    gap: float | None = None
+    shortest: int = 10
+    held_out: float = 0.25
+    seed: int = 0
+    compiled: bool | None = None
+    folder: Path | None = None
+    identification: Annotated[IdentificationConfig, tyro.conf.arg(name="")] = field(
+        default_factory=IdentificationConfig
+    )
+
+    def make_plant(self) -> Plant:
+        """The plant, with the control interval that was asked for."""
+        known = plants()
+        if self.plant not in known:
+            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(known)}.")
+        plant = known[self.plant]()
+        if self.dt is None:
+            return plant
+        return known[self.plant](dt=self.dt, horizon=max(1, round(plant.horizon / self.dt)) * self.dt)
+
+    def make_folder(self) -> Path:
+        """The folder of the results, created."""
+        folder = self.folder or Path("runs") / "identify" / self.plant / time.strftime("%Y%m%d-%H%M%S")
+        try:
+            (folder / "figures").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"folder={folder} cannot be written ({error}); choose another with --folder.") from error
+        return folder
+
+
+def main(config: Config) -> None:
+    plant = config.make_plant()
+    log = checked(read_log(config.log, plant, [Column.parse(text) for text in config.columns]), plant, drop=config.drop)
+    parts = resample(log, plant, gap=config.gap, shortest=config.shortest)
+    training, held_out = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
+    folder = config.make_folder()
+    print(report_of_parts(parts, plant, rows=len(log.times)))
+    steps = sum(len(segment.record.actions) for segment in parts.segments)
+    wanted = steps >= 500 if config.compiled is None else config.compiled
+    measured = measured_states(plant, log)
+    closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
+    task = Identification(
+        plant,
+        closure,
+        free=measured,
+        config=config.identification,
+        compiled=wanted and (config.compiled is True or can_compile(torch.device("cpu"))),
+    )
+    found = task.run(training, held_out)
+    metrics = metrics_of(plant, measured, found, parts) | {
+        "config": asdict(config),
+        "held_back": held_back(plant, parts.segments),
+    }
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2, default=str) + "\n")
+    torch.save({"closure": closure.state_dict()}, folder / "weights.pt")
+    drawn = {"twin_and_log": charts.twin_and_log(plant, measured, training, held_out, found)}
+    drawn["weights"] = charts.weights(found)
+    for name, figure in drawn.items():
+        figure.savefig(folder / "figures" / f"{name}.png", dpi=120)
+    print(table(metrics))
+    print(f"results in {folder}")
+
+
+def metrics_of(plant: Plant, measured: list[int], found: Identified, parts: Resampled) -> dict[str, Any]:
+    """The content of ``metrics.json``, with the errors of the measured states; what is not known is null."""
+    summary: dict[str, Any] = {"plant": plant.name, "iterations": found.iterations}
+    for name in ("training", "held_out"):
+        before, after = getattr(found, name)
+        rms = {
+            plant.states[k].name: {
+                "unit": plant.states[k].unit,
+                "before": before.rms[k].item(),
+                "after": after.rms[k].item(),
+            }
+            for k in measured
+        }
+        summary[name] = {"seconds": after.seconds, "J_p_before": before.J_p, "J_p": after.J_p}
+        summary[name] |= {"J_p_ratio": after.J_p / before.J_p, "rms": rms}
+    summary["autocorrelation"] = {plant.states[k].name: found.autocorrelation[k].item() for k in measured}
+    summary["weights"] = {
+        name: {key: value if math.isfinite(value) else None for key, value in entry.items()}
+        for name, entry in found.weights.items()
+    }
+    described = parts._asdict() | {"segments": [(s.start, len(s.record.actions)) for s in parts.segments]}
+    return summary | {"log": described}
+
+
+def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
+    """What became of the log, for the terminal."""
+    steps = [len(segment.record.actions) for segment in parts.segments]
+    lines = [
+        f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%}), resampled to {sum(steps)} intervals of "
+        f"{plant.dt:g} s in {len(steps)} segments"
+    ]
+    lines += [f"  gap from {first:g} to {last:g} s (limit {parts.gap:g} s)" for first, last in parts.gaps]
+    lines += [f"  left out as too short: {first:g} to {last:g} s" for first, last in parts.too_short]
+    return "\n".join(lines)
+
+
+def table(metrics: dict[str, Any]) -> str:
+    """The results for the terminal."""
+    lines = [f"  {'':<32}{'before':>12}{'after':>12}{'ratio':>12}"]
+    for name in ("training", "held_out"):
+        found, shown = metrics[name], name.replace("_", " ")
+        costs = (found["J_p_before"], found["J_p"], found["J_p_ratio"])
+        lines.append(f"  {'J_p, ' + shown:<32}" + "".join(f"{value:>12.4g}" for value in costs))
+        for state, rms in found["rms"].items():
+            label = f"RMS {state} [{rms['unit']}]"
+            lines.append(f"    {label:<30}{rms['before']:>12.4g}{rms['after']:>12.4g}")
+    correlation = ", ".join(f"{name} {value:.2f}" for name, value in metrics["autocorrelation"].items())
+    lines.append(f"  correlation of neighbouring residuals: {correlation}")
+    lines.append(f"  {'weight':<32}{'before':>12}{'after':>12}{'std. error':>12}")
+    for name, entry in metrics["weights"].items():
+        error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
+        lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
+    shares = {name: share for name, share in metrics["held_back"].items() if share}
+    lines += [f"  the plant's actuators hold back {name} in {share:.1%} of the log" for name, share in shares.items()]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

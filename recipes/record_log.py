@@ -1,0 +1,98 @@
+"""Write the log of a simulated real system, to try ``identify.py`` on: jittered intervals, noisy sensors, a gap."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+
+from rt_torchrl.catalogue import plants
+from rt_torchrl.classical import ClassicalController
+from rt_torchrl.envs.cryogenic_tank.valves import PIValve
+from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.log import Log, logged_states
+from rt_torchrl.plant import Plant
+from rt_torchrl.recorder import ClassicalLaw, Law, policy_law, recorded
+from rt_torchrl.runner import main_of
+
+CONTROLLERS: dict[str, type[ClassicalController]] = {
+    "wind_turbine": JonkmanController,
+    "flapping_wing": TrimmedPD,
+    "cryogenic_tank": PIValve,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Fly one episode of a plant and write what a data logger would.
+
+    Args:
+        log: the file to write, CSV or Parquet.
+        plant: name of the folder under envs.
+        law: what acts: classical for the plant's classical controller, policy for a policy.
+        weights: weights.pt of a training with the paper's policy; by default a policy's first weights, at random.
+        role: which policy of the training.
+        states: names of the states that are logged; by default all.
+        seed: of the episode and of a policy's first weights.
+        horizon: length of the episode [s]; by default the plant's.
+        jitter: greatest difference of a control interval from dt, as a share of dt.
+        noise: standard deviation of the sensors of the states, as a share of what they read.
+        gap: share of the log that is missing from its middle on.
+    """
+
+    log: Annotated[Path, tyro.conf.Positional]
+    plant: str
+    law: Literal["classical", "policy"] = "classical"
+    weights: Path | None = None
+    role: Literal["model_based", "model_free"] = "model_based"
+    states: tuple[str, ...] = ()
+    seed: int = 0
+    horizon: float | None = None
+    jitter: float = 0.4
+    noise: float = 0.005
+    gap: float = 0.02
+
+    def __post_init__(self):
+        if self.plant not in plants():
+            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(plants())}.")
+        if self.law == "classical" and self.plant not in CONTROLLERS:
+            raise ValueError(f"law='classical': of {self.plant!r} no classical controller is known; use policy.")
+        if not 0.0 <= self.gap < 0.5:
+            raise ValueError(f"gap={self.gap} must lie in [0, 0.5), a share of the log.")
+
+
+def main(config: Config) -> None:
+    plant, generator = make_plant(config), torch.Generator().manual_seed(config.seed)
+    law = law_of(config, plant, generator)
+    log = with_gap(recorded(plant, law, generator, jitter=config.jitter, noise=config.noise), config.gap)
+    log = log.without([s.name for s in logged_states(plant) if config.states and s.name not in config.states])
+    log.write(config.log)
+    print(f"{len(log.times)} rows of plant {plant.name!r} in {config.log}: {', '.join(log.columns)}")
+
+
+def make_plant(config: Config) -> Plant:
+    """The plant, with the horizon that was asked for."""
+    kind = plants()[config.plant]
+    return kind() if config.horizon is None else kind(horizon=config.horizon)
+
+
+def law_of(config: Config, plant: Plant, generator: torch.Generator) -> Law:
+    """What acts on the real system."""
+    if config.law == "classical":
+        return ClassicalLaw(CONTROLLERS[config.plant](plant))
+    policy = plant.make_policy(generator)
+    if config.weights:
+        policy.load_state_dict(torch.load(config.weights, weights_only=True)[config.role])
+    return policy_law(plant, policy)
+
+
+def with_gap(log: Log, share: float) -> Log:
+    """Without a share of its rows, from the middle on."""
+    middle, end = 0.5 * log.times[-1], (0.5 + share) * log.times[-1]
+    return log.chosen((log.times <= middle) | (log.times > end))
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,147 @@
+r"""How far a twin is from segments of a log, and how that changes with the closure's weights and the initial states.
+
+.. math:: J_p(w, s_0^1, \dots, s_0^m) = \sum_i\sum_{k=0}^{n_i} L_p(s^i_k, \check s^i_k)\,\Delta t
+
+A sensor's first sample is as noisy as any other, and a system that forgets slowly carries its error through the whole
+segment. The initial states are therefore unknowns beside the weights, and their samples count as any other.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from rt_torchrl.assimilation import discrepancy_derivatives
+from rt_torchrl.gauss_newton import NormalEquations
+from rt_torchrl.plant import Plant
+from rt_torchrl.resampling import Segment
+from rt_torchrl.sensitivity import Sensitivities
+from rt_torchrl.trajectory import DivergenceError
+from rt_torchrl.twin import DigitalTwin
+
+
+class InitialStates(nn.Module):
+    """s_0 of every segment: what was measured, plus trainable offsets of the measured components.
+
+    Args:
+        segments: of the log.
+        free: indices of the states that have an offset.
+        scale: unit of the offsets, by state; about the noise, so that a step of one is neither long nor short.
+    """
+
+    def __init__(self, segments: Sequence[Segment], free: Sequence[int], scale: Float[Tensor, " n_s"]):
+        super().__init__()
+        self.register_buffer("measured", torch.stack([segment.record.states[0] for segment in segments]))
+        self.register_buffer("unit", torch.diag(scale)[list(free)])
+        self.free = tuple(free)
+        self.offsets = nn.Parameter(scale.new_zeros(len(segments), len(self.free)))
+
+    def forward(self) -> Float[Tensor, "segments n_s"]:
+        return self.measured + self.offsets @ self.unit
+
+
+class Replayed(NamedTuple):
+    """A segment as the twin replays it: states s_0 ... s_n, and what every sample says of the unknowns.
+
+    ``gradient`` and ``curvature`` are those of L_p by the state, ``sensitivity`` is that of the state by the unknowns
+    with the places ``index`` in the vector of all.
+    """
+
+    states: Float[Tensor, "samples n_s"]
+    gradient: Float[Tensor, "samples n_s"]
+    curvature: Float[Tensor, "samples n_s n_s"]
+    sensitivity: Float[Tensor, "samples n_s n_local"]
+    index: Int[Tensor, " n_local"]
+
+
+class Misfit:
+    """J_p of a twin on segments of a log.
+
+    Args:
+        twin: its closure's trainable weights come first among the unknowns.
+        segments: of any lengths.
+        initial: the initial states; their offsets come last.
+        weights: whether the closure's weights are unknowns.
+        compiled: compile the interval.
+    """
+
+    def __init__(
+        self,
+        twin: DigitalTwin,
+        segments: Sequence[Segment],
+        initial: InitialStates,
+        *,
+        weights: bool = True,
+        compiled: bool = False,
+    ):
+        self.twin, self.segments, self.initial = twin, list(segments), initial
+        self._sensitivities = Sensitivities(twin.plant, twin.closure, compiled_step=compiled)
+        self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
+        self._shown = self.weight_count if weights else 0
+        self.unknowns = nn.ModuleList([twin.closure, initial] if weights else [initial])
+
+    @property
+    def plant(self) -> Plant:
+        return self.twin.plant
+
+    def cost(self) -> Tensor:
+        """J_p, differentiable by the adjoint of the twin's engine."""
+        total = 0.0
+        for (start, record), first in zip(self.segments, self.initial(), strict=True):
+            flown = self.twin.replay(first[None], record.exogenous[None], record.actions[None], start=start)
+            total = total + self.plant.dt * self.plant.discrepancy(flown.states[0], record.states).sum()
+        return total
+
+    @torch.no_grad()
+    def replays(self) -> list[Replayed]:
+        """Every segment under the present unknowns.
+
+        Raises:
+            DivergenceError: if a state is not finite.
+        """
+        return [self._replay(*numbered) for numbered in enumerate(zip(self.segments, self.initial(), strict=True))]
+
+    def _replay(self, number: int, given: tuple[Segment, Tensor]) -> Replayed:
+        (start, record), first = given
+        ends, S = self._sensitivities(
+            first[None], record.exogenous[None], record.actions[None], start=start, initial=True
+        )
+        self._require_finite(ends[0], start)
+        states = torch.cat([first[None], ends[0]])
+        at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
+        S = torch.cat([at_start[None], S[0]])
+        by_initial = S[..., self.weight_count :] @ self.initial.unit.T
+        g, H = discrepancy_derivatives(self.plant, states[None], record.states[None])
+        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
+
+    @torch.no_grad()
+    def normal_equations(self, replays: Sequence[Replayed] | None = None) -> NormalEquations:
+        """J_p, its gradient and its Gauss-Newton matrix by all unknowns, of ``replays`` that were made already."""
+        count = self._shown + self.initial.offsets.numel()
+        gradient, matrix = self.initial.measured.new_zeros(count), self.initial.measured.new_zeros(count, count)
+        cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
+        for replayed, segment in zip(replays or self.replays(), self.segments, strict=True):
+            S, i = replayed.sensitivity, replayed.index
+            cost = cost + dt * self.plant.discrepancy(replayed.states, segment.record.states).sum()
+            gradient[i] += dt * torch.einsum("ki,kiw->w", replayed.gradient, S)
+            matrix[i[:, None], i] += dt * torch.einsum("kiv,kiw->vw", S, replayed.curvature @ S)
+        return NormalEquations(cost, gradient, matrix)
+
+    def _index(self, number: int) -> Int[Tensor, " n_local"]:
+        free = len(self.initial.free)
+        own = self._shown + number * free + torch.arange(free)
+        return torch.cat([torch.arange(self._shown), own])
+
+    def _require_finite(self, ends: Tensor, start: float) -> None:
+        finite = ends.isfinite().all(-1)
+        if finite.all():
+            return
+        k = int(finite.int().argmin())
+        raise DivergenceError(
+            f"twin of plant {self.plant.name!r} diverged at t = {start + (k + 1) * self.plant.dt:g} s of the log, "
+            f"under {type(self.twin.closure).__name__}; the state before was "
+            f"{ends[k - 1].tolist() if k else 'the initial state'}. Check the units of the columns, use a smaller dt, "
+            "or start from a closure nearer to the system."
+        )

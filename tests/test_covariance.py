@@ -1,0 +1,93 @@
+"""Standard errors of identified weights against linear regression and Monte Carlo."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from straight_line import Line, Slope, flown, line_segment, noise_of
+
+from rt_torchrl.covariance import covariance, named_values, newey_west, standard_errors
+from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.identification import Identification, IdentificationConfig
+from rt_torchrl.misfit import InitialStates, Misfit
+from rt_torchrl.resampling import Segment
+from rt_torchrl.twin import DigitalTwin
+
+
+def regression_error(n, dt, *, smooth):
+    """Standard error of the slope of a line through n samples with such noise, by (XᵀX)⁻¹XᵀΩX(XᵀX)⁻¹."""
+    X = np.stack([np.ones(n), dt * np.arange(n)], -1)
+    omega = np.eye(n)
+    if smooth:
+        omega = 0.5 * np.eye(n) + 0.25 * (np.eye(n, k=1) + np.eye(n, k=-1))
+    inverse = np.linalg.inv(X.T @ X)
+    return math.sqrt((inverse @ X.T @ omega @ X @ inverse)[1, 1])
+
+
+def slope_misfit(segments, free=(0,)):
+    plant = Line()
+    initial = InitialStates(segments, free, torch.ones(1).double())
+    return Misfit(DigitalTwin(plant, Slope()), segments, initial)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_standard_errors_are_those_of_regression(smooth):
+    """Mean over draws of the estimated variance against the exact one, for white and for smoothed noise."""
+    n, found = 300, []
+    for seed in range(10):
+        segment = line_segment(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=smooth))
+        misfit = slope_misfit([segment])
+        slope, first = np.polyfit(0.1 * np.arange(n), segment.record.states[:, 0].numpy(), 1)
+        with torch.no_grad():
+            misfit.twin.closure.w[0] = slope
+            misfit.initial.offsets[:] = first - segment.record.states[0]
+        found.append(covariance(misfit)[0, 0].item())
+    expected = regression_error(n, 0.1, smooth=smooth)
+    # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
+    # that in the error; the window takes another few per cent of the correlation and of the trend.
+    assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
+
+
+def test_scatter_over_logs_is_the_standard_error():
+    """Monte Carlo on the oracle plant: noise drawn anew, weights fitted anew."""
+    plant, config = LinearQuadratic(horizon=4.0), IdentificationConfig(iterations=4)
+    (clean,) = flown(plant, torch.Generator().manual_seed(0), (40,))
+    estimates, errors = [], []
+    for seed in range(12):
+        generator = torch.Generator().manual_seed(100 + seed)
+        noise = 0.02 * torch.randn(clean.record.states.shape, generator=generator, dtype=torch.float64)
+        segment = Segment(0.0, clean.record._replace(states=clean.record.states + noise))
+        closure = LinearClosure(plant.true_closure)
+        task = Identification(plant, closure, free=(0, 1), config=config)
+        task._descend(misfit := Misfit(task.twin, [segment], task._initial([segment], (0, 1))), config.iterations)
+        estimates.append(closure.matrix.detach().flatten().clone())
+        errors.append(torch.tensor(list(standard_errors(misfit).values())))
+    z = (torch.stack(estimates) - torch.tensor(plant.true_closure).double().flatten()) / torch.stack(errors)
+    # 48 standard normal numbers, four at a time correlated: their mean square is 1 within 0.4 or so. With 41 samples
+    # of two states and 4 lags the errors themselves are low by some 10 %.
+    assert 0.5 < (z**2).mean() < 2.2
+
+
+def test_scores_of_white_noise_sum_to_their_variance():
+    scores = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = newey_west(scores)
+    # Fourteen lags of 20 000 samples: 2·14·2/3/20 000 is a scatter of 3 %.
+    torch.testing.assert_close(found / 20_000, torch.eye(2).double(), rtol=0, atol=0.12)
+
+
+def test_named_errors_follow_from_those_of_the_logarithms():
+    """Of a = e^w to first order, σ_a = a σ_w."""
+    plant = FlappingWing(horizon=0.03)
+    segments = flown(plant, torch.Generator().manual_seed(0), (60,))
+    closure = QuasiSteadyPolar.true().requires_grad_(True)
+    noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    noisy = [Segment(0.0, segments[0].record._replace(states=segments[0].record.states + noise))]
+    misfit = Misfit(DigitalTwin(plant, closure), noisy, InitialStates(noisy, (), torch.ones(4).double()))
+    expected = closure.coefficients.detach() * covariance(misfit).diagonal().sqrt()
+    found = standard_errors(misfit)
+    assert list(found) == ["a", "b", "c"]
+    assert list(found.values()) == pytest.approx(expected.tolist(), rel=1e-9)
+    assert list(named_values(LinearClosure(torch.zeros(2, 2)))) == [f"matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]

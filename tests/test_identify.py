@@ -1,0 +1,86 @@
+"""The two recipes around logs, from a recorded file to the results."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.identification import IdentificationConfig
+
+pd = pytest.importorskip("pandas")
+RECIPES = Path(__file__).parent.parent / "recipes"
+
+
+def recipe(name):
+    """The module of a recipe."""
+    spec = importlib.util.spec_from_file_location(f"recipe_{name}", RECIPES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """Half a minute of the turbine under Jonkman's controller, with a gap; the speed in rpm, the time in ms."""
+    path, record = tmp_path_factory.mktemp("log") / "log.csv", recipe("record_log")
+    states = {"states": ("rotor_speed",), "horizon": 30.0, "gap": 0.1}
+    record.main(record.Config(log=path, plant="wind_turbine", **states))
+    table = pd.read_csv(path)
+    table["rpm"], table["ms"] = table.pop("rotor_speed") * 30.0 / np.pi, 1e3 * table.pop("time")
+    table.to_csv(path, index=False)
+    return path
+
+
+COLUMNS = ("rpm=rotor_speed*0.10471975511965977", "ms=time*1e-3")
+
+
+def test_a_log_is_identified_and_the_results_are_written(log, tmp_path, capsys):
+    identify = recipe("identify")
+    config = IdentificationConfig(iterations=2)
+    identify.main(
+        identify.Config(log=log, plant="wind_turbine", columns=COLUMNS, folder=tmp_path, identification=config)
+    )
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    # Dai's coefficients are wrong by some rad/s within half a minute; two steps take most of that away.
+    assert metrics["training"]["J_p_ratio"] < 0.3 and metrics["held_out"]["J_p_ratio"] < 1.0
+    assert list(metrics["training"]["rms"]) == ["rotor_speed"]
+    assert [steps for _, steps in metrics["log"]["segments"]] == [29, 23]
+    # 15 s and 12 s at 0.5 s, less what the jitter takes at the ends.
+    seconds = metrics["training"]["seconds"], metrics["held_out"]["seconds"]
+    assert seconds[1] / sum(seconds) == pytest.approx(0.25, abs=0.03)
+    closure = SaintDrenan.from_set("Dai2016")
+    closure.load_state_dict(torch.load(tmp_path / "weights.pt", weights_only=True)["closure"])
+    after = [entry["after"] for entry in metrics["weights"].values()]
+    assert closure.coefficients.tolist() == pytest.approx(after)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"twin_and_log.png", "weights.png"}
+    shown = capsys.readouterr().out
+    assert "gap from" in shown and "c8" in shown and "J_p, held out" in shown
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"plant": "windmill"}, "plant='windmill' does not exist"),
+        ({"columns": ()}, "no column 'time'"),
+        ({"columns": ("rpm=rotor_speed*1000", COLUMNS[1]), "held_out": 2.0}, "held_out=2.0"),
+        ({"columns": (COLUMNS[0], "ms=time*1e-6")}, "no part of 10"),
+        ({"dt": 60.0}, "unstable"),
+    ],
+)
+def test_what_cannot_be_identified_is_refused(log, tmp_path, options, message):
+    identify = recipe("identify")
+    given = {"log": log, "plant": "wind_turbine", "columns": COLUMNS, "folder": tmp_path} | options
+    with pytest.raises(ValueError, match=message):
+        identify.main(identify.Config(**given))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_recorded_is_refused(tmp_path):
+    record = recipe("record_log")
+    for options, message in (({"plant": "windmill"}, "windmill"), ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5")):
+        with pytest.raises(ValueError, match=message):
+            record.Config(log=tmp_path / "log.csv", **options)

@@ -1,0 +1,272 @@
+"""Recorded logs: columns and units, what is refused, and resampling against closed-form signals."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.log import Column, Log, checked, logged_signals, read_log
+from rt_torchrl.recorder import policy_law, recorded
+from rt_torchrl.resampling import hold_means, hold_out, resample
+from rt_torchrl.trajectory import Rollout
+
+pytest.importorskip("pandas")
+PLANT = LinearQuadratic(dt=0.1)
+TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,1,0,b\n250,3000,0.3,-1,0.5,c\n"
+MAPPING = [Column.parse("t=time*0.001"), Column.parse("x_mm=position*1e-3+2")]
+
+
+def signals(times, **columns):
+    """A log of the oracle plant; columns that are not given are zero."""
+    times = np.asarray(times, dtype=float)
+    zero = dict.fromkeys(("position", "velocity", "force", "disturbance"), np.zeros_like(times))
+    return Log(times=times, columns=zero | columns)
+
+
+def jittered(n, dt=0.1, seed=0):
+    times = dt * (np.arange(n) + 0.6 * (np.random.default_rng(seed).random(n) - 0.5))
+    return times - times[0]
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("omega=rotor_speed", ("omega", "rotor_speed", 1.0, 0.0)),
+        ("rpm=rotor_speed*0.10472", ("rpm", "rotor_speed", 0.10472, 0.0)),
+        ("T [C]=wall_temperature+273.15", ("T [C]", "wall_temperature", 1.0, 273.15)),
+        ("p=pressure*1e5-2.5", ("p", "pressure", 1e5, -2.5)),
+        ("a=b=force*-1e-3+1e2", ("a=b", "force", -1e-3, 1e2)),
+    ],
+)
+def test_columns_are_declared_with_factor_and_offset(text, expected):
+    assert dataclasses.astuple(Column.parse(text)) == expected
+
+
+@pytest.mark.parametrize("text", ["omega", "=force", "x=force*", "x=force*two", "x=force+1+2", "x=force*2*3"])
+def test_columns_that_are_not_understood_are_refused(text):
+    with pytest.raises(ValueError, match="not understood"):
+        Column.parse(text)
+
+
+@pytest.mark.parametrize("text", ["x=force*0", "x=force*nan", "x=force+inf"])
+def test_units_that_lose_the_signal_are_refused(text):
+    with pytest.raises(ValueError, match="finite"):
+        Column.parse(text)
+
+
+def test_a_csv_file_is_read_in_the_signals_units(tmp_path):
+    (tmp_path / "log.csv").write_text(TABLE)
+    log = checked(read_log(tmp_path / "log.csv", PLANT, MAPPING), PLANT)
+    assert log.times.tolist() == pytest.approx([0.0, 0.1, 0.25])
+    assert log.columns["position"].tolist() == pytest.approx([3.0, 4.0, 5.0])
+    assert set(log.columns) == {"position", "velocity", "force", "disturbance"}
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_what_is_written_is_read_again(tmp_path, suffix):
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow")
+    times = jittered(20)
+    log = signals(times, position=np.sin(times), force=np.cos(times))
+    log.write(tmp_path / f"log.{suffix}")
+    again = read_log(tmp_path / f"log.{suffix}", PLANT)
+    # Decimal digits of the shortest form that is read back, to rounding of the parser.
+    np.testing.assert_allclose(again.times, log.times, rtol=1e-15)
+    for name, values in log.columns.items():
+        np.testing.assert_allclose(again.columns[name], values, rtol=1e-15)
+
+
+def test_dates_are_counted_from_the_first_row(tmp_path):
+    rows = ["2024-03-31 00:59:59.5+01:00", "2024-03-31 03:00:00+02:00", "2024-03-31T01:00:02Z"]
+    text = "time,force,disturbance\n" + "".join(f"{row},0,0\n" for row in rows)
+    (tmp_path / "log.csv").write_text(text)
+    # The clocks were put forward in between: 23:59:59.5, 1:00:00 and 1:00:02 UTC.
+    assert read_log(tmp_path / "log.csv", PLANT).times.tolist() == [0.0, 3600.5, 3602.5]
+
+
+@pytest.mark.parametrize(
+    "table, columns, message",
+    [
+        (TABLE, [], "no column 'time'"),
+        (TABLE, ["when=time"], "column 'when' for 'time'"),
+        (TABLE, ["t=clock"], "has the signals time, position"),
+        (TABLE, ["t=time", "x_mm=position", "velocity=position"], "name a signal twice"),
+        (TABLE, ["t=time", "note=position"], "what is no number"),
+        ("time,force\n0,1\n0.1,1\n", [], "no column disturbance"),
+        (TABLE.replace("100,", "0,"), ["t=time"], "row 1 of the log .* the same time"),
+        (TABLE.replace("250,", "50,"), ["t=time"], "row 2 of the log .* an earlier time"),
+        (TABLE.replace("100,", ",", 1), ["t=time"], "1 of them without a time"),
+        (TABLE.replace("-1,0.5", ",0.5"), MAPPING, "force is nan N in row 2"),
+        (TABLE.replace("-1,0.5", "-2.5,0.5"), MAPPING, "force is -2.5 N in row 2 .* from -2 to 2 N"),
+        (TABLE.splitlines()[0] + "\n", ["t=time"], "0 rows"),
+    ],
+)
+def test_logs_that_cannot_drive_a_twin_are_refused(tmp_path, table, columns, message):
+    (tmp_path / "log.csv").write_text(table)
+    declared = [column if isinstance(column, Column) else Column.parse(column) for column in columns]
+    with pytest.raises(ValueError, match=message):
+        checked(read_log(tmp_path / "log.csv", PLANT, declared), PLANT)
+
+
+def test_files_that_cannot_be_read_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_log(tmp_path / "none.csv", PLANT)
+    with pytest.raises(ValueError, match="must be one of .csv, .parquet"):
+        read_log(tmp_path / "log.xlsx", PLANT)
+
+
+def test_bad_rows_become_gaps_on_demand():
+    force = np.zeros(100)
+    force[[30, 31, 32, 33, 60]] = [3.0, np.nan, 3.0, 3.0, np.inf]
+    log = checked(signals(0.1 * np.arange(100), force=force), PLANT, drop=True)
+    assert len(log.times) == 95
+    parts = resample(log, PLANT)
+    # Four rows make a pause of 0.5 s, longer than three intervals; one row a pause of 0.2 s, which is bridged.
+    assert [len(segment.record.actions) for segment in parts.segments] == [29, 65]
+    assert parts.gaps == [(pytest.approx(2.9), pytest.approx(3.4))]
+
+
+def test_instantaneous_signals_are_interpolated():
+    """A line exactly, a sine to h²/8 of its curvature, h the longest interval."""
+    times = jittered(200)
+    log = signals(times, position=2.0 - 0.3 * times, velocity=np.sin(times))
+    (segment,) = resample(log, PLANT).segments
+    t = torch.arange(len(segment.record.states), dtype=torch.float64) * PLANT.dt
+    torch.testing.assert_close(segment.record.states[:, 0], 2.0 - 0.3 * t, rtol=0, atol=1e-12)
+    error = (segment.record.states[:, 1] - t.sin()).abs().max().item()
+    bound = np.diff(times).max() ** 2 / 8.0
+    assert 0.2 * bound < error < bound
+
+
+def test_held_signals_are_averaged_over_the_interval():
+    """Against the integral of the steps by a fine sum, and with nothing lost over the whole record."""
+    times = jittered(50)
+    values = np.random.default_rng(1).normal(size=50)
+    grid = 0.1 * np.arange(45)
+    found = hold_means(times, values, grid)
+    fine = (np.arange(44 * 1000) + 0.5) * 1e-4
+    held = values[np.searchsorted(times, fine, side="right") - 1].reshape(44, 1000).mean(-1)
+    # At most two steps an interval, each up to 4 high and wrong by at most a thousandth of the interval.
+    np.testing.assert_allclose(found, held, atol=8e-3)
+    whole = hold_means(times, values, np.array([0.0, times[-1]]))[0]
+    assert whole == pytest.approx((values[:-1] * np.diff(times)).sum() / times[-1], rel=1e-12)
+
+
+def test_a_regular_log_is_taken_as_it_is():
+    n = 40
+    values = np.random.default_rng(2).normal(size=(2, n))
+    log = signals(5.0 + 0.1 * np.arange(n), position=values[0], force=values[1])
+    (segment,) = resample(log, PLANT).segments
+    assert segment.start == 5.0
+    # Rounding of the times.
+    np.testing.assert_allclose(segment.record.states[:, 0].numpy(), values[0], atol=1e-11)
+    np.testing.assert_allclose(segment.record.actions[:, 0].numpy(), values[1, :-1], atol=1e-11)
+
+
+def test_gaps_split_and_short_parts_are_left_out_and_told():
+    times = np.concatenate([np.arange(0, 50), np.arange(60, 63), np.arange(80, 130)]) * 0.1
+    parts = resample(signals(times), PLANT)
+    assert [(round(s.start, 9), len(s.record.actions)) for s in parts.segments] == [(0.0, 49), (8.0, 49)]
+    assert np.allclose(parts.gaps, [(4.9, 6.0), (6.2, 8.0)]) and np.allclose(parts.too_short, [(6.0, 6.2)])
+    assert (parts.interval, parts.gap) == (pytest.approx(0.1), pytest.approx(0.3))
+    assert parts.jitter < 1e-9
+    # A longer limit bridges the first gap, a still longer one both.
+    assert [len(s.record.actions) for s in resample(signals(times), PLANT, gap=1.2).segments] == [62, 49]
+    assert [len(s.record.actions) for s in resample(signals(times), PLANT, gap=2.0).segments] == [129]
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [({"gap": 0.0}, "gap=0.0"), ({"shortest": 1}, "shortest=1"), ({"shortest": 99}, "no part of 99")],
+)
+def test_splits_that_leave_nothing_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        resample(signals(0.1 * np.arange(50)), PLANT, **options)
+
+
+def test_the_end_is_held_out():
+    times = np.concatenate([np.arange(0, 51), np.arange(100, 151)]) * 0.1
+    segments = resample(signals(times, position=times), PLANT).segments
+    training, held_out = hold_out(segments, PLANT.dt, 0.25)
+    lengths = [[len(s.record.actions) for s in part] for part in (training, held_out)]
+    assert lengths == [[50, 25], [25]]
+    assert held_out[0].start == pytest.approx(12.5)
+    assert held_out[0].record.states[0, 0] == training[1].record.states[-1, 0] == pytest.approx(12.5)
+    # A cut that would leave five intervals moves to the end of the segment.
+    assert [len(s.record.actions) for s in hold_out(segments, PLANT.dt, 0.45)[0]] == [50]
+    for share in (0.0, 1.0, math.nan):
+        with pytest.raises(ValueError, match="between 0 and 1"):
+            hold_out(segments, PLANT.dt, share)
+    with pytest.raises(ValueError, match="judge by"):
+        hold_out(segments[:1], PLANT.dt, 0.1)
+
+
+def test_states_that_no_sensor_gives_are_refused_by_name():
+    log = signals(0.1 * np.arange(50)).without(["velocity"])
+    with pytest.raises(ValueError, match="holds no velocity"):
+        resample(log, PLANT)
+
+
+def test_the_turbine_completes_its_filters():
+    """From the rotor speed alone, against the plant's own integration of them."""
+    plant = WindTurbine(horizon=120.0)
+    generator = torch.Generator().manual_seed(1)
+    wind = plant.draw_exogenous(1, generator)
+    start = plant.draw_initial_state(1, generator)
+    start[:, 2] = wind[:, 0, 0]  # settled, as the completion takes it
+    start[:, 3] = plant.speed_error(start[:, 1], start[:, 2])
+    torque = 25e3 + 1e3 * torch.sin(0.1 * torch.arange(plant.n_steps))
+    command = torch.stack([torque, torch.zeros_like(torque)], -1)[None].double()
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure)(start, wind, command)
+    found = plant.complete_states({"rotor_speed": flown.states[0, :, 0]}, wind[0], flown.actions[0])
+    # The mean of both ends is the integral to second order: (Δt/T)²/12 of what a filter of 4 s or 5 s is driven by.
+    scale = flown.states[0].abs().amax(0).clamp_min(1e-9)
+    error = (found - flown.states[0]).abs()[1:] / scale
+    assert (error[:, 1:4] < 2e-3).all() and (error[:, [0, 4, 5]] == 0.0).all()
+    given = torch.full((plant.n_steps + 1,), 9.0, dtype=torch.float64)
+    measured = {"rotor_speed": flown.states[0, :, 0], "filtered_wind_speed": given}
+    assert torch.equal(plant.complete_states(measured, wind[0], flown.actions[0])[:, 2], given)
+    with pytest.raises(ValueError, match="rotor_speed"):
+        plant.complete_states({}, wind[0], flown.actions[0])
+
+
+def test_remembered_actions_have_no_column_of_their_own():
+    names = [signal.name for signal in logged_signals(WindTurbine(horizon=10.0))]
+    assert names.count("generator_torque") == names.count("blade_pitch") == 1
+
+
+def test_a_recorder_without_jitter_writes_the_plants_own_trajectory():
+    plant = FlappingWing(horizon=0.02)
+    policy = plant.make_policy(torch.Generator().manual_seed(0))
+    log = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(1)
+    start, wind = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure, policy)(start, wind)
+    # The same steps, with Δt as the difference of two times.
+    for k, state in enumerate(plant.states):
+        np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(log.columns["headwind"][:-1], wind[0, :, 0].numpy())
+    for option in ("jitter", "noise"):
+        with pytest.raises(ValueError, match=f"{option}=1.0"):
+            recorded(plant, policy_law(plant, policy), generator, **{option: 1.0})
+
+
+def test_jitter_and_noise_are_as_large_as_asked():
+    plant = LinearQuadratic(horizon=100.0)
+    law = policy_law(plant, plant.make_policy(torch.Generator().manual_seed(0)))
+    log, clean = (
+        recorded(plant, law, torch.Generator().manual_seed(2), jitter=0.4, noise=noise) for noise in (0.05, 0.0)
+    )
+    intervals = np.diff(log.times) / plant.dt
+    # Differences of uniform numbers on ±0.2: triangular on ±0.4, of deviation 0.4/√6; 1000 of them, five deviations.
+    assert 0.6 <= intervals.min() < 0.7 and 1.3 < intervals.max() <= 1.4
+    assert intervals.std() == pytest.approx(0.4 / math.sqrt(6.0), rel=0.1)
+    assert (log.columns["position"] / clean.columns["position"]).std() == pytest.approx(0.05, rel=0.12)
+    assert np.array_equal(log.columns["force"], clean.columns["force"])

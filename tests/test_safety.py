@@ -1,0 +1,261 @@
+"""The safety layer: limits by their formulas, the watchdog under a clock of the test, and what is learned from."""
+
+import json
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from tensordict.nn import TensorDictModule
+from test_algorithm import twinning
+from torchrl.envs import GymEnv
+from torchrl.envs.utils import check_env_specs
+
+from rt_torchrl.algorithm import ReinforcementTwinning
+from rt_torchrl.environment import PlantEnv
+from rt_torchrl.safety import SafetyConfig, SafetyLayer
+
+DT = 0.1
+
+
+class Clock:
+    """Time passes when the test says so."""
+
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+class Failing(PlantEnv):
+    """A system whose observation fails, and comes late, at the steps that the test names; steps count from 0."""
+
+    def __init__(self, plant, clock, *, broken=(), late=(), value=float("nan")):
+        super().__init__(plant, seed=0)
+        self.clock, self.broken, self.late, self.value = clock, set(broken), set(late), value
+
+    def _step(self, tensordict):
+        k = int(self._step_count)
+        found = super()._step(tensordict)
+        self.clock.now += 0.5 if k in self.late else 0.01
+        if k in self.broken:
+            found["observation"] = found["observation"].index_fill(-1, torch.tensor([0]), self.value)
+        return found
+
+
+def layer(env=None, *, fallback=(0.0,), clock=None, horizon=2.0, **options):
+    env = PlantEnv(LinearQuadratic(horizon=horizon), seed=0) if env is None else env
+    return SafetyLayer(env, SafetyConfig(interval=DT, **options), fallback=fallback, clock=clock or Clock())
+
+
+def failing(clock=None, horizon=2.0, broken=(), late=(), value=float("nan"), **options):
+    clock = clock or Clock()
+    env = Failing(LinearQuadratic(horizon=horizon), clock, broken=broken, late=late, value=value)
+    return layer(env, clock=clock, **options)
+
+
+def fly(env, asked, steps=None):
+    """An episode in which the policy asks for these numbers."""
+    asked = iter(asked)
+    policy = TensorDictModule(
+        lambda e: torch.full((*e.shape[:-1], 1), float(next(asked)), dtype=torch.float64), ["observation"], ["action"]
+    )
+    return env.rollout(steps or 20, policy)
+
+
+def applied(episode):
+    return episode["next", "applied"].flatten().tolist()
+
+
+def test_range_then_rate_are_exact():
+    """a_k = clip(clip(asked, −1, 1.5), a_{k−1} ± r Δt) by a loop over plain numbers."""
+    asked = [0.1, 3.0, 3.0, 0.9, -2.0, -2.0, -2.0, -2.0, -2.0, -2.0, 0.5, 0.55, 0.5, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0, -2.0]
+    episode = fly(layer(low=(-1.0,), high=(1.5,), rates=(4.0,), rest=(0.0,)), asked)
+    last, expected = 0.0, []
+    for value in asked:
+        last = min(max(min(max(value, -1.0), 1.5), last - 0.4), last + 0.4)
+        expected.append(last)
+    # Rounding of sums of up to four increments.
+    assert applied(episode) == pytest.approx(expected, abs=1e-14)
+    assert episode["action"].flatten().tolist() == asked
+    assert max(applied(episode)) == 1.5 and min(applied(episode)) == -1.0
+
+
+def test_the_system_gets_what_is_applied():
+    """The states are those of the bare system under the applied actions."""
+    asked = torch.linspace(-4.0, 4.0, 20).tolist()
+    episode = fly(layer(rates=(5.0,), high=(1.0,)), asked)
+    bare = fly(PlantEnv(LinearQuadratic(horizon=2.0), seed=0), applied(episode))
+    assert torch.equal(episode["next", "state"], bare["next", "state"])
+    assert applied(episode) != asked
+
+
+def test_nothing_is_touched_within_the_limits():
+    asked = (1.5 * torch.sin(torch.arange(20.0))).tolist()
+    env = layer(rates=(40.0,), ranges={"observation": (-1e3, 1e3)}, deadline=1.0)
+    episode, bare = fly(env, asked), fly(PlantEnv(LinearQuadratic(horizon=2.0), seed=0), asked)
+    for key in ("observation", "state", "reward", "applied", "truncated", "terminated", "done"):
+        assert torch.equal(episode["next", key], bare["next", key])
+    assert not env.report.events and not env.report.counts
+
+
+def test_the_first_action_is_free_without_a_rest_and_the_fallback_is_limited_too():
+    env = failing(broken=[2], rates=(5.0,), fallback=(-2.0,), hold=0.3)
+    assert applied(fly(env, [2.0] * 20))[:8] == pytest.approx([2.0, 2.0, 2.0, 1.5, 1.0, 0.5, 1.0, 1.5], abs=1e-14)
+
+
+def test_a_broken_observation_trips_for_the_hold_time_and_is_held():
+    env = failing(broken=[4, 5], fallback=(-1.0,), hold=0.3)
+    episode = fly(env, [0.5] * 20)
+    # The observations after steps 4 and 5 are broken, at 0.5 and 0.6 s: the fallback acts from 0.5 s to 0.9 s.
+    assert applied(episode) == [0.5] * 5 + [-1.0] * 4 + [0.5] * 11
+    assert episode["next", "tripped"].flatten().tolist() == [4 <= k <= 7 for k in range(20)]
+    observation = episode["next", "observation"]
+    assert observation.isfinite().all()
+    assert (observation[0, 4:6, 0] == observation[0, 3, 0]).all()
+    # The other component was a number and is passed on.
+    assert torch.equal(observation[..., 1], episode["next", "state"][..., 1])
+    assert env.report.counts == {"not finite": 2, "fallback": 4}
+    first = env.report.events[0]
+    assert (first.step, first.reasons, first.asked, first.applied) == (4, {"not finite": "observation"}, [0.5], [0.5])
+    assert first.time == pytest.approx(0.4)
+    assert [event.step for event in env.report.events] == [4, 5, 6, 7, 8]
+
+
+def test_without_a_hold_time_the_fallback_acts_for_one_interval():
+    assert applied(fly(failing(broken=[4], fallback=(-1.0,)), [0.5] * 20)) == [0.5] * 5 + [-1.0] + [0.5] * 14
+
+
+def test_a_value_out_of_range_trips_and_is_passed_on():
+    env = failing(broken=[3], value=7.0, fallback=(-1.0,), ranges={"observation": ((-5.0, -50.0), (5.0, 50.0))})
+    episode = fly(env, [0.5] * 20)
+    assert applied(episode) == [0.5] * 4 + [-1.0] + [0.5] * 15
+    assert episode["next", "observation"][0, 3, 0] == 7.0
+    assert env.report.counts == {"out of range": 1, "fallback": 1}
+
+
+def test_a_late_observation_trips():
+    env = failing(late=[6], fallback=(-1.0,), deadline=0.2)
+    assert applied(fly(env, [0.5] * 20)) == [0.5] * 7 + [-1.0] + [0.5] * 12
+    assert env.report.counts == {"late": 1, "fallback": 1}
+    assert env.report.events[0].reasons == {"late": "0.5 s, deadline 0.2 s"}
+
+
+def test_an_action_that_is_no_number_is_replaced_at_once():
+    env = layer(fallback=(-1.0,))
+    assert applied(fly(env, [0.5] * 3 + [float("nan")] + [0.5] * 16)) == [0.5] * 3 + [-1.0] + [0.5] * 16
+    assert env.report.counts == {"asked": 1, "fallback": 1}
+
+
+def test_an_episode_that_stays_tripped_is_truncated_not_terminated():
+    env = failing(broken=range(5, 20), fallback=(-1.0,), patience=0.4)
+    episode = fly(env, [0.5] * 20)
+    # Tripped at 0.6 s, the end of step 5; 0.4 s later is the end of step 9.
+    assert episode.shape[1] == 10
+    assert episode["next", "truncated"][0, -1] and episode["next", "done"][0, -1]
+    assert not episode["next", "terminated"].any() and not episode["next", "done"][0, :-1].any()
+    assert env.report.counts["truncated"] == 1
+    # One that recovers in between is not.
+    assert fly(failing(broken=[5, 6, 8, 9, 11, 12], fallback=(-1.0,), patience=0.4), [0.5] * 20).shape[1] == 20
+
+
+def test_a_controller_as_fallback_sees_the_last_finite_observation():
+    env = failing(broken=[4], fallback=lambda found: 0.25 * found["observation"][..., :1])
+    episode = fly(env, [0.5] * 20)
+    assert applied(episode)[5] == 0.25 * episode["next", "observation"][0, 3, 0].item()
+
+
+def test_events_are_written_as_json_lines_and_a_new_episode_begins_anew(tmp_path):
+    path = tmp_path / "deep" / "events.jsonl"
+    env = failing(broken=[19], fallback=(-1.0,), hold=1.0, log=path)
+    for _ in range(2):
+        # The watchdog is tripped at the end of the episode; the next one does not inherit that.
+        assert applied(fly(env, [float("nan")] + [3.0] * 19))[:12] == [-1.0] * 10 + [2.0] * 2
+    found = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [report.counts for report in env.reports] == [{"asked": 1, "fallback": 10, "range": 10, "not finite": 1}] * 2
+    assert [(entry["episode"], entry["step"]) for entry in found] == [(n, k) for n in range(2) for k in range(20)]
+    assert found[0]["asked"] == [None] and found[0]["applied"] == [-1.0] and "asked" in found[0]["reasons"]
+
+
+def test_reinforcement_twinning_learns_from_what_was_applied():
+    plant = LinearQuadratic(horizon=2.0)
+    parts = twinning(plant)
+    env = layer(PlantEnv(plant, seed=0), rates=(1.0,), rest=(0.0,))
+    found = ReinforcementTwinning(
+        env, parts.twin, config=parts.config, generator=torch.Generator().manual_seed(0), **parts.policies
+    )
+    report = found.episode()
+    assert report["J_p"].isfinite() and env.report.counts["rate"] > 0 and len(env.reports) == 1
+    record = found.short_term[-1]
+    steps = torch.cat([torch.zeros(1, 1, dtype=torch.float64), record.actions]).diff(dim=0)
+    assert steps.abs().max() <= 0.1 + 1e-14
+    held = {event.step: event.applied for event in env.report.events}
+    for k, value in held.items():
+        assert record.actions[k].tolist() == value
+    assert torch.equal(found.long_term._buffer[:]["action"], record.actions)
+
+
+def test_specs_hold_around_both_kinds_of_systems():
+    check_env_specs(layer())
+    pytest.importorskip("gymnasium")
+    check_env_specs(layer(GymEnv("Pendulum-v1"), rates=(10.0,)))
+
+
+def test_a_gymnasium_system_is_guarded_in_its_own_precision():
+    pytest.importorskip("gymnasium")
+    limits = {"rates": (8.0,), "rest": (0.0,), "ranges": {"observation": (-2.0, 2.0)}, "hold": 0.0}
+    env = SafetyLayer(GymEnv("Pendulum-v1"), SafetyConfig(interval=0.05, **limits), fallback=(0.0,))
+    env.set_seed(0)
+    torch.manual_seed(0)
+    episode = env.rollout(200, break_when_any_done=False)
+    sent = torch.cat([torch.zeros(1, 1), episode["next", "applied"]])
+    assert sent.dtype == torch.float32 and sent.abs().max() <= 2.0
+    # Single precision of numbers up to two.
+    assert sent.diff(dim=0).abs().max() <= 0.4 + 1e-6
+    fast = (episode["next", "observation"].abs() > 2.0).any(-1)
+    assert torch.equal(fast, episode["next", "tripped"].flatten())
+    assert env.report.counts["out of range"] == fast.sum() > 0
+
+
+def test_what_the_layer_does_not_have_is_the_systems():
+    env = layer()
+    assert isinstance(env.plant, LinearQuadratic) and env.closure is env.plant.closure
+    state = env.state_dict()
+    first = env.reset()["state"]
+    env.load_state_dict(state)
+    assert torch.equal(env.reset()["state"], first)
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = env.nonsense
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"rates": (0.0,)}, "rates"),
+        ({"rates": (1.0, 2.0)}, "rates"),
+        ({"low": (3.0,)}, "low"),
+        ({"fallback": (float("nan"),)}, "fallback"),
+        ({"rest": (0.0, 0.0)}, "rest"),
+        ({"deadline": 0.0}, "deadline=0.0"),
+        ({"hold": -1.0}, "hold=-1.0"),
+        ({"patience": -1.0}, "patience=-1.0"),
+        ({"ranges": {"observation": (1.0, 1.0)}}, "range of 'observation'"),
+        ({"ranges": {"speed": (0.0, 1.0)}}, "speed"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        layer(**options)
+
+
+def test_what_cannot_be_guarded_is_refused():
+    with pytest.raises(ValueError, match="batch_size=\\(2,\\)"):
+        layer(PlantEnv(LinearQuadratic(), batch_size=2))
+    with pytest.raises(ValueError, match="interval=0.0"):
+        SafetyConfig(interval=0.0)
+    with pytest.raises(ValueError, match="begins with a fault"):
+        layer(ranges={"observation": (100.0, 101.0)}).reset()
+    with pytest.raises(ValueError, match="fallback gave"):
+        fly(failing(broken=[1], fallback=lambda found: torch.full((1, 1), torch.nan)), [0.0] * 20)
+    pytest.importorskip("gymnasium")
+    with pytest.raises(ValueError, match="continuous entry"):
+        layer(GymEnv("CartPole-v1"))
