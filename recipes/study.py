@@ -105,8 +105,8 @@ class Config:
         """The oracle and the classical controllers of a plant; each is computed once and kept."""
         place = self.kept / "yardsticks" / plant
         unseen = QUICK_UNSEEN if self.quick else self.unseen
-        starts, iterations, evaluations, episodes = (1, 10, 5, 3) if self.quick else (3, 60, 80, 20)
-        best = {"unseen": unseen, "starts": starts, "iterations": iterations}
+        starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
+        best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
         tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
         found = {"oracle": partial(oracle, plant, place / "oracle.json", **best)}
         for name, kind in CONTROLLERS[plant].items():

@@ -25,7 +25,7 @@ def kept(path: Path, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def oracle(plant: str, path: Path, *, unseen: int, starts: int, iterations: int) -> dict[str, Any]:
+def oracle(plant: str, path: Path, *, unseen: int, starts: int, iterations: int, polish: int) -> dict[str, Any]:
     """The plant's own policy, optimised with exact gradients on the true plant and on the unseen episodes themselves.
 
     Args:
@@ -33,7 +33,8 @@ def oracle(plant: str, path: Path, *, unseen: int, starts: int, iterations: int)
         path: file to keep the result in.
         unseen: number of unseen episodes.
         starts: number of random initial weights.
-        iterations: gradients from each.
+        iterations: gradients from each, on a few of the episodes.
+        polish: gradients of the best, on all of them.
 
     Returns:
         ``J_a_of_each_start``, per-episode ``costs`` of the best and the statistics of :class:`Judged`.
@@ -43,7 +44,7 @@ def oracle(plant: str, path: Path, *, unseen: int, starts: int, iterations: int)
         torch.set_num_threads(1)
         system = plants()[plant]()
         episodes = UnseenEpisodes(system, unseen, compiled=missing_for_compilation() is None)
-        best = exact_optimum(episodes, system.make_policy, starts=starts, iterations=iterations)
+        best = exact_optimum(episodes, system.make_policy, starts=starts, iterations=iterations, polish=polish)
         found = episodes.judge(episodes.fly(best.policy))
         costs = {"costs": found.control_costs.tolist(), "J_a_of_each_start": best.costs}
         return costs | found.statistics()
