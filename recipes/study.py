@@ -61,7 +61,7 @@ class Config:
     seeds: int = 5
     variant_seeds: int = 2
     jobs: int = 0
-    backend: Literal["loky", "threading", "ray"] = "loky"
+    backend: Literal["loky", "ray"] = "loky"
     unseen: int = 100
     folder: Path = Path("runs/study")
     quick: bool = False

@@ -1,10 +1,8 @@
 """A run folder read back: the plant, the trained policies and the closure, without training anything."""
 
 import dataclasses
-import importlib.util
 import json
 import pickle
-import sys
 import types
 import typing
 from collections.abc import Sequence
@@ -16,6 +14,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.plant import Plant
+from rt_torchrl.recipe import load_recipe
 from rt_torchrl.run_config import RunConfig
 
 
@@ -117,21 +116,8 @@ def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:
 
 
 def config_class_of(recipe: Path) -> type[RunConfig]:
-    """The class ``Config`` of a recipe, which is imported for it.
-
-    Raises:
-        ValueError: if there is no such file, or no such class in it.
-    """
-    if not recipe.is_file():
-        raise ValueError(f"recipe={recipe} does not exist; give the file of the recipe that made the run.")
-    name = f"rt_torchrl_recipe_{recipe.stem}"
-    spec = importlib.util.spec_from_file_location(name, recipe)
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    found = getattr(module, "Config", None)
-    if not (isinstance(found, type) and issubclass(found, RunConfig)):
-        raise ValueError(f"recipe={recipe} has no class Config derived from RunConfig.")
-    return found
+    """The class ``Config`` of a recipe, which is imported for it; see :func:`load_recipe` for errors."""
+    return load_recipe(recipe).Config
 
 
 def rebuilt(kind: Any, value: Any) -> Any:

@@ -65,7 +65,7 @@ def finished(tmp_path, seed, shift, **options):
 
 def test_the_command_of_a_training_can_be_repeated_by_hand(tmp_path):
     found = training(tmp_path, 3, variant="noise 1 %", options=("--quick",))
-    command = " ".join(found.command())
+    command = found.command()
     assert "some_plant.py --seed 3 --twinning.arm twinning" in command and "--noise 0.01 --quick" in command
     assert "--overwrite" in command and "--resume" not in command
     found.folder.mkdir()
@@ -75,14 +75,34 @@ def test_the_command_of_a_training_can_be_repeated_by_hand(tmp_path):
         training(tmp_path, variant="rain")
 
 
+def written(path, main):
+    """A recipe of the options every recipe has, with this as its main."""
+    path.write_text(
+        "import json, os\n"
+        "from dataclasses import dataclass\n"
+        "from rt_torchrl.run_config import RunConfig\n\n"
+        "@dataclass(frozen=True, kw_only=True)\n"
+        "class Config(RunConfig):\n    pass\n\n"
+        f"def main(config):\n    {main}\n"
+    )
+    return path
+
+
 def test_a_failed_training_says_why_and_a_finished_one_is_kept(tmp_path):
-    recipe = tmp_path / "fails.py"
-    recipe.write_text("print('working'); raise SystemExit('error: no rotor')")
-    failing = training(tmp_path, recipe=recipe)
-    with pytest.raises(RuntimeError, match="exit status 1; see .*training.log: error: no rotor"):
+    failing = training(tmp_path, recipe=written(tmp_path / "fails.py", "raise ValueError('no rotor')"))
+    with pytest.raises(RuntimeError, match="fails.py --seed 0 .* failed; see .*training.log: no rotor"):
         failing.run()
+    assert "fails.py --seed 0" in (failing.folder / "training.log").read_text()
     (failing.folder / "metrics.json").write_text("{}")
     failing.run()
+
+
+def test_a_training_needs_a_recipe(tmp_path):
+    with pytest.raises(RuntimeError, match="some_plant.py does not exist"):
+        training(tmp_path).run()
+    (tmp_path / "bare.py").write_text("x = 1")
+    with pytest.raises(RuntimeError, match="has no class Config"):
+        training(tmp_path, recipe=tmp_path / "bare.py").run()
 
 
 def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
@@ -161,30 +181,22 @@ def test_the_report_says_what_was_found(tmp_path):
 def computed(tmp_path, backend, jobs=2):
     """What the study computes side by side from two trainings of a recipe that only writes its process."""
     study = recipe("study")
-    script = tmp_path / "tiny.py"
-    script.write_text(
-        "import json, os, pathlib, sys\n"
-        "folder = pathlib.Path(sys.argv[sys.argv.index('--log-dir') + 1])\n"
-        "(folder / 'metrics.json').write_text(json.dumps({'parent': os.getppid()}))\n"
-    )
+    main = "(config.log_dir / 'metrics.json').write_text(json.dumps({'process': os.getpid()}))"
+    script = written(tmp_path / "tiny.py", main)
     trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
     study.side_by_side([t.run for t in trainings], backend=backend, jobs=jobs)
-    return [t.metrics()["parent"] for t in trainings]
+    return [t.metrics()["process"] for t in trainings]
 
 
-@pytest.mark.parametrize("backend", ["loky", "threading"])
-def test_trainings_run_side_by_side(tmp_path, backend):
-    # Threads start them from this process, loky from others.
-    assert (os.getpid() in computed(tmp_path, backend)) == (backend == "threading")
+def test_trainings_run_side_by_side(tmp_path):
+    assert os.getpid() not in computed(tmp_path, "loky")
 
 
 def test_trainings_spread_over_ray(tmp_path):
     ray = pytest.importorskip("ray")
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
-        parents = computed(tmp_path, "ray")
-        # Ray's workers start them, not this process.
-        assert os.getpid() not in parents
+        assert os.getpid() not in computed(tmp_path, "ray")
     finally:
         ray.shutdown()
 
@@ -246,7 +258,7 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     policies = [name for v, name in config.trainings("wind_turbine") if v == "nominal"][3:]
     assert policies == ["twinning, gain-scheduled", "twinning, with bias", "twinning, perceptron"]
     (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]
-    assert first.arm == "twinning" and " ".join(first.command()).endswith("--policy scheduled")
+    assert first.arm == "twinning" and first.command().endswith("--policy scheduled")
     short = recipe("study").Config(quick=True, folder=tmp_path).trainings("flapping_wing")
     # What is kept of a quick study is never taken for a result of the whole one.
     assert folders.isdisjoint(t.folder for group in short.values() for t in group)

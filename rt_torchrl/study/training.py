@@ -1,13 +1,15 @@
 """One training of the study, as the command of its recipe."""
 
+import contextlib
 import json
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from rt_torchrl.algorithm import Arm
+from rt_torchrl.recipe import load_recipe
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "nominal": (),
@@ -21,7 +23,9 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """A recipe's run with one arm, seed and variant; a process of its own, so that it can be repeated by hand.
+    """A recipe's run with one arm, seed and variant, by the options of a command that can be repeated by hand.
+
+    It runs in the process that asks for it: the next one of the same plant then finds everything compiled.
 
     Args:
         recipe: path of the recipe.
@@ -47,12 +51,16 @@ class Training:
     def plant(self) -> str:
         return self.recipe.stem
 
-    def command(self) -> list[str]:
-        """The command line; goes on with a run that was interrupted after its first episode."""
+    def arguments(self) -> list[str]:
+        """Options of the recipe; goes on with a run that was interrupted after its first episode."""
         begun = (self.folder / "checkpoint.pt").exists()
         options = ["--seed", str(self.seed), "--twinning.arm", self.arm, "--log-dir", str(self.folder)]
         options += ["--figures-every", "0", "--threads", "1", "--resume" if begun else "--overwrite"]
-        return [sys.executable, str(self.recipe), *options, *VARIANTS[self.variant], *self.options]
+        return [*options, *VARIANTS[self.variant], *self.options]
+
+    def command(self) -> str:
+        """The same as a command line."""
+        return " ".join(["uv run", str(self.recipe), *self.arguments()])
 
     def done(self) -> bool:
         """Whether its results are there."""
@@ -62,17 +70,19 @@ class Training:
         """Train, unless that is done; what the recipe prints goes to ``training.log`` in the folder.
 
         Raises:
-            RuntimeError: if the recipe fails; ends with the last line that it printed.
+            RuntimeError: if the recipe fails; with what it said.
         """
         if self.done():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         log = self.folder / "training.log"
-        with log.open("w") as output:
-            code = subprocess.run(self.command(), stdout=output, stderr=subprocess.STDOUT).returncode
-        if code:
-            last = (log.read_text().strip().splitlines() or ["no output"])[-1]
-            raise RuntimeError(f"{' '.join(self.command())} failed with exit status {code}; see {log}: {last}")
+        with log.open("w") as output, contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+            print(self.command(), flush=True)
+            try:
+                recipe = load_recipe(self.recipe)
+                recipe.main(tyro.cli(recipe.Config, args=self.arguments()))
+            except (Exception, SystemExit) as error:
+                raise RuntimeError(f"{self.command()} failed; see {log}: {error}") from error
 
     def metrics(self) -> dict[str, Any]:
         """Its ``metrics.json``."""
