@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from rt_torchrl.descent import Descended
 
@@ -46,6 +45,7 @@ class LevenbergMarquardt:
         for argument, value in (("damping", damping), ("longest_step", longest_step)):
             if not value > 0:
                 raise ValueError(f"{argument}={value} of Levenberg-Marquardt must be positive.")
+        self.curvature_floor = torch.finfo(torch.float64).eps
         if not tolerance >= 0:
             raise ValueError(f"tolerance={tolerance} of Levenberg-Marquardt must not be negative.")
         self.module, self.damping, self.tolerance, self.longest_step = module, damping, tolerance, longest_step
@@ -71,7 +71,7 @@ class LevenbergMarquardt:
             before = copy.deepcopy(self.module.state_dict())
             step = self._step(current, self.damping)
             step *= (self.longest_step / step.abs().max()).clamp(max=1.0)
-            vector_to_parameters(parameters_to_vector(weights) + step, weights)
+            _add(step, weights)
             trial = self._attempt(equations)
             if trial is not None and trial.cost <= current.cost:
                 current, self.damping = trial, max(0.1 * self.damping, self.least_damping)
@@ -88,7 +88,7 @@ class LevenbergMarquardt:
     def _step(self, current: NormalEquations, damping: float) -> Tensor:
         diagonal = current.matrix.diagonal()
         # A weight that the record does not show at all gets the smallest curvature that is not rounding.
-        floor = diagonal.max() * torch.finfo(diagonal.dtype).eps
+        floor = diagonal.max() * self.curvature_floor
         damped = current.matrix + damping * torch.diag(diagonal.clamp_min(floor))
         return -torch.linalg.solve(damped, current.gradient)
 
@@ -99,6 +99,12 @@ class LevenbergMarquardt:
         except FloatingPointError:
             return None
         return found if found.cost.isfinite() and found.matrix.isfinite().all() else None
+
+
+def _add(step: Tensor, weights: list[nn.Parameter]) -> None:
+    """Move the weights; in place, because torch's ``vector_to_parameters`` would make them views of one vector."""
+    for weight, part in zip(weights, step.split([w.numel() for w in weights]), strict=True):
+        weight.add_(part.view_as(weight))
 
 
 def promised(equations: NormalEquations, step: Tensor) -> Tensor:

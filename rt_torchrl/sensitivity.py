@@ -21,6 +21,9 @@ from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import drive_of
 
+WIDE = 4
+"""Weights for each state from which on a reverse-mode product for each state is quicker than one for each weight."""
+
 
 class Sensitivities:
     """Trajectories under recorded actions with their sensitivities.
@@ -35,7 +38,8 @@ class Sensitivities:
         self.interval = Interval(plant, closure, None)
         self._march = compiled_if(compiled, march_by_scan, march)
         self._linearise = compiled_if(compiled, linearise)
-        self._weight_jacobians = compiled_if(compiled, weight_jacobians)
+        wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
+        self._weight_jacobians = compiled_if(compiled, weight_jacobians_by_rows if wide else weight_jacobians)
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
 
     @torch.no_grad()
@@ -72,6 +76,22 @@ def weight_jacobians(interval: Interval, names: tuple[str, ...], starts: Tensor,
         return torch.func.jvp(end, weights, tangents)[1]
 
     return torch.func.vmap(column, out_dims=-1)(basis)
+
+
+def weight_jacobians_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """The same by n_s reverse-mode products at every interval, which is less work where n_w is far above n_s."""
+    weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
+
+    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
+        # As a batch of one: the compiler cannot join vectors without one under a vmap of unknown length.
+        state, *drive = (x.unsqueeze(0) for x in (state, *drive))
+        return torch.func.functional_call(interval, values, (state, Drive(*drive))).squeeze(0)
+
+    rows = torch.func.jacrev(end)
+    for _ in range(2):  # over the realisations, then over time
+        rows = torch.func.vmap(rows, in_dims=(None, 0, 0, 0, 0))
+    found = rows(weights, starts, drive.t.expand(starts.shape[:2]), drive.exogenous, drive.command)
+    return torch.cat([jacobian.flatten(3) for jacobian in found.values()], -1)
 
 
 def propagate(A: Tensor, B: Tensor) -> Tensor:

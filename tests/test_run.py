@@ -67,7 +67,7 @@ def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
     policy = run.algorithm.policies["model_based"]
     plant, state, costs = run.unseen.plant, run.unseen.initial_state, {}
     # Independent of the library's rollout: the plant's step in a loop.
-    for name, pi in (("before", run.initial_policy), ("after", policy)):
+    for name, pi in (("before", run.initial_policies["model_based"]), ("after", policy)):
         s, total = state, 0.0
         for k in range(plant.n_steps):
             t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]

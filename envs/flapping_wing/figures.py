@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-from torch import Tensor, nn
+from torch import Tensor
 
 from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.style import (
@@ -31,6 +31,7 @@ from rt_torchrl.figures.style import (
     twin_label,
 )
 from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.visited import visited_features as features_of
 
 POLAR_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 SPAN_SHARE = 0.7
@@ -203,19 +204,9 @@ def polars(snapshot: Snapshot) -> Figure:
 
 def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     """(sin α_e, cos α_e) in the last real flight, at the blade element nearest to ``SPAN_SHARE`` of the span."""
-    plant, record, probe = snapshot.plant, snapshot.record, _Probe()
-    t = plant.dt * torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
-    plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, probe)
+    plant = snapshot.plant
     element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
-    return probe.features[:, element]
-
-
-class _Probe(nn.Module):
-    """A closure without forces that keeps what it was asked for."""
-
-    def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        self.features = features
-        return torch.zeros_like(features)
+    return features_of(plant, snapshot.record)[:, element]
 
 
 def _draw_polars(axes: np.ndarray, snapshot: Snapshot) -> None:

@@ -1,6 +1,7 @@
 r"""The NREL 5-MW rotor as a plant: one rotating mass, its speed filter and its actuators (paper, section 5.1)."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.merit import merit
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
 from rt_torchrl.plant import Plant, require_stable_step
 from rt_torchrl.policies import SaturatedAffine
@@ -274,6 +276,10 @@ class WindTurbine(Plant):
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """Saint-Drenan's C_p with the coefficients of Dai 2016; draws nothing."""
         return SaintDrenan.from_set("Dai2016")
+
+    def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
+        """The same and a perceptron of (λ, β)."""
+        return NeuralPowerCoefficient(SaintDrenan.from_set("Dai2016"), hidden=hidden, generator=generator)
 
     def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
         """The paper's policy: one affine law per action through the smooth clip, without bias unless asked for."""
