@@ -6,7 +6,7 @@ r"""Forward sensitivities of a trajectory to the closure's weights, :math:`S_k =
 
 As in the parallel adjoint, all A_k and B_k are one batched call each; only the linear recurrence is sequential. They
 give the gradient, the Gauss-Newton matrix and the Fisher information of an identification. Their cost grows with the
-number of weights, that of an adjoint does not: they are for closures of some ten weights.
+number of weights, that of an adjoint does not: they are for closures of up to some hundred weights.
 """
 
 import torch
@@ -48,9 +48,11 @@ class Sensitivities:
         initial_state: Float[Tensor, "batch n_s"],
         exogenous: Float[Tensor, "batch n n_z"],
         actions: Float[Tensor, "batch n n_a"],
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_w"]]:
         """States s_1 ... s_n and their sensitivities S_1 ... S_n."""
-        drive = drive_of(self.interval.plant, exogenous, actions)
+        drive = drive_of(self.interval.plant, exogenous, actions, start=start)
         initial_state = initial_state.clone(memory_format=torch.contiguous_format)
         ends = self._march(self.interval, initial_state, drive)
         starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])

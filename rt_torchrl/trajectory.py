@@ -71,7 +71,7 @@ class Rollout:
         exogenous: Float[Tensor, "batch n n_z"],
         command: Float[Tensor, "batch n n_a"] | None = None,
         *,
-        start: float = 0.0,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
         """The trajectory of ``n`` intervals.
 
@@ -79,7 +79,7 @@ class Rollout:
             initial_state: s_0 of each realisation.
             exogenous: z, held over each interval.
             command: actions from a record; None with a policy.
-            start: time of s_0 [s].
+            start: time of s_0 [s], one for all or one for each realisation.
 
         Raises:
             ValueError: if shapes do not fit the plant and each other, or commands are given beside a policy.
@@ -117,10 +117,11 @@ class Rollout:
             if not value.isfinite().all():
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
 
-    def _require_finite(self, ends: Tensor, start: float) -> None:
+    def _require_finite(self, ends: Tensor, start: float | Tensor) -> None:
         if ends.isfinite().all():
             return
         k, realisation, component = (~ends.isfinite()).nonzero()[0].tolist()
+        start = float(start[realisation]) if isinstance(start, Tensor) else start
         last = ends[k - 1, realisation].tolist() if k else "the initial state"
         weights = [type(m).__name__ for m in (self.interval.closure, self.interval.policy) if m is not None]
         raise DivergenceError(
@@ -131,8 +132,8 @@ class Rollout:
         )
 
 
-def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float = 0.0) -> Drive:
-    """The drive, time first, of inputs and commands that come batch first."""
+def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Tensor = 0.0) -> Drive:
+    """The drive, time first, of inputs and commands that come batch first; ``start`` as in :meth:`Rollout.__call__`."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
     commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()
