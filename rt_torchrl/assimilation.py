@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.closures import BoundedPerceptron
 from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
@@ -28,8 +29,9 @@ class AssimilationConfig:
             in the input, but weights that move the states less than that chance are lost in it.
         method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
             forward sensitivities, for closures of some ten weights, and makes no use of ``descent``.
-        prior: ρ of a cost ½ρ‖w − w_p⁰‖² beside J_p, in its unit; 0 for none, as in the paper. For closures of many
-            weights: it leaves those where they started that no record shows, and so what was never visited as it was.
+        prior: ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in its unit, on the weights w of the closure's perceptrons
+            (:class:`BoundedPerceptron`); 0 for none. It leaves those where they started that no record shows, and so
+            the law what it was where nothing was visited.
         segment: control intervals after which the replay starts again from the measured state (multiple shooting); 0
             replays whole records, as in the paper. Over short segments the states are nearly linear in the weights,
             which takes a closure of many of them to the record in a few steps; J_p of each is that of its mean segment.
@@ -95,7 +97,8 @@ class Assimilation:
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
         self.second_order = LevenbergMarquardt(twin.closure)
-        self.prior_weights = self._weights().detach().clone()
+        self._start = self._weights().detach().clone()
+        self._stiffness = self._prior_stiffness()
 
     def update(
         self, records: Sequence[Record], processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
@@ -153,17 +156,22 @@ class Assimilation:
         return torch.cat(trained) if trained else torch.empty(0, dtype=torch.float64)
 
     def _prior_cost(self) -> Tensor:
-        return 0.5 * self.config.prior * (self._weights() - self.prior_weights).square().sum()
+        return 0.5 * (self._stiffness * (self._weights() - self._start).square()).sum()
+
+    def _prior_stiffness(self) -> Tensor:
+        """ρ of every trained weight, in the order of :meth:`_weights`."""
+        closure, rho = self.twin.closure, self.config.prior
+        held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
+        trained = [w for w in closure.parameters() if w.requires_grad]
+        each = [torch.full_like(w.detach().flatten(), rho if id(w) in held else 0.0) for w in trained]
+        return torch.cat(each) if each else torch.empty(0, dtype=torch.float64)
 
     def _with_prior(self, found: NormalEquations) -> NormalEquations:
         if not self.config.prior:
             return found
-        away, stiffness = self._weights() - self.prior_weights, self.config.prior * torch.ones_like(self.prior_weights)
-        return NormalEquations(
-            found.cost + self._prior_cost(),
-            found.gradient + stiffness * away,
-            found.matrix + torch.diag(stiffness),
-        )
+        pull = self._stiffness * (self._weights() - self._start)
+        matrix = found.matrix + torch.diag(self._stiffness)
+        return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
 
     def normal_equations(
         self,

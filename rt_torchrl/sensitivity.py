@@ -39,7 +39,9 @@ class Sensitivities:
         self._march = compiled_if(compiled, march_by_scan, march)
         self._linearise = compiled_if(compiled, linearise)
         wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
-        self._weight_jacobians = compiled_if(compiled, weight_jacobians_by_rows if wide else weight_jacobians)
+        # By rows uncompiled: the compiler fails on them for a batch of unknown size, and gains little on large batches.
+        columns = compiled_if(compiled, weight_jacobians)
+        self._weight_jacobians = weight_jacobians_by_rows if wide else columns
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
 
     @torch.no_grad()
@@ -85,9 +87,7 @@ def weight_jacobians_by_rows(interval: Interval, names: tuple[str, ...], starts:
     weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
 
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
-        # As a batch of one: the compiler cannot join vectors without one under a vmap of unknown length.
-        state, *drive = (x.unsqueeze(0) for x in (state, *drive))
-        return torch.func.functional_call(interval, values, (state, Drive(*drive))).squeeze(0)
+        return torch.func.functional_call(interval, values, (state, Drive(*drive)))
 
     rows = torch.func.jacrev(end)
     for _ in range(2):  # over the realisations, then over time
