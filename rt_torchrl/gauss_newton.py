@@ -45,7 +45,6 @@ class LevenbergMarquardt:
         for argument, value in (("damping", damping), ("longest_step", longest_step)):
             if not value > 0:
                 raise ValueError(f"{argument}={value} of Levenberg-Marquardt must be positive.")
-        self.curvature_floor = torch.finfo(torch.float64).eps
         if not tolerance >= 0:
             raise ValueError(f"tolerance={tolerance} of Levenberg-Marquardt must not be negative.")
         self.module, self.damping, self.tolerance, self.longest_step = module, damping, tolerance, longest_step
@@ -88,7 +87,7 @@ class LevenbergMarquardt:
     def _step(self, current: NormalEquations, damping: float) -> Tensor:
         diagonal = current.matrix.diagonal()
         # A weight that the record does not show at all gets the smallest curvature that is not rounding.
-        floor = diagonal.max() * self.curvature_floor
+        floor = diagonal.max() * torch.finfo(diagonal.dtype).eps
         damped = current.matrix + damping * torch.diag(diagonal.clamp_min(floor))
         return -torch.linalg.solve(damped, current.gradient)
 

@@ -28,8 +28,8 @@ class RunConfig:
         hidden: widths of the hidden layers of an mlp policy.
         model_free_policy: another of these for the model-free policy alone; same for that of the model-based one, from
             the same initial weights.
-        closure: paper for the plant's own law in the twin, or mlp for a law with a perceptron in it; the latter has other
-            defaults of twinning.records and twinning.assimilation, NEURAL in the recipe.
+        closure: paper for the plant's own law in the twin, or mlp for a law with a perceptron in it, which has other
+            defaults of twinning.records and twinning.assimilation: NEURAL in the recipe.
         closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number of real episodes n_e.
         seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
