@@ -1,5 +1,6 @@
 """Reinforcement twinning of the cryogenic tank (paper, sections 5.3 and 6.4)."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -43,6 +44,14 @@ PAPER = TwinningConfig(
     model_based=ModelBasedConfig(iterations=5, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     switch=SwitchConfig(patience=4, clone_patience=20),
 )
+NEURAL = dataclasses.replace(
+    PAPER,
+    # Segments of two hours; without the prior the perceptron takes the first steps, which are the constants' to take.
+    assimilation=AssimilationConfig(
+        iterations=15, method="levenberg_marquardt", inputs="record", segment=240, prior=30.0
+    ),
+)
+"""What trains ``--closure mlp``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +78,10 @@ class Config(RunConfig):
     model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
+
+    @classmethod
+    def defaults_for(cls, closure: str) -> "Config":
+        return cls(closure=closure, twinning=NEURAL if closure == "mlp" else PAPER)
 
     def plant(self) -> CryogenicTank:
         return CryogenicTank(

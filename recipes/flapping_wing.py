@@ -1,5 +1,6 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -39,6 +40,15 @@ PAPER = TwinningConfig(
     model_based=ModelBasedConfig(iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5)),
     switch=SwitchConfig(patience=4, clone_patience=4),
 )
+NEURAL = dataclasses.replace(
+    PAPER,
+    # Segments of five wing beats, 0.25 s, on the measured wind: three hundred weights on every draw of it would take
+    # gigabytes, and over whole flights most steps fail.
+    assimilation=AssimilationConfig(
+        iterations=8, method="levenberg_marquardt", inputs="record", segment=500, prior=1e-6
+    ),
+)
+"""What trains ``--closure mlp``."""
 
 
 class LighterWing(FlappingWing):
@@ -70,6 +80,10 @@ class Config(RunConfig):
     model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
+
+    @classmethod
+    def defaults_for(cls, closure: str) -> "Config":
+        return cls(closure=closure, twinning=NEURAL if closure == "mlp" else PAPER)
 
     def plant(self, kind: type[FlappingWing] = FlappingWing) -> FlappingWing:
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)

@@ -17,6 +17,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.distillation import Distillation, DistillationConfig, same_architecture
 from rt_torchrl.environment import PlantEnv
 from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
@@ -47,6 +48,7 @@ class TwinningConfig:
         assimilation: step 4.
         model_based: step 5.
         switch: step 6.
+        distillation: how step 6 clones between policies of different architectures.
     """
 
     arm: Arm = "twinning"
@@ -60,6 +62,7 @@ class TwinningConfig:
     assimilation: AssimilationConfig = field(default_factory=AssimilationConfig)
     model_based: ModelBasedConfig = field(default_factory=ModelBasedConfig)
     switch: SwitchConfig = field(default_factory=SwitchConfig)
+    distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
     def __post_init__(self):
         for argument in ("realisations", "records", "virtual_episodes"):
@@ -77,9 +80,6 @@ class ReinforcementTwinning:
         model_based: π_mb, trained in place.
         config: see :class:`TwinningConfig`.
         generator: source of everything random except what the real system draws itself.
-
-    Raises:
-        ValueError: if the weights of the two policies differ in shape: step 6 could not clone one into the other.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class ReinforcementTwinning:
     ):
         self.env, self.twin, self.config, self.generator = env, twin, config, generator
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        require_clonable(model_free, model_based)
         self.model_free = ModelFree(twin.plant, model_free, config.model_free, generator=generator)
         self.assimilation = Assimilation(twin, config.assimilation)
         self.model_based = ModelBased(twin, model_based, config.model_based)
+        self.distillation = Distillation(twin, config.distillation)
         self.long_term = LongTermMemory(config.long_term, generator=generator)
         self.short_term = ShortTermMemory(config.records)
         self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
@@ -181,22 +181,50 @@ class ReinforcementTwinning:
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
         """Step 6: mean J_a of both policies over the same N virtual episodes, then the decision tree."""
-        costs = self.virtual_costs()
+        judged_on = self.draw_virtual_episodes(self.config.virtual_episodes)
+        costs = self.virtual_costs(judged_on)
         idle = self.switch.idle
         now = weight_vector(self.policies[idle])
         change = (now - self._earlier_weights[idle]).norm() / now.norm()
         event = self.switch.decide(costs[self.switch.live].item(), costs[idle].item(), change.item())
-        if event == "clone":
-            self.policies[idle].load_state_dict(self.policies[self.switch.live].state_dict())
-            (self.model_free if idle == "model_free" else self.model_based).restart()
         report = findings(**{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
-        return report.set_non_tensor("event", event)
+        report.set_non_tensor("event", event)
+        return report.update(self.clone(costs, judged_on)) if event == "clone" else report
 
-    def virtual_costs(self) -> dict[Role, Tensor]:
-        """Mean J_a of each policy over N virtual episodes with random initial states and disturbances."""
-        initial_state, exogenous = self.draw_virtual_episodes(self.config.virtual_episodes)
-        flown = {role: self.twin.control(policy, initial_state, exogenous) for role, policy in self.policies.items()}
-        return {role: control_cost(self.twin.plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+    def virtual_costs(self, episodes: VirtualEpisodes) -> dict[Role, Tensor]:
+        """Mean J_a of each policy over virtual episodes."""
+        flown = {role: self.twin.control(policy, *episodes) for role, policy in self.policies.items()}
+        plant, exogenous = self.twin.plant, episodes.exogenous
+        return {role: control_cost(plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+
+    def clone(self, costs: dict[Role, Tensor], judged_on: VirtualEpisodes) -> TensorDict:
+        """The live policy into the idle one: a copy of its weights, or a distillation into another architecture.
+
+        Args:
+            costs: mean J_a of both policies over ``judged_on``, where a distilled clone must not cost more than the
+                policy it replaces.
+            judged_on: virtual episodes.
+        """
+        live, idle = (self.policies[role] for role in (self.switch.live, self.switch.idle))
+        report = findings()
+        if same_architecture(live, idle):
+            idle.load_state_dict(live.state_dict())
+        else:
+            found = self.distillation.clone(
+                live,
+                idle,
+                seen=self.long_term.observations(),
+                draw=lambda: self.draw_virtual_episodes(self.config.virtual_episodes),
+                judged_on=judged_on,
+                to_beat=costs[self.switch.idle].item(),
+            )
+            ratio = found.cost / costs[self.switch.live]
+            report.update(findings(distillation_error=found.error, distillation_cost_ratio=ratio))
+            if not found.accepted:
+                reason = f"clone refused: J_a {found.cost:.4g} of it, {costs[self.switch.idle]:.4g} of what it replaces"
+                return report.set_non_tensor("event", "keep").set_non_tensor("reason", reason)
+        (self.model_free if self.switch.idle == "model_free" else self.model_based).restart()
+        return report
 
 
 def collector_of(env: EnvBase, actor: LivePolicy, n_steps: int) -> Collector:
@@ -216,17 +244,3 @@ def findings(**values: float | Tensor) -> TensorDict:
 def weight_vector(module: nn.Module) -> Tensor:
     """All weights of a module, detached, in one vector."""
     return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
-
-
-def require_clonable(first: nn.Module, second: nn.Module) -> None:
-    """Refuse two policies whose weights do not fit each other.
-
-    Raises:
-        ValueError: with the shapes of both.
-    """
-    shapes = [{name: tuple(value.shape) for name, value in m.state_dict().items()} for m in (first, second)]
-    if shapes[0] != shapes[1]:
-        raise ValueError(
-            f"model_free and model_based have weights of shapes {shapes[0]} and {shapes[1]}; step 6 copies one into "
-            "the other, so give both the same architecture."
-        )

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.closures import BoundedPerceptron
 from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
@@ -29,6 +30,12 @@ class AssimilationConfig:
             in the input, but weights that move the states less than that chance are lost in it.
         method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
             forward sensitivities, for closures of some ten weights, and makes no use of ``descent``.
+        prior: ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in its unit, on the weights w of the closure's perceptrons
+            (:class:`BoundedPerceptron`); 0 for none. It leaves those where they started that no record shows, and so
+            the law what it was where nothing was visited.
+        segment: control intervals after which the replay starts again from the measured state (multiple shooting); 0
+            replays whole records, as in the paper. Over short segments the states are nearly linear in the weights,
+            which takes a closure of many of them to the record in a few steps; J_p of each is that of its mean segment.
         descent: how the closure's weights descend J_p.
     """
 
@@ -36,6 +43,8 @@ class AssimilationConfig:
     stop_ratio: float = 0.0
     inputs: Literal["realisations", "record"] = "realisations"
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
+    prior: float = 0.0
+    segment: int = 0
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self):
@@ -43,6 +52,35 @@ class AssimilationConfig:
             raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
         if not 0.0 <= self.stop_ratio < 1.0:
             raise ValueError(f"stop_ratio={self.stop_ratio} must lie in [0, 1).")
+        if not self.prior >= 0.0:
+            raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
+        if self.segment < 0:
+            raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
+
+
+class Replayed(NamedTuple):
+    """What the twin replays: inputs, measured states and actions, and the times of the first states [s]."""
+
+    exogenous: Float[Tensor, "batch n n_z"]
+    measured: Float[Tensor, "batch n+1 n_s"]
+    actions: Float[Tensor, "batch n n_a"]
+    start: float | Float[Tensor, " batch"] = 0.0
+
+    def cut(self, segment: int, dt: float) -> "Replayed":
+        """In segments of that many intervals of length ``dt``, in the order of time; what is left over is dropped."""
+        exogenous, measured, actions, _ = self
+        batch, whole = len(exogenous), exogenous.shape[1] // segment
+        if whole == 0:
+            raise ValueError(f"segment={segment} exceeds the {exogenous.shape[1]} control intervals of a record.")
+        n = whole * segment
+        starts = torch.stack([measured[:, k * segment : (k + 1) * segment + 1] for k in range(whole)], 1)
+        time = dt * segment * torch.arange(whole, dtype=torch.float64, device=exogenous.device)
+        return Replayed(
+            exogenous[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
+            starts.flatten(0, 1),
+            actions[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
+            time.repeat(batch),
+        )
 
 
 class Assimilation:
@@ -60,11 +98,13 @@ class Assimilation:
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
         self.second_order = LevenbergMarquardt(twin.closure)
+        self._start = self._weights().detach().clone()
+        self._stiffness = self._prior_stiffness()
 
     def update(
         self, records: Sequence[Record], processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
     ) -> Descended:
-        """One episode's gradient steps.
+        """One episode's gradient steps; reported is J_p of the whole records, without the prior.
 
         Args:
             records: D_S.
@@ -78,35 +118,81 @@ class Assimilation:
             exogenous = torch.cat([process.sample(count, generator) for process in processes])
         measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
         actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
+        whole = Replayed(exogenous, measured, actions)
+        if not self.config.segment:
+            return self._descend(whole)
+        before = self._cost_of(whole)
+        found = self._descend(whole.cut(self.config.segment, self.twin.plant.dt))
+        return found._replace(start=before, best=self._cost_of(whole))
 
-        if self.config.method == "levenberg_marquardt":
-            return self.second_order.run(
-                lambda: self.normal_equations(exogenous, measured, actions),
-                self.config.iterations,
-                stop_below=self.config.stop_ratio,
-            )
+    def _descend(self, replayed: "Replayed") -> Descended:
+        def equations() -> NormalEquations:
+            return self._with_prior(self.normal_equations(*replayed))
 
         def cost() -> Tensor:
-            replayed = self.twin.replay(measured[:, 0], exogenous, actions)
-            return identification_cost(self.twin.plant, replayed, measured).mean()
+            return self._identification_cost(replayed) + self._prior_cost()
 
-        return self.descent.run(cost, self.config.iterations, stop_below=self.config.stop_ratio)
+        before = self._prior_cost().item()
+        method, function = self.descent, cost
+        if self.config.method == "levenberg_marquardt":
+            method, function = self.second_order, equations
+        found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
+        return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
+
+    def _identification_cost(self, replayed: "Replayed") -> Tensor:
+        exogenous, measured, actions, start = replayed
+        flown = self.twin.replay(measured[:, 0], exogenous, actions, start=start)
+        return identification_cost(self.twin.plant, flown, measured).mean()
+
+    @torch.no_grad()
+    def _cost_of(self, whole: "Replayed") -> float:
+        """J_p of whole records; infinite where a closure that was found on their segments diverges."""
+        try:
+            return self._identification_cost(whole).item()
+        except FloatingPointError:
+            return float("inf")
+
+    def _weights(self) -> Tensor:
+        trained = [w.flatten() for w in self.twin.closure.parameters() if w.requires_grad]
+        return torch.cat(trained) if trained else torch.empty(0, dtype=torch.float64)
+
+    def _prior_cost(self) -> Tensor:
+        return 0.5 * (self._stiffness * (self._weights() - self._start).square()).sum()
+
+    def _prior_stiffness(self) -> Tensor:
+        """ρ of every trained weight, in the order of :meth:`_weights`."""
+        closure, rho = self.twin.closure, self.config.prior
+        held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
+        trained = [w for w in closure.parameters() if w.requires_grad]
+        each = [torch.full_like(w.detach().flatten(), rho if id(w) in held else 0.0) for w in trained]
+        return torch.cat(each) if each else torch.empty(0, dtype=torch.float64)
+
+    def _with_prior(self, found: NormalEquations) -> NormalEquations:
+        if not self.config.prior:
+            return found
+        pull = self._stiffness * (self._weights() - self._start)
+        matrix = found.matrix + torch.diag(self._stiffness)
+        return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
 
     def normal_equations(
         self,
         exogenous: Float[Tensor, "batch n n_z"],
         measured: Float[Tensor, "batch samples n_s"],
         actions: Float[Tensor, "batch n n_a"],
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> NormalEquations:
         """J_p, its gradient and its Gauss-Newton matrix with respect to the closure's weights."""
-        states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions)
+        states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions, start=start)
         plant, target = self.twin.plant, measured[:, 1:]
         share = plant.dt / len(measured)
         g, H = discrepancy_derivatives(plant, states, target)
+        # Of the states that J_p looks at: the products below are most of the work for a closure of many weights.
+        seen = (H != 0.0).flatten(0, 2).any(0)
+        H, S_seen = H[..., seen, :][..., seen], S[:, :, seen]
         return NormalEquations(
             share * plant.discrepancy(states, target).sum(),
             share * torch.einsum("bki,bkiw->w", g, S),
-            share * torch.einsum("bkiv,bkij,bkjw->vw", S, H, S),
+            share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
 
 

@@ -1,8 +1,12 @@
 """Closures of general use: any ``closure(features) -> coefficients`` can stand in for a plant's own."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from rt_torchrl.policies import mlp
 
 
 class PositiveCoefficients(nn.Module):
@@ -48,3 +52,43 @@ class PositiveCoefficients(nn.Module):
     def named_coefficients(self) -> dict[str, Tensor]:
         """The coefficients by name."""
         return dict(zip(self.names, self.coefficients.unbind(), strict=True))
+
+
+class BoundedPerceptron(nn.Module):
+    r"""A perceptron of scaled features with bounded outputs, all zero at the start.
+
+    .. math:: y = b\,\tanh N(\hat x), \qquad \hat x_i = \frac{2x_i - x_{i,hi} - x_{i,lo}}{x_{i,hi} - x_{i,lo}}
+
+    What a neural closure adds to a law it starts from: nothing at first, and never more than b, wherever the states go.
+
+    Args:
+        ranges: low and high end of each feature, a fixed physical range that is scaled to [−1, 1]; no limit.
+        bounds: b, greatest absolute value of each output.
+        hidden: width of each hidden layer.
+        generator: source of the initial weights; those of the last layer are zero.
+
+    Raises:
+        ValueError: if a range is empty or a bound is not positive.
+    """
+
+    def __init__(
+        self,
+        ranges: Sequence[tuple[float, float]],
+        bounds: Sequence[float],
+        *,
+        hidden: Sequence[int],
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        low, high = torch.tensor(ranges, dtype=torch.float64, device=generator.device).unbind(-1)
+        bound = torch.tensor(bounds, dtype=torch.float64, device=generator.device)
+        if not (low < high).all() or not (bound > 0.0).all():
+            raise ValueError(f"ranges={ranges} must each go from low to high, and bounds={bounds} must be positive.")
+        self.network = mlp(len(ranges), hidden, len(bounds), generator=generator).to(generator.device)
+        nn.init.zeros_(self.network[-1].weight)
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("half_range", 0.5 * (high - low))
+        self.register_buffer("bound", bound)
+
+    def forward(self, features: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
+        return self.bound * torch.tanh(self.network((features - self.middle) / self.half_range))

@@ -23,7 +23,7 @@ def compiled_if(compiled: bool, function: Callable, eager: Callable | None = Non
     if missing:
         raise RuntimeError(
             f"compiled=True needs {missing}, which this machine lacks. Install it (Debian: apt-get install g++ "
-            "python3-dev) or choose compiled=False; a recipe takes --no-compiled."
+            "python3-dev) or choose compiled=False; a recipe takes --compiled False."
         )
     return _compile(function)
 

@@ -27,6 +27,8 @@ TAGS = {
     "value": "model-free/mean value of the policy",
     "exploration": "model-free/exploration strength",
     "weight_change": "switch/relative weight change of the idle policy",
+    "distillation_error": "switch/RMS action error of a distilled clone, share of range",
+    "distillation_cost_ratio": "switch/J_a of a distilled clone over that of the live policy (twin)",
 }
 """Tag of each entry of an episode's record; entries without one are not scalars."""
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from rt_torchrl.descent import Descended
 
@@ -71,7 +70,7 @@ class LevenbergMarquardt:
             before = copy.deepcopy(self.module.state_dict())
             step = self._step(current, self.damping)
             step *= (self.longest_step / step.abs().max()).clamp(max=1.0)
-            vector_to_parameters(parameters_to_vector(weights) + step, weights)
+            _add(step, weights)
             trial = self._attempt(equations)
             if trial is not None and trial.cost <= current.cost:
                 current, self.damping = trial, max(0.1 * self.damping, self.least_damping)
@@ -99,6 +98,12 @@ class LevenbergMarquardt:
         except FloatingPointError:
             return None
         return found if found.cost.isfinite() and found.matrix.isfinite().all() else None
+
+
+def _add(step: Tensor, weights: list[nn.Parameter]) -> None:
+    """Move the weights; in place, because torch's ``vector_to_parameters`` would make them views of one vector."""
+    for weight, part in zip(weights, step.split([w.numel() for w in weights]), strict=True):
+        weight.add_(part.view_as(weight))
 
 
 def promised(equations: NormalEquations, step: Tensor) -> Tensor:

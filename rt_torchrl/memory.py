@@ -88,6 +88,10 @@ class LongTermMemory:
         """Transitions with ``index`` (for :meth:`refresh`) and the importance weight ``priority_weight``."""
         return self._buffer.sample(batch_size)
 
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """Those of all transitions, in no particular order."""
+        return self._buffer[:]["observation"]
+
     def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
         """Give sampled transitions their new TD errors δ."""
         # Single precision, because the sampler draws in it when it is given a generator.

@@ -11,6 +11,7 @@ and it is the *same* map for the real system and for its digital twin: they diff
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -197,6 +198,14 @@ class Plant(nn.Module, ABC):
     @abstractmethod
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """The closure a twin of this plant starts from, w_p⁰."""
+
+    def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
+        """A closure with a perceptron in it that starts where :meth:`make_closure` does, for a plant that has one.
+
+        Raises:
+            ValueError: if this one has none.
+        """
+        raise ValueError(f"plant {self.name!r} has no neural closure; write its make_neural_closure or take its own.")
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The policy both controllers start from, w_a⁰; a saturated affine law of the observation unless overridden."""

@@ -11,6 +11,7 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.classical import ClassicalController
 from rt_torchrl.evaluation import Judged, Optimum, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.switching import Role
+from rt_torchrl.visited import rms_error, visited_features
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
@@ -56,7 +57,7 @@ def summary(
     algorithm: ReinforcementTwinning,
     unseen: UnseenEpisodes,
     judged: dict[str, Judged],
-    initial_policy: nn.Module,
+    initial_policies: dict[Role, nn.Module],
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
     untrained: Float[Tensor, " starts"],
@@ -68,26 +69,28 @@ def summary(
     """
     closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
-    before = unseen.control_costs(initial_policy)
+    before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
     flown = unseen.fly(algorithm.policies[live])
     J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
     after = {role: judged[role].control_costs.mean() for role in ROLES}
     better = min(ROLES, key=lambda role: after[role].item())
     found = {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
-        **{f"J_a_ratio_{role}": (after[role] / before.mean()).item() for role in ROLES},
+        **{f"J_a_ratio_{role}": (after[role] / before[role].mean()).item() for role in ROLES},
         **{f"J_a_over_untrained_{role}": (after[role] / untrained.mean()).item() for role in ROLES},
         "unseen": {
-            "episodes": len(before),
+            "episodes": len(unseen.initial_state),
             "J_p": mean_with_confidence(J_p),
             "J_p_before": mean_with_confidence(J_p_before),
-            "J_a_before": mean_with_confidence(before),
+            "J_a_before": mean_with_confidence(before["model_based"]),
+            "J_a_before_model_free": mean_with_confidence(before["model_free"]),
             "J_a_untrained": mean_with_confidence(untrained),
             **results(unseen, judged),
         },
         "live": live,
         "better": better,
         "closure": {name: named_weights(law) for name, law in laws.items()},
+        "closure_error": closure_errors(algorithm, laws),
         "seconds": seconds_per_step(episodes),
     }
     if optimum is not None:
@@ -110,6 +113,12 @@ def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]
             for kind, chosen in kinds.items()
         },
     }
+
+
+def closure_errors(algorithm: ReinforcementTwinning, laws: dict[str, nn.Module]) -> dict[str, list[float]]:
+    """RMS error of every coefficient of the closures ``found`` and ``start`` where the last real episode went."""
+    features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
+    return {name: rms_error(laws[name], laws["true"], features).tolist() for name in ("found", "start")}
 
 
 @torch.no_grad()
@@ -136,9 +145,8 @@ def table(metrics: dict[str, Any]) -> str:
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones"]
     lines.append(f"  {'cost':<22}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
     rows = [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
-    rows += [
-        (f"J_a {role.replace('_', '-')}", "J_a_before", f"J_a_{role}", found[f"J_a_ratio_{role}"]) for role in ROLES
-    ]
+    for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):
+        rows.append((f"J_a {role.replace('_', '-')}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
     for name, before, after, ratio in rows:
         means = f"{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}"
         lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{ratio:>10.3g}")

@@ -1,9 +1,11 @@
 """Options that every recipe has."""
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import nn
@@ -11,6 +13,7 @@ from torch import nn
 from rt_torchrl.algorithm import TwinningConfig
 from rt_torchrl.plant import Plant
 from rt_torchrl.policies import SaturatedMLP
+from rt_torchrl.switching import Role
 from rt_torchrl.trajectory import Engine
 
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
@@ -23,6 +26,11 @@ class RunConfig:
     Args:
         policy: paper for the plant's own, or mlp.
         hidden: widths of the hidden layers of an mlp policy.
+        model_free_policy: another of these for the model-free policy alone; same for that of the model-based one, from
+            the same initial weights.
+        closure: paper for the plant's own law in the twin, or mlp for a law with a perceptron in it, which has other
+            defaults of twinning.records and twinning.assimilation: NEURAL in the recipe.
+        closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number of real episodes n_e.
         seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: parallel (exact, fast), odeint_adjoint (the paper's continuous
@@ -45,6 +53,9 @@ class RunConfig:
 
     policy: str = "paper"
     hidden: tuple[int, ...] = (32, 32)
+    model_free_policy: str = "same"
+    closure: Literal["paper", "mlp"] = "paper"
+    closure_hidden: tuple[int, ...] = (16, 16)
     episodes: int = 20
     seed: int = 0
     engine: Engine = "parallel"
@@ -86,6 +97,31 @@ class RunConfig:
         if self.policy == "mlp":
             return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
         raise ValueError(f"policy={self.policy!r} does not exist; choose paper or mlp.")
+
+    def make_closure(self, plant: Plant, generator: torch.Generator) -> nn.Module:
+        """The twin's closure asked for, w_p⁰; override it for closures of your own.
+
+        Raises:
+            ValueError: if the plant has no neural closure, or there is no closure of that name.
+        """
+        if self.closure == "paper":
+            return plant.make_closure(generator)
+        if self.closure == "mlp":
+            return plant.make_neural_closure(generator, self.closure_hidden)
+        raise ValueError(f"closure={self.closure!r} does not exist; choose paper or mlp.")
+
+    def make_policies(self, plant: Plant, generator: torch.Generator) -> dict[Role, nn.Module]:
+        """π_mb and π_mf: with the same initial weights where they are of the same kind."""
+        model_based = self.make_policy(plant, generator)
+        if self.model_free_policy == "same":
+            return {"model_based": model_based, "model_free": copy.deepcopy(model_based)}
+        other = dataclasses.replace(self, policy=self.model_free_policy)
+        return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
+
+    @classmethod
+    def defaults_for(cls, closure: str) -> "RunConfig":
+        """The defaults that go with a closure; override it where one closure is not trained like another."""
+        return cls(closure=closure)
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Closure of the real system in each episode, if it wears; override it for a system that does."""

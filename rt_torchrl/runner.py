@@ -69,16 +69,15 @@ class Run:
         self.folder = require_folder(config, plant.name)
         generator = torch.Generator(device=device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, plant)
-        model_based = self.make_policy(generator).to(device)
-        closure = plant.make_closure(generator).to(device)
-        self.initial_policy, self.initial_closure = copy.deepcopy(model_based), copy.deepcopy(closure)
+        policies = {role: policy.to(device) for role, policy in config.make_policies(plant, generator).items()}
+        closure = config.make_closure(plant, generator).to(device)
+        self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
         system = {"noise": config.noise, "wear": config.wear(plant)}
         env = PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
         self.algorithm = ReinforcementTwinning(
             env,
             DigitalTwin(believed or plant, closure, engine=config.engine, compiled=compiled),
-            model_free=copy.deepcopy(model_based),
-            model_based=model_based,
+            **policies,
             config=self.config.twinning,
             generator=generator,
         )
@@ -97,7 +96,7 @@ class Run:
         settings = dataclasses.asdict(self.asked) | {"plant": self.algorithm.twin.plant.name}
         (self.folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
         dashboard = Dashboard(self.folder)
-        gap = engine_gap(self.initial_closure, self.initial_policy, self.unseen)
+        gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)
         dashboard.scalar("gradient/relative gap of parallel to odeint_adjoint, short horizon", gap)
         with tqdm(total=self.config.episodes, initial=len(self.episodes), unit="episode", dynamic_ncols=True) as bar:
             try:
@@ -143,7 +142,7 @@ class Run:
     def _results(self, gap: float, judged: dict[str, Judged]) -> dict[str, Any]:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
         untrained = untrained_costs(self.unseen, self.make_policy)
-        initial = self.initial_policy, self.initial_closure
+        initial = self.initial_policies, self.initial_closure
         summary = report.summary(self.algorithm, self.unseen, judged, *initial, self.episodes, untrained, optimum)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
@@ -173,7 +172,11 @@ class Run:
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     """Run a recipe's main on its command line; what the user can mend is told in one line, without a traceback."""
     try:
-        main(tyro.cli(config_class))
+        config = tyro.cli(config_class)
+        if isinstance(config, RunConfig):
+            # Read again on top of the defaults that go with the closure; what is given on the command line stays.
+            config = tyro.cli(config_class, default=config.defaults_for(config.closure))
+        main(config)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error
 

@@ -6,7 +6,7 @@ r"""Forward sensitivities of a trajectory to the closure's weights, :math:`S_k =
 
 As in the parallel adjoint, all A_k and B_k are one batched call each; only the linear recurrence is sequential. They
 give the gradient, the Gauss-Newton matrix and the Fisher information of an identification. Their cost grows with the
-number of weights, that of an adjoint does not: they are for closures of some ten weights.
+number of weights, that of an adjoint does not: they are for closures of up to some hundred weights.
 """
 
 import torch
@@ -20,6 +20,9 @@ from rt_torchrl.engines.recurrence import march, march_by_scan, march_by_step
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import drive_of
+
+WIDE = 4
+"""Weights for each state from which on a reverse-mode product for each state is quicker than one for each weight."""
 
 
 class Sensitivities:
@@ -36,7 +39,10 @@ class Sensitivities:
         self.interval = Interval(plant, closure, None)
         self._march = march_by_step if compiled_step else compiled_if(compiled, march_by_scan, march)
         self._linearise = compiled_if(compiled, linearise)
-        self._weight_jacobians = compiled_if(compiled, weight_jacobians)
+        wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
+        # By rows uncompiled: the compiler fails on them for a batch of unknown size, and gains little on large batches.
+        columns = compiled_if(compiled, weight_jacobians)
+        self._weight_jacobians = weight_jacobians_by_rows if wide else columns
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
 
     @torch.no_grad()
@@ -46,7 +52,7 @@ class Sensitivities:
         exogenous: Float[Tensor, "batch n n_z"],
         actions: Float[Tensor, "batch n n_a"],
         *,
-        start: float = 0.0,
+        start: float | Float[Tensor, " batch"] = 0.0,
         initial: bool = False,
     ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_w"]]:
         """States s_1 ... s_n and their sensitivities S_1 ... S_n.
@@ -55,7 +61,7 @@ class Sensitivities:
             initial_state: s_0 of each trajectory.
             exogenous: z, held over each interval.
             actions: held likewise.
-            start: time of s_0 [s].
+            start: time of s_0 [s], one for all or one for each trajectory.
             initial: append n_s columns, ds_k/ds_0.
         """
         drive = drive_of(self.interval.plant, exogenous, actions, start=start)
@@ -87,6 +93,20 @@ def weight_jacobians(interval: Interval, names: tuple[str, ...], starts: Tensor,
         return torch.func.jvp(end, weights, tangents)[1]
 
     return torch.func.vmap(column, out_dims=-1)(basis)
+
+
+def weight_jacobians_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """The same by n_s reverse-mode products at every interval, which is less work where n_w is far above n_s."""
+    weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
+
+    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
+        return torch.func.functional_call(interval, values, (state, Drive(*drive)))
+
+    rows = torch.func.jacrev(end)
+    for _ in range(2):  # over the realisations, then over time
+        rows = torch.func.vmap(rows, in_dims=(None, 0, 0, 0, 0))
+    found = rows(weights, starts, drive.t.expand(starts.shape[:2]), drive.exogenous, drive.command)
+    return torch.cat([jacobian.flatten(3) for jacobian in found.values()], -1)
 
 
 def propagate(A: Tensor, B: Tensor) -> Tensor:

@@ -72,7 +72,7 @@ class Rollout:
         exogenous: Float[Tensor, "batch n n_z"],
         command: Float[Tensor, "batch n n_a"] | None = None,
         *,
-        start: float = 0.0,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
         """The trajectory of ``n`` intervals.
 
@@ -80,7 +80,7 @@ class Rollout:
             initial_state: s_0 of each realisation.
             exogenous: z, held over each interval.
             command: actions from a record; None with a policy.
-            start: time of s_0 [s].
+            start: time of s_0 [s], one for all or one for each realisation.
 
         Raises:
             ValueError: if shapes do not fit the plant and each other, or commands are given beside a policy.
@@ -125,7 +125,7 @@ def require_finite(
     initial_state: Float[Tensor, "batch n_s"],
     modules: Sequence[nn.Module | None],
     *,
-    start: float = 0.0,
+    start: float | Float[Tensor, " batch"] = 0.0,
 ) -> None:
     """Refuse a trajectory that has left the finite numbers.
 
@@ -134,7 +134,7 @@ def require_finite(
         ends: states at the end of every interval.
         initial_state: s_0.
         modules: closure and policy it was computed with, for the message.
-        start: time of s_0 [s].
+        start: time of s_0 [s], one for all or one for each realisation.
 
     Raises:
         DivergenceError: with plant, realisation, time and the last state that was finite.
@@ -142,17 +142,18 @@ def require_finite(
     if ends.isfinite().all():
         return
     k, realisation, component = (~ends.isfinite()).nonzero()[0].tolist()
+    began = float(start[realisation]) if isinstance(start, Tensor) else start
     last = (ends[k - 1] if k else initial_state)[realisation].tolist()
     weights = [type(module).__name__ for module in modules if module is not None]
     raise DivergenceError(
-        f"plant {plant.name!r} diverged in realisation {realisation} at t = {start + (k + 1) * plant.dt:g} s: "
+        f"plant {plant.name!r} diverged in realisation {realisation} at t = {began + (k + 1) * plant.dt:g} s: "
         f"{plant.states[component].name} is not finite; the state before was {last}, the weights those of "
         f"{' and '.join(weights)}. Use a smaller dt, or weights nearer to ones that are known to work."
     )
 
 
-def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float = 0.0) -> Drive:
-    """The drive, time first, of inputs and commands that come batch first."""
+def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Tensor = 0.0) -> Drive:
+    """The drive, time first, of inputs and commands that come batch first; ``start`` as in :meth:`Rollout.__call__`."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
     commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()

@@ -35,7 +35,7 @@ class DigitalTwin:
         exogenous: Float[Tensor, "batch n n_z"],
         actions: Float[Tensor, "batch n n_a"],
         *,
-        start: float = 0.0,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
         """Virtual episodes under recorded actions; see :meth:`Rollout.__call__` for shapes and errors."""
         return self._replay(initial_state, exogenous, actions, start=start)

@@ -67,7 +67,7 @@ def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
     policy = run.algorithm.policies["model_based"]
     plant, state, costs = run.unseen.plant, run.unseen.initial_state, {}
     # Independent of the library's rollout: the plant's step in a loop.
-    for name, pi in (("before", run.initial_policy), ("after", policy)):
+    for name, pi in (("before", run.initial_policies["model_based"]), ("after", policy)):
         s, total = state, 0.0
         for k in range(plant.n_steps):
             t, z = torch.tensor(k * plant.dt), run.unseen.exogenous[:, k]
@@ -89,6 +89,19 @@ def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
     assert ["J_a_unseen" in record for record in metrics["episodes"]] == [False, True, False, True]
     live = metrics["summary"]["live"]
     assert metrics["episodes"][3]["J_a_unseen"] == metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
+
+
+def test_the_model_free_policy_may_be_of_another_kind(tmp_path):
+    run = small_run(tmp_path, episodes=1, model_free_policy="mlp", hidden=(4,))
+    assert {role: type(policy).__name__ for role, policy in run.algorithm.policies.items()} == {
+        "model_based": "LinearGain",
+        "model_free": "SaturatedMLP",
+    }
+    unseen = run.train()["summary"]["unseen"]
+    for key, role in (("J_a_before", "model_based"), ("J_a_before_model_free", "model_free")):
+        assert unseen[key]["mean"] == run.unseen.control_costs(run.initial_policies[role]).mean().item()
+    with pytest.raises(ValueError, match="policy='cubic' does not exist"):
+        small_run(tmp_path / "other", model_free_policy="cubic")
 
 
 class Worn(RunConfig):
@@ -133,10 +146,11 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     assert isinstance(run.unseen.plant, Heavier)
 
 
-def test_resuming_gives_the_same_run_to_the_bit(tmp_path):
-    whole = small_run(tmp_path / "whole", episodes=4).train()
-    small_run(tmp_path / "parts", episodes=2).train()
-    parts = small_run(tmp_path / "parts", episodes=4, resume=True).train()
+@pytest.mark.parametrize("options", [{}, {"model_free_policy": "mlp", "hidden": (4,)}], ids=["same", "two kinds"])
+def test_resuming_gives_the_same_run_to_the_bit(tmp_path, options):
+    whole = small_run(tmp_path / "whole", episodes=4, **options).train()
+    small_run(tmp_path / "parts", episodes=2, **options).train()
+    parts = small_run(tmp_path / "parts", episodes=4, resume=True, **options).train()
     for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
         assert {**one, "seconds": None} == {**other, "seconds": None}
     for metrics in (whole, parts):

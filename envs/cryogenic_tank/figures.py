@@ -9,7 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
+from rt_torchrl.envs.cryogenic_tank.coefficient_figure import CLOSURE_COLOURS, LABELS, coefficients
 from rt_torchrl.envs.cryogenic_tank.merit import BAND
+from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.figures.learning import closure_weights, tracked_weights
 from rt_torchrl.figures.style import (
@@ -30,18 +32,13 @@ from rt_torchrl.figures.style import (
     panels,
     time_axis,
     twin_label,
+    veil,
 )
 from rt_torchrl.snapshot import Snapshot
 
 POINTS = 720
 """Groups of samples a record is drawn in at most: ten minutes each in five days, a ninth of an orbit."""
 DAY = 86_400.0
-LABELS = {
-    "U_s": ("wall to fluid $U_s$ [W/(m² K)]", 1.0),
-    "U_HX": ("heat exchanger $U_{HX}$ [W/(m² K)]", 1.0),
-    "K_JT": ("valve $K_{JT}$ [GPa s²/kg²]", 1e-9),
-}
-CLOSURE_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -49,6 +46,8 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     drawn = {figure.__name__: figure(snapshot) for figure in (tank, heat_exchanger, vent_path)}
     if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
         drawn["closure_weights"] = closure_weights(snapshot, LABELS)
+    if not isinstance(snapshot.closure, ConstantCoefficients):
+        drawn["coefficients"] = coefficients(snapshot)
     return drawn
 
 
@@ -130,7 +129,8 @@ def _means(group: int, *series: Float[np.ndarray, " n"]) -> list[Float[np.ndarra
 def heat_exchanger(snapshot: Snapshot) -> Figure:
     """Heat the exchanger takes and load the vent holds over Δp_V at the set point, for each closure.
 
-    Below, how often the last episode had each pressure drop: a twin can only know what was visited.
+    Below, how often the last episode had each pressure drop: a twin can only know what was visited; drops outside
+    their range are pale.
     """
     plant, record = snapshot.plant, snapshot.record
     # Denser towards the shut valve, where the flow goes with the root of the drop.
@@ -147,6 +147,8 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     mean = record.exogenous.mean().item()
     held.axhline(mean, label="mean load of the last episode", **LIMIT_LINE)
     visited = 1e-3 * array(_drop(plant, record.states[:-1], record.actions))
+    for ax in (heat, held):
+        veil(ax, kilopascal := 1e-3 * array(drop), (kilopascal >= visited.min()) & (kilopascal <= visited.max()))
     weight = np.full(len(visited), 100.0 / len(visited))
     share.hist(visited, np.linspace(0.0, 1e-3 * plant.actions[0].high, 41), weights=weight, color=SAMPLES)
     caption(heat, "heat taken by the exchanger $Q_{HX}$ [W]")

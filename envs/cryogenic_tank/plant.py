@@ -11,6 +11,7 @@ from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad, LoadModel
 from rt_torchrl.envs.cryogenic_tank.merit import merit
 from rt_torchrl.envs.cryogenic_tank.mixture import Conditions, evaporation_heat, mixture_rates
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
+from rt_torchrl.envs.cryogenic_tank.neural import first_neural_guess
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, valve_conductance, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
@@ -289,6 +290,8 @@ class CryogenicTank(Plant):
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """The paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²; draws nothing."""
         return ConstantCoefficients.first_guess(generator.device)
+
+    make_neural_closure = first_neural_guess
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The paper's policy, three weights."""

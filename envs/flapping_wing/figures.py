@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-from torch import Tensor, nn
+from torch import Tensor
 
 from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.style import (
@@ -29,8 +29,10 @@ from rt_torchrl.figures.style import (
     panels,
     time_axis,
     twin_label,
+    veil,
 )
 from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.visited import visited_features as features_of
 
 POLAR_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 SPAN_SHARE = 0.7
@@ -178,7 +180,8 @@ def _mean_over_beats(beat: int, *series: Float[np.ndarray, " n"]) -> list[Float[
 def polars(snapshot: Snapshot) -> Figure:
     """C_L and C_D over the effective angle of attack: of the true wing, the twin and the initial twin.
 
-    Below, how often the last flight had each angle at 70 % of the span: a twin can only know what was visited.
+    Below, how often the last flight had each angle at 70 % of the span: a twin can only know what was visited. Angles
+    that no blade element had are pale.
     """
     visited = visited_features(snapshot)
     C = {name: closure(visited) for name, closure in closures(snapshot).items()}
@@ -190,9 +193,13 @@ def polars(snapshot: Snapshot) -> Figure:
     for k, (ax, name) in enumerate(zip(axes[:2, 0], names, strict=True)):
         caption(ax, name, f"RMS where visited {rms['twin'][k]:.2g}, initial {rms['initial twin'][k]:.2g}")
     angle = np.degrees(np.arctan2(*array(visited).T))
+    edges = np.arange(-180.0, 180.0 + BIN, BIN)
+    anywhere = np.degrees(np.arctan2(*array(features_of(snapshot.plant, snapshot.record)).reshape(-1, 2).T))
+    for ax in axes[:2, 0]:
+        veil(ax, edges, _touched(anywhere, edges))
     share = np.full(len(angle), 100.0 / len(angle))
     ax = axes[2, 0]
-    ax.hist(angle, np.arange(-180.0, 180.0 + BIN, BIN), weights=share, color=SAMPLES)
+    ax.hist(angle, edges, weights=share, color=SAMPLES)
     caption(ax, f"share of the flight [%] per {BIN:g} deg at {SPAN_SHARE:.0%} of the span")
     ax.set_xlabel(r"effective angle of attack $\alpha_e$ [deg]")
     ax.set_xticks(np.arange(-180, 181, 45))
@@ -203,19 +210,15 @@ def polars(snapshot: Snapshot) -> Figure:
 
 def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     """(sin α_e, cos α_e) in the last real flight, at the blade element nearest to ``SPAN_SHARE`` of the span."""
-    plant, record, probe = snapshot.plant, snapshot.record, _Probe()
-    t = plant.dt * torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
-    plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, probe)
+    plant = snapshot.plant
     element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
-    return probe.features[:, element]
+    return features_of(plant, snapshot.record)[:, element]
 
 
-class _Probe(nn.Module):
-    """A closure without forces that keeps what it was asked for."""
-
-    def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        self.features = features
-        return torch.zeros_like(features)
+def _touched(values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m"]) -> np.ndarray:
+    """Which edges border on a bin that holds a value."""
+    filled = np.histogram(values, edges)[0] > 0
+    return np.append(filled, False) | np.append(False, filled)
 
 
 def _draw_polars(axes: np.ndarray, snapshot: Snapshot) -> None:

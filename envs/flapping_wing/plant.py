@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from rt_torchrl.envs.flapping_wing import merit as judgement
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
 from rt_torchrl.plant import Plant, require_stable_step
 from rt_torchrl.policies import SaturatedAffine
 from rt_torchrl.signal import Signal
@@ -278,7 +279,7 @@ class FlappingWing(Plant):
         """½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
-    merit, categories = judgement.merit, judgement.categories
+    merit, categories, make_neural_closure = judgement.merit, judgement.categories, drawn_neural_polar
 
     # Randomness
 

@@ -87,6 +87,7 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
 
     Left: the true table, the learned law and the law that the training started from. Each tick at the top is a λ
     of the episode, in the colour of the pitch angle within 2.5 deg of its own: a twin can only know what was visited.
+    Curves are pale outside the range of those λ.
     """
     visited = _Visited.of(snapshot)
     true, learned, initial = visited.C_p.values()
@@ -146,10 +147,13 @@ def _draw_curves(ax: Axes, snapshot: Snapshot, visited: _Visited) -> None:
     lam = torch.linspace(2.0, max(13.0, visited.lam.max()), 200, dtype=torch.float64)
     lam = lam.to(snapshot.record.states.device)
     for k, (pitch, colour) in enumerate(zip(PITCHES, PITCH_COLOURS, strict=True)):
+        near = visited.lam[np.abs(visited.beta - pitch) <= 2.5]
+        inside = (array(lam) >= near.min(initial=np.inf)) & (array(lam) <= near.max(initial=-np.inf))
         for (name, style), closure in zip(CLOSURE_LINES.items(), closures(snapshot).values(), strict=True):
             values = _evaluate(closure, lam, torch.full_like(lam, pitch))
-            ax.plot(array(lam), values, color=colour, linestyle=style, linewidth=1.6, gid=f"{name}, {pitch:g} deg")
-        near = visited.lam[np.abs(visited.beta - pitch) <= 2.5]
+            look = {"color": colour, "linestyle": style, "linewidth": 1.6}
+            ax.plot(array(lam), values, alpha=0.25, gid=f"{name}, {pitch:g} deg", **look)
+            ax.plot(array(lam), np.where(inside, values, np.nan), **look)
         ax.plot(near, np.full_like(near, 0.585 - 0.02 * k), "|", color=colour, markersize=6, alpha=0.6)
         ax.plot([], [], color=colour, label=rf"$\beta$ = {pitch:g} deg")
     for name, style in CLOSURE_LINES.items():

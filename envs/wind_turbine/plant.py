@@ -1,6 +1,7 @@
 r"""The NREL 5-MW rotor as a plant: one rotating mass, its speed filter and its actuators (paper, section 5.1)."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from rt_torchrl.envs.wind_turbine.completion import completed
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.merit import merit
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
 from rt_torchrl.plant import Plant, require_stable_step
 from rt_torchrl.policies import SaturatedAffine
@@ -113,8 +115,7 @@ class WindTurbine(Plant):
         if min(cost_weights) < 0:
             raise ValueError(f"cost_weights={cost_weights} must not be negative.")
         self.wind = KaimalWind() if wind is None else wind
-        self.inertia = inertia
-        self.cost_weights = cost_weights
+        self.inertia, self.cost_weights = inertia, cost_weights
         self.best_power_coefficient, self.best_tip_speed_ratio, _ = table.maximum()
         self.optimal_gain = self._optimal_gain()
         limits = (math.inf, math.inf) if rate_limits is None else rate_limits
@@ -283,6 +284,10 @@ class WindTurbine(Plant):
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """Saint-Drenan's C_p with the coefficients of Dai 2016; draws nothing."""
         return SaintDrenan.from_set("Dai2016")
+
+    def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
+        """The same and a perceptron of (λ, β)."""
+        return NeuralPowerCoefficient(SaintDrenan.from_set("Dai2016"), hidden=hidden, generator=generator)
 
     def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
         """The paper's policy: one affine law per action through the smooth clip, without bias unless asked for."""

@@ -87,6 +87,12 @@ def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
         ax.axhline(bound * scale, label="limits", **LIMIT_LINE)
 
 
+def veil(ax: Axes, x: np.ndarray, visited: np.ndarray) -> None:
+    """Make a panel pale at every x that was not visited: what a twin says there, it was never told."""
+    whole = {"transform": ax.get_xaxis_transform(), "color": "white", "alpha": 0.65, "linewidth": 0, "zorder": 2.5}
+    ax.fill_between(x, 0.0, 1.0, where=~visited, **whole)
+
+
 def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
     """Times of the samples in s, min or h, whichever is read best, and the axis label."""
     unit, length = time_unit(plant.dt * samples)

@@ -1,0 +1,237 @@
+"""Closures with a perceptron in them: where they start, what keeps their physics, how they are identified."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from test_sensitivity import recorded
+from torch import nn
+from torch.nn.utils import parameters_to_vector
+
+from rt_torchrl.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.closures import BoundedPerceptron
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.interval import Interval
+from rt_torchrl.memory import Record
+from rt_torchrl.runner import main_of
+from rt_torchrl.sensitivity import weight_jacobians, weight_jacobians_by_rows
+from rt_torchrl.trajectory import drive_of
+from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.visited import rms_error, visited_features
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "wind_turbine.py"
+PLANTS = [WindTurbine(horizon=20.0), FlappingWing(horizon=0.01), CryogenicTank(horizon=1200.0)]
+RANGES = {
+    "wind_turbine": ((3.0, 12.0), (0.0, 20.0)),
+    "flapping_wing": ((-1.0, 1.0), (-1.0, 1.0)),
+    "cryogenic_tank": ((0.9, 1.1), (0.6, 0.7), (0.0, 2.0), (0.0, 1.0)),
+}
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def points(plant, count=200):
+    low, high = torch.tensor(RANGES[plant.name], dtype=torch.float64).unbind(-1)
+    return low + (high - low) * torch.rand(count, len(low), generator=seeded(1), dtype=torch.float64)
+
+
+def disturbed(plant, scale=1.0):
+    """A neural closure whose perceptron says something."""
+    closure = plant.make_neural_closure(seeded(), (8, 8))
+    with torch.no_grad():
+        closure.correction.network[-1].weight.normal_(0.0, scale, generator=seeded(2))
+    return closure
+
+
+@pytest.fixture(params=PLANTS, ids=lambda plant: plant.name)
+def plant(request):
+    return request.param
+
+
+def test_it_starts_where_the_papers_does(plant):
+    features = points(plant)
+    assert torch.equal(plant.make_neural_closure(seeded(3), (8,))(features), plant.make_closure(seeded(3))(features))
+    assert not torch.allclose(disturbed(plant)(features), plant.make_closure(seeded())(features), rtol=1e-2)
+
+
+def test_the_correction_is_bounded_wherever_the_features_are():
+    correction = BoundedPerceptron([(0.0, 1.0), (-5.0, 5.0)], [0.5, 2.0], hidden=(4,), generator=seeded())
+    with torch.no_grad():
+        correction.network[-1].weight.fill_(50.0)
+    far = 1e3 * torch.randn(100, 2, generator=seeded(1), dtype=torch.float64)
+    assert (correction(far).abs() <= torch.tensor([0.5, 2.0])).all() and (correction(far).abs() > 0.4).any()
+
+
+@pytest.mark.parametrize(("ranges", "bounds"), [([(1.0, 1.0)], [1.0]), ([(0.0, 1.0)], [0.0])])
+def test_wrong_scales_are_refused(ranges, bounds):
+    with pytest.raises(ValueError, match="ranges=.*low to high.*bounds="):
+        BoundedPerceptron(ranges, bounds, hidden=(4,), generator=seeded())
+
+
+def test_a_plant_without_a_neural_closure_says_so():
+    with pytest.raises(ValueError, match="'linear_quadratic' has no neural closure"):
+        LinearQuadratic().make_neural_closure(seeded(), (8,))
+
+
+def test_both_sides_of_a_wing_are_alike_and_its_drag_is_positive():
+    closure, angle = disturbed(PLANTS[1], 5.0), torch.linspace(0.1, 3.0, 50, dtype=torch.float64)
+    one, other = (closure(torch.stack([a.sin(), a.cos()], -1)) for a in (angle, -angle))
+    torch.testing.assert_close(one[:, 0], -other[:, 0], rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(one[:, 1], other[:, 1], rtol=1e-12, atol=1e-14)
+    assert (one[:, 1] > 0.0).all()
+    along = closure(torch.tensor([[0.0, 1.0]], dtype=torch.float64))
+    assert along[0, 0] == 0.0
+
+
+def test_the_tanks_coefficients_stay_within_a_factor_of_two():
+    tank = PLANTS[2]
+    ratio = disturbed(tank, 20.0)(points(tank)) / tank.make_closure(seeded())(points(tank))
+    assert ratio.min() >= 0.5 and ratio.max() <= 2.0 and ratio.max() > 1.5
+
+
+def test_jacobians_by_rows_are_those_by_columns(plant):
+    """Reverse mode against forward mode, on visited intervals."""
+    _, flown, exogenous = recorded(plant, batch=2)
+    closure = disturbed(plant, 0.3)
+    names = tuple(name for name, _ in closure.named_parameters())
+    interval, drive = Interval(plant, closure, None), drive_of(plant, exogenous, flown.actions)
+    starts = flown.states[:, :-1].transpose(0, 1)
+    with torch.no_grad():
+        columns, rows = (f(interval, names, starts, drive) for f in (weight_jacobians, weight_jacobians_by_rows))
+    # The same derivatives in another order: rounding, relative to the largest of each state.
+    assert ((columns - rows).abs().amax((0, 1, 3)) <= 1e-10 * columns.abs().amax((0, 1, 3)).clamp(min=1e-300)).all()
+
+
+def test_segments_start_from_the_record(plant):
+    """J_p of the segments is the mean over them, each flown here from its measured state at its own time."""
+    twin, flown, exogenous = recorded(plant, batch=2)
+    config = AssimilationConfig(segment=8, inputs="record", method="levenberg_marquardt", iterations=1)
+    assimilation, seen = Assimilation(twin, config), []
+    equations = assimilation.normal_equations
+    assimilation.normal_equations = lambda *arguments: seen.append(equations(*arguments)) or seen[-1]
+    records = [Record(*parts) for parts in zip(flown.states, exogenous, flown.actions, strict=True)]
+    costs, n = [], plant.n_steps // 8 * 8
+    with torch.no_grad():
+        for record in records:
+            for first in range(0, n, 8):
+                state, total = record.states[first], 0.0
+                for k in range(first, first + 8):
+                    t = torch.tensor(k * plant.dt, dtype=torch.float64)
+                    state = plant.step(t, state, record.actions[k], record.exogenous[k], twin.closure).state
+                    total = total + plant.dt * plant.discrepancy(state, record.states[k + 1])
+                costs.append(total)
+    assimilation.update(records, [], 1, seeded())
+    # Rounding of at most eight steps.
+    assert seen[0].cost.item() == pytest.approx(torch.stack(costs).mean().item(), rel=1e-9)
+
+
+def test_what_is_reported_for_segments_is_the_whole_record():
+    plant = LinearQuadratic(horizon=4.0, noise=0.0)
+    results = []
+    for segment in (0, 10):
+        twin, flown, exogenous = recorded(plant, batch=1)
+        config = AssimilationConfig(segment=segment, inputs="record", method="levenberg_marquardt")
+        record = Record(flown.states[0], exogenous[0], flown.actions[0])
+        results.append(Assimilation(twin, config).update([record], [], 1, seeded()))
+        # A noise-free record: both find the true matrix.
+        torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-7)
+    assert results[0].start == pytest.approx(results[1].start, rel=1e-12)
+    assert results[1].best < 1e-12 * results[1].start
+
+
+class Corrected(nn.Module):
+    """The law that a twin starts from and a perceptron of one layer."""
+
+    def __init__(self, law):
+        super().__init__()
+        self.law = law
+        ranges = [(-3.0, 3.0)] * 2
+        self.correction = BoundedPerceptron(ranges, [1.0, 1.0], hidden=(), generator=seeded())
+
+    def forward(self, features):
+        return self.law(features) + self.correction(features)
+
+
+def test_a_prior_pulls_the_perceptron_against_the_record():
+    plant, moved = LinearQuadratic(horizon=4.0, noise=0.0), []
+    for prior in (0.01, 0.1, 1.0):
+        twin, flown, exogenous = recorded(plant, batch=1)
+        twin = DigitalTwin(plant, Corrected(twin.closure.requires_grad_(False)))
+        start = parameters_to_vector(twin.closure.correction.parameters()).detach()
+        config = AssimilationConfig(prior=prior, inputs="record", method="levenberg_marquardt", iterations=40)
+        assimilation = Assimilation(twin, config)
+        assimilation.update([Record(flown.states[0], exogenous[0], flown.actions[0])], [], 1, seeded())
+        away = parameters_to_vector(twin.closure.correction.parameters()).detach() - start
+        moved.append(away.norm().item())
+        found = assimilation.normal_equations(exogenous, flown.states, flown.actions)
+        # At the minimum of both the gradient of J_p is the pull of the prior; the steps end where 1e-4 of the cost is
+        # left to gain, some hundredths of the gradient.
+        assert (found.gradient + prior * away).norm() <= 0.1 * found.gradient.norm()
+    assert moved[0] > moved[1] > moved[2] > 0.0
+
+
+def test_a_prior_leaves_the_law_free():
+    plant = LinearQuadratic(horizon=4.0, noise=0.0)
+    twin, flown, exogenous = recorded(plant, batch=1)
+    twin = DigitalTwin(plant, Corrected(twin.closure))
+    config = AssimilationConfig(prior=1e6, inputs="record", method="levenberg_marquardt", iterations=30)
+    Assimilation(twin, config).update([Record(flown.states[0], exogenous[0], flown.actions[0])], [], 1, seeded())
+    # With the perceptron held, the law finds the true matrix as it does alone.
+    torch.testing.assert_close(twin.closure.law.matrix, plant.closure.matrix, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("option", "message"), [({"prior": -1.0}, "prior=-1.0"), ({"segment": -1}, "segment=-1")])
+def test_wrong_options_are_refused(option, message):
+    with pytest.raises(ValueError, match=message):
+        AssimilationConfig(**option)
+
+
+def test_a_segment_longer_than_the_record_is_refused():
+    twin, flown, exogenous = recorded(LinearQuadratic(horizon=2.0), batch=1)
+    record = Record(flown.states[0], exogenous[0], flown.actions[0])
+    with pytest.raises(ValueError, match="segment=21 exceeds the 20 control intervals"):
+        Assimilation(twin, AssimilationConfig(segment=21, inputs="record")).update([record], [], 1, seeded())
+
+
+def test_the_error_where_visited_is_that_of_the_coefficients():
+    """On the turbine, where the features are known: λ = ωR/u and the pitch."""
+    plant = PLANTS[0]
+    _, flown, exogenous = recorded(plant, batch=1)
+    record = Record(flown.states[0], exogenous[0], flown.actions[0])
+    features = visited_features(plant, record)
+    lam = 63.0 * record.states[:-1, 0] / record.exogenous[:, 0]
+    torch.testing.assert_close(features, torch.stack([lam, record.actions[:, 1]], -1), rtol=1e-14, atol=0)
+    closure = plant.make_closure(seeded())
+    error = (closure(features) - plant.closure(features)).square().mean().sqrt()
+    assert rms_error(closure, plant.closure, features).tolist() == pytest.approx([error.item()], rel=1e-12)
+    assert rms_error(plant.closure, plant.closure, features).tolist() == [0.0]
+
+
+def load_recipe():
+    spec = importlib.util.spec_from_file_location("recipe_wind_turbine", RECIPE)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_command_line_trains_a_closure_by_its_own_defaults(monkeypatch):
+    """What is given stays: here the number of records."""
+    recipe, seen = load_recipe(), []
+    for options in ([], ["--closure", "mlp"], ["--closure", "mlp", "--twinning.records", "3"]):
+        monkeypatch.setattr("sys.argv", ["wind_turbine.py", *options])
+        main_of(recipe.Config, seen.append)
+    paper, neural, chosen = (config.twinning for config in seen)
+    assert paper == recipe.PAPER and neural == recipe.NEURAL != paper
+    assert chosen.records == 3 and chosen.assimilation == neural.assimilation
+    assert [type(c.make_closure(PLANTS[0], seeded())).__name__ for c in seen[:2]] == [
+        "SaintDrenan",
+        "NeuralPowerCoefficient",
+    ]
