@@ -89,12 +89,12 @@ def test_arms_touch_their_own_half_alone():
 def test_what_is_stored_is_what_was_applied():
     """On the turbine, whose rate limits change most commands of a policy with noise."""
     found = twinning(WindTurbine(horizon=30.0), exploration=ExplorationConfig(spread=1.0, episodes=5))
-    asked = []
-    act = found.actor.forward
-    found.actor.forward = lambda observation: asked.append(act(observation)) or asked[-1]
+    flown = []
+    fly = found.collector.rollout
+    found.collector.rollout = lambda: flown.append(fly()) or flown[-1]
     found.interact()
     (record,) = found.short_term
-    commands = torch.cat(asked)[-60:]
+    (commands,) = flown[-1]["action"]
     stored = found.long_term._buffer[:60]
     # The plant latches the applied action into the state at the end of the interval.
     assert torch.equal(record.actions, record.states[1:, 4:])
