@@ -1,6 +1,7 @@
 """Reinforcement Twinning: a digital twin and two controllers, trained while the real system runs."""
 
 from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.contract import PlantContractError, check_plant
 from rt_torchrl.environment import PlantEnv
 from rt_torchrl.plant import Plant
 from rt_torchrl.signal import Signal
@@ -11,12 +12,14 @@ __all__ = [
     "DigitalTwin",
     "DivergenceError",
     "Plant",
+    "PlantContractError",
     "PlantEnv",
     "ReinforcementTwinning",
     "Rollout",
     "Signal",
     "Trajectory",
     "TwinningConfig",
+    "check_plant",
     "control_cost",
     "identification_cost",
 ]

@@ -95,7 +95,7 @@ class ReinforcementTwinning:
         require_clonable(model_free, model_based)
         self.model_free = ModelFree(twin.plant, model_free, config.model_free, generator=generator)
         self.assimilation = Assimilation(twin, config.assimilation)
-        self.model_based = ModelBased(twin, model_based, config.model_based)
+        self.model_based = ModelBased(twin, model_based, config.model_based, generator=generator)
         self.long_term = LongTermMemory(config.long_term, generator=generator)
         self.short_term = ShortTermMemory(config.records)
         self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))

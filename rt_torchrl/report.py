@@ -68,6 +68,7 @@ def summary(
     """
     closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
+    known = {name: law for name, law in laws.items() if law is not None}
     before = unseen.control_costs(initial_policy)
     flown = unseen.fly(algorithm.policies[live])
     J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
@@ -87,7 +88,7 @@ def summary(
         },
         "live": live,
         "better": better,
-        "closure": {name: named_weights(law) for name, law in laws.items()},
+        "closure": {name: named_weights(law) for name, law in known.items()},
         "seconds": seconds_per_step(episodes),
     }
     if optimum is not None:
@@ -188,7 +189,7 @@ def closure_lines(closure: dict[str, Any]) -> list[str]:
     """Weights found, beside the true ones where the real plant has the same closure."""
     if not closure["found"] or not all(isinstance(value, float) for value in closure["found"].values()):
         return []
-    true = closure["true"] or {}
+    true = closure.get("true") or {}
     lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}{'true':>12}"]
     for name, value in closure["found"].items():
         known = f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"

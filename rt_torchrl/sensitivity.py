@@ -44,9 +44,11 @@ class Sensitivities:
         initial_state: Float[Tensor, "batch n_s"],
         exogenous: Float[Tensor, "batch n n_z"],
         actions: Float[Tensor, "batch n n_a"],
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_w"]]:
-        """States s_1 ... s_n and their sensitivities S_1 ... S_n."""
-        drive = drive_of(self.interval.plant, exogenous, actions)
+        """States s_1 ... s_n and their sensitivities S_1 ... S_n; ``start`` is the time of s_0 [s]."""
+        drive = drive_of(self.interval.plant, exogenous, actions, start=start)
         initial_state = initial_state.clone(memory_format=torch.contiguous_format)
         ends = self._march(self.interval, initial_state, drive)
         starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])
