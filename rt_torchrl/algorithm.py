@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.environment import PlantEnv
 from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, ShortTermMemory
@@ -69,7 +69,7 @@ class ReinforcementTwinning:
     """The algorithm; call :meth:`episode` once per real episode.
 
     Args:
-        env: the real system; a :class:`PlantEnv` of batch size 1, or any TorchRL environment with its entries.
+        env: the real system; a :class:`PlantEnv` of batch size 1, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
         model_free: π_mf, trained in place; starts live.
         model_based: π_mb, trained in place.
@@ -82,7 +82,7 @@ class ReinforcementTwinning:
 
     def __init__(
         self,
-        env: PlantEnv,
+        env: EnvBase,
         twin: DigitalTwin,
         *,
         model_free: nn.Module,

@@ -1,7 +1,5 @@
 """Unseen episodes on a real system whose true closure nobody knows."""
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float
 from tensordict.nn import TensorDictModule
@@ -9,13 +7,12 @@ from torch import Tensor, nn
 
 from rt_torchrl.evaluation import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.real_system import RealSystem
+from rt_torchrl.trajectory import Trajectory
 
 
-class Flown(NamedTuple):
+class Flown(Trajectory):
     """A trajectory as measured, with the exogenous input that acted in it."""
 
-    states: Float[Tensor, "count samples n_s"]
-    actions: Float[Tensor, "count n n_a"]
     exogenous: Float[Tensor, "count n n_z"]
 
 
@@ -53,7 +50,9 @@ class RealEpisodes(UnseenEpisodes):
         finally:
             self._system.load_state_dict(kept)
         states = torch.cat([found["state"], found["next", "state"][:, -1:]], 1)
-        return Flown(states, found["next", "applied"], found["exogenous"])
+        flown = Flown(states, found["next", "applied"])
+        flown.exogenous = found["exogenous"]
+        return flown
 
     def exogenous_of(self, flown: Flown) -> Float[Tensor, "count n n_z"]:
         return flown.exogenous

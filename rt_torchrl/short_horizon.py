@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.policies import mlp
-from rt_torchrl.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
 
@@ -101,29 +101,44 @@ class ShortHorizon:
         self._optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.config.policy_rate, betas=self.moments)
 
     def sweep(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> float:
-        """Once through the episodes, a step of the policy for each whole window.
+        """Fly the episodes once, then take a step of the policy for each of their whole windows.
+
+        Every step is on windows of all phases of the episode, one of each realisation: with those of one phase alone
+        the critic forgets the others.
 
         Returns:
             Mean norm of the gradients of J_w, relative to the mean cost of the first sweep.
         """
-        state, norms, n = initial_state, [], self.config.window
-        for first in range(0, exogenous.shape[1] - n + 1, n):
-            start, inputs = first * self.twin.plant.dt, exogenous[:, first : first + n]
-            flown = self.twin.control(self.policy, state, inputs, start=start)
-            if not self.reference:
-                self.reference = control_cost(self.twin.plant, flown, inputs, start=start).mean().item() or 1.0
-            costs, seen = self._costs(flown, inputs, start)
-            norms.append(self._improve_policy(costs, seen))
-            self._improve_critic(costs.detach(), seen.detach())
-            state = flown.states[:, -1].detach()
+        plant, n = self.twin.plant, self.config.window
+        batch, count = len(exogenous), exogenous.shape[1] // n
+        with torch.no_grad():
+            flown = self.twin.control(self.policy, initial_state, exogenous)
+        self.reference = self.reference or control_cost(plant, flown, exogenous).mean().item() or 1.0
+        inputs = exogenous[:, : count * n].unflatten(1, (count, n))
+        rows, norms = torch.arange(batch, device=exogenous.device), []
+        for shift in range(count):
+            phase = (rows + shift) % count
+            start = plant.dt * n * phase.double()
+            norms.append(self._window(flown.states[rows, phase * n], inputs[rows, phase], start))
         return sum(norms) / len(norms)
 
-    def _costs(self, flown: Trajectory, inputs: Tensor, start: float) -> tuple[Tensor, Tensor]:
-        """L_k over the reference, ``batch n``, and the observations e_0 ... e_n; the last with the last input."""
-        plant, n = self.twin.plant, inputs.shape[1]
-        t = start + plant.dt * torch.arange(n + 1, dtype=torch.float64, device=inputs.device)
-        costs = plant.running_cost(t[:-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
-        return costs, plant.observe(t, flown.states, torch.cat([inputs, inputs[:, -1:]], 1))
+    def _window(
+        self,
+        state: Float[Tensor, "batch n_s"],
+        inputs: Float[Tensor, "batch n n_z"],
+        start: Float[Tensor, " batch"],
+    ) -> float:
+        """One step of the policy, then the critic's; the norm of the policy's gradient."""
+        plant = self.twin.plant
+        flown = self.twin.control(self.policy, state, inputs, start=start)
+        clock = plant.dt * torch.arange(inputs.shape[1] + 1, dtype=torch.float64, device=inputs.device)
+        t = start.unsqueeze(-1) + clock
+        costs = plant.running_cost(t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
+        # There is no input after the last interval.
+        seen = plant.observe(t, flown.states, torch.cat([inputs, inputs[:, -1:]], 1))
+        norm = self._improve_policy(costs, seen)
+        self._improve_critic(costs.detach(), seen.detach())
+        return norm
 
     def _improve_policy(self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"]) -> float:
         gamma, n = self.config.discount, costs.shape[1]

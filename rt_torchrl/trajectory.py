@@ -96,7 +96,7 @@ class Rollout:
         if isinstance(start, Tensor) and isinstance(self._engine, ContinuousAdjoint):
             raise ValueError(
                 "engine='odeint_adjoint' integrates all realisations over the same span and takes no start for each; "
-                "use parallel or autograd, or replay whole records (window=0)."
+                "use parallel or autograd, or whole episodes (window=0)."
             )
         drive = drive_of(self.plant, exogenous, command, start=start)
         torch._dynamo.maybe_mark_dynamic(initial_state, 0)

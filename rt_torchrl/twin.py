@@ -46,7 +46,7 @@ class DigitalTwin:
         initial_state: Float[Tensor, "batch n_s"],
         exogenous: Float[Tensor, "batch n n_z"],
         *,
-        start: float = 0.0,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
         """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`."""
         return self._rollout(policy)(initial_state, exogenous, start=start)
