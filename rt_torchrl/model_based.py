@@ -92,7 +92,8 @@ class ModelBased:
             accepted = bool(self._cost(judged_on) <= incumbent)
         if not accepted:
             self.policy.load_state_dict(before)
-            self.restart()
+            if isinstance(self.descent, Descent):
+                self.restart()
         return Plan(descended, accepted)
 
     def _descend(self, planned_on: VirtualEpisodes) -> Descended:
@@ -101,6 +102,7 @@ class ModelBased:
         with torch.no_grad():
             start = self._cost(planned_on).item()
         gradients = [self.descent.sweep(*planned_on) for _ in range(self.config.iterations)]
+        self.policy.load_state_dict(self.descent.learner.state_dict())
         with torch.no_grad():
             end = self._cost(planned_on).item()
         return Descended(start, end, gradients[0] if gradients else float("nan"), len(gradients))

@@ -1,4 +1,4 @@
-"""The real system where it is not a plant in simulation: any TorchRL or Gymnasium environment, in a plant's terms."""
+"""The real system where it is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import EnvBase, GymWrapper
+from torchrl.envs import EnvBase
 
 from rt_torchrl.environment import declare_specs
 from rt_torchrl.plant import Plant
@@ -42,7 +42,19 @@ class Reading:
         """The vector in the plant's units.
 
         Raises:
-            ValueError: if an entry is missing, or the vector has not the shape of the signals or is not finite.
+            ValueError: as :meth:`vector`, or if the vector is not finite.
+        """
+        found = self.vector(reported, signals, what)
+        if not found.isfinite().all():
+            names = [signal.name for signal in signals]
+            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {found[0].tolist()}.")
+        return found
+
+    def vector(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
+        """The vector in the plant's units, whatever its values.
+
+        Raises:
+            ValueError: if an entry is missing, or the vector has not the shape of the signals.
         """
         missing = [key for key in self.keys if reported.get(key, None) is None]
         if missing:
@@ -55,8 +67,6 @@ class Reading:
                 f"{what}, read from {list(self.keys)}, has shape {tuple(found.shape)}; the plant needs "
                 f"{(*reported.batch_size, len(signals))}, which is {names}: give the reading a function `of` them."
             )
-        if not found.isfinite().all():
-            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {found.tolist()}.")
         return in_units(found, self.scale, self.offset).reshape(1, len(signals))
 
 
@@ -99,7 +109,7 @@ class RealSystem(EnvBase):
     environment must not end it before.
 
     Args:
-        env: a TorchRL environment of one system (batch size () or (1,)), or a Gymnasium one, which is wrapped.
+        env: a TorchRL environment of one system (batch size () or (1,)); a Gymnasium one in TorchRL's ``GymWrapper``.
         plant: physics and control problem of the twin. What it draws is not used here.
         state: where its state is found.
         exogenous: where its exogenous input is found, which must be that of the interval to come; a constant for each
@@ -113,8 +123,8 @@ class RealSystem(EnvBase):
         device: where its entries go.
 
     Raises:
-        ValueError: if an entry is missing or misshapen, the environment is a batch, or its limits on the action do not
-            contain the plant's.
+        ValueError: if the environment is none of TorchRL or a batch, an entry is missing or misshapen, or its limits on
+            the action do not contain the plant's.
     """
 
     def __init__(
@@ -130,7 +140,8 @@ class RealSystem(EnvBase):
         seed: int | None = 0,
         device: torch.device | str = "cpu",
     ):
-        env = env if isinstance(env, EnvBase) else GymWrapper(env)
+        if not isinstance(env, EnvBase):
+            raise ValueError(f"env is a {type(env).__name__}; wrap it first, such as torchrl.envs.GymWrapper(env).")
         if env.batch_size not in (torch.Size([]), torch.Size([1])):
             raise ValueError(f"batch_size={tuple(env.batch_size)} of the environment must be () or (1,): one system.")
         super().__init__(device=torch.device(device), batch_size=torch.Size([1]))
@@ -143,11 +154,14 @@ class RealSystem(EnvBase):
 
     def _require_fit(self) -> None:
         """Refuse before the first step what would fail in it; nothing real is moved."""
-        imagined = self.env.fake_tensordict()
-        self._state.read(imagined, self.plant.states, "state")
-        self._input(imagined)
+        imagined = self.env.fake_tensordict()  # zeros, of which a reading need not be finite
+        self._state.vector(imagined, self.plant.states, "state")
+        if isinstance(self._exogenous, Reading):
+            self._exogenous.vector(imagined, self.plant.inputs, "exogenous")
+        else:
+            self._input(imagined)
         if self._applied is not None:
-            self._applied.read(imagined["next"], self.plant.actions, "applied")
+            self._applied.vector(imagined["next"], self.plant.actions, "applied")
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
             raise ValueError(

@@ -65,12 +65,18 @@ class ShortHorizonConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be positive.")
 
 
+MODULES = ("learner", "critic", "target")
+
+
 class ShortHorizon:
     """Descends J_w of one window after the other, along virtual episodes.
 
+    What descends is a copy of the policy, because it gets worse before it gets better while the critic is still wrong:
+    it goes on from episode to episode, whether or not it is good enough yet to take the policy's place.
+
     Args:
         twin: flies the windows.
-        policy: π_mb, updated in place.
+        policy: π_mb, not changed here; ``learner`` is the copy.
         config: see :class:`ShortHorizonConfig`.
         generator: source of the critic's initial weights.
 
@@ -97,8 +103,9 @@ class ShortHorizon:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the state of the policy's optimiser, because its weights have jumped."""
-        self._optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.config.policy_rate, betas=self.moments)
+        """Go on from the policy as it is now, because its weights have jumped."""
+        self.learner = copy.deepcopy(self.policy)
+        self._optimiser = torch.optim.Adam(self.learner.parameters(), lr=self.config.policy_rate, betas=self.moments)
 
     def sweep(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> float:
         """Fly the episodes once, then take a step of the policy for each of their whole windows.
@@ -112,7 +119,7 @@ class ShortHorizon:
         plant, n = self.twin.plant, self.config.window
         batch, count = len(exogenous), exogenous.shape[1] // n
         with torch.no_grad():
-            flown = self.twin.control(self.policy, initial_state, exogenous)
+            flown = self.twin.control(self.learner, initial_state, exogenous)
         self.reference = self.reference or control_cost(plant, flown, exogenous).mean().item() or 1.0
         inputs = exogenous[:, : count * n].unflatten(1, (count, n))
         rows, norms = torch.arange(batch, device=exogenous.device), []
@@ -130,7 +137,7 @@ class ShortHorizon:
     ) -> float:
         """One step of the policy, then the critic's; the norm of the policy's gradient."""
         plant = self.twin.plant
-        flown = self.twin.control(self.policy, state, inputs, start=start)
+        flown = self.twin.control(self.learner, state, inputs, start=start)
         clock = plant.dt * torch.arange(inputs.shape[1] + 1, dtype=torch.float64, device=inputs.device)
         t = start.unsqueeze(-1) + clock
         costs = plant.running_cost(t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
@@ -146,7 +153,7 @@ class ShortHorizon:
         J_w = (costs * weights).sum(-1) + gamma**n * self.target(seen[:, -1]).squeeze(-1)
         self._optimiser.zero_grad(set_to_none=True)
         J_w.mean().backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.gradient_limit)
+        norm = nn.utils.clip_grad_norm_(self.learner.parameters(), self.gradient_limit)
         self._optimiser.step()
         return norm.item()
 
@@ -173,12 +180,12 @@ class ShortHorizon:
         return torch.stack(found, 1).flip(1)
 
     def state_dict(self) -> dict[str, Any]:
-        modules = {name: getattr(self, name).state_dict() for name in ("critic", "target")}
+        modules = {name: getattr(self, name).state_dict() for name in MODULES}
         optimisers = {"policy": self._optimiser.state_dict(), "values": self._critic_optimiser.state_dict()}
         return modules | optimisers | {"reference": self.reference}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        for name in ("critic", "target"):
+        for name in MODULES:
             getattr(self, name).load_state_dict(state[name])
         self._optimiser.load_state_dict(state["policy"])
         self._critic_optimiser.load_state_dict(state["values"])

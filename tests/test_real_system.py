@@ -204,6 +204,11 @@ def test_a_batch_of_systems_is_refused():
         RealSystem(PlantEnv(LinearQuadratic(), batch_size=3), LinearQuadratic(), state=STATE)
 
 
+def test_what_is_no_environment_of_torchrl_is_refused(unchecked):
+    with pytest.raises(ValueError, match="env is a object; wrap it first, such as torchrl.envs.GymWrapper"):
+        RealSystem(object(), LinearQuadratic(), state=STATE)
+
+
 def test_an_episode_that_ends_early_is_refused():
     plant = LinearQuadratic(horizon=2.0)
     system = connected(plant, rig=Rig(plant, ends_after=7))
@@ -212,11 +217,12 @@ def test_an_episode_that_ends_early_is_refused():
 
 
 def test_a_reading_that_is_not_finite_is_refused():
-    system = connected(
-        LinearQuadratic(), state=Reading(keys=(("sensors", "encoder"),), of=lambda mm: mm / mm.abs().sum())
-    )
-    system.reset()
-    system.env.inner.plant.draw_initial_state = lambda batch, generator: torch.zeros(batch, 2).double()
+    """When it is read; of the zeros that stand in for a report before that, it may be anything."""
+    plant = LinearQuadratic()
+    share = Reading(keys=(("sensors", "encoder"),), of=lambda mm: mm / mm.abs().sum())
+    system = connected(plant, rig=Rig(plant), state=share)
+    assert system.reset()["state"].isfinite().all()
+    plant.draw_initial_state = lambda batch, generator: torch.zeros(batch, 2).double()
     with pytest.raises(ValueError, match=r"state \['position', 'velocity'\], read from .*is not finite: \[nan, nan\]"):
         system.reset()
 

@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.real_system import Reading, RealSystem
@@ -34,4 +35,6 @@ def gymnasium_pendulum(
     env = gymnasium.make("Pendulum-v1", g=plant.gravity, max_episode_steps=plant.n_steps)
     if env.unwrapped.dt != plant.dt:
         raise ValueError(f"dt={plant.dt} s of the plant must be that of Gymnasium's pendulum, {env.unwrapped.dt} s.")
-    return RealSystem(env, plant, state=Reading(of=angle_and_speed), closure=closure, seed=seed, device=device)
+    return RealSystem(
+        GymWrapper(env), plant, state=Reading(of=angle_and_speed), closure=closure, seed=seed, device=device
+    )
