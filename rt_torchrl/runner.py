@@ -40,9 +40,9 @@ class Run:
     Args:
         config: see :class:`RunConfig`.
         plant: the real system in simulation, and the twin's physics.
-        env: the real system, where it is not a plant in simulation. It is judged on ``plant`` under its closure; where
-            that is not known (``env.closure`` is None), on real episodes: ``unseen`` for each of five policies, and one
-            for each of twenty random starts.
+        env: the real system, where it is not a plant in simulation. It is judged on ``plant`` under ``env.closure``;
+            where that is not known, on real episodes: four times ``unseen`` of them (the policy before, both after, and
+            the live one again for the twin), and one for each of twenty random starts.
         believed: the twin's physics where they are not those of the real system; None where they are.
         plant_figures: figures only this plant has.
         baselines: classical controllers to judge beside the policies, by name.
@@ -79,19 +79,19 @@ class Run:
         model_based = self.make_policy(generator).to(device)
         closure = plant.make_closure(generator).to(device)
         self.initial_policy, self.initial_closure = copy.deepcopy(model_based), copy.deepcopy(closure)
-        system = {"noise": config.noise, "wear": config.wear(plant)}
         self.algorithm = ReinforcementTwinning(
-            env or PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system),
+            simulated(plant, config, device=device, compiled=compiled) if env is None else env,
             DigitalTwin(believed or plant, closure, engine=config.engine, compiled=compiled),
             model_free=copy.deepcopy(model_based),
             model_based=model_based,
             config=self.config.twinning,
             generator=generator,
         )
-        if env is not None and env.closure is None:
-            self.unseen: UnseenEpisodes = RealEpisodes(env, self.config.unseen, device=device)
-        else:
-            self.unseen = UnseenEpisodes(plant, self.config.unseen, compiled=compiled, device=device)
+        self.unseen: UnseenEpisodes = (
+            UnseenEpisodes(plant, self.config.unseen, compiled=compiled, device=device)
+            if env is None or env.closure is not None
+            else RealEpisodes(env, self.config.unseen, device=device)
+        )
         self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
         self.episodes: list[dict[str, Any]] = []
         if config.resume:
@@ -198,6 +198,12 @@ def can_compile(device: torch.device) -> bool:
     if missing:
         print(f"This machine lacks {missing}: running without torch.compile, several times slower.")
     return missing is None
+
+
+def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:
+    """The real system in simulation, with the sensors and the wear of the configuration."""
+    system = {"noise": config.noise, "wear": config.wear(plant)}
+    return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
 
 
 def require_simulation(
