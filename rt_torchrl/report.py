@@ -68,7 +68,6 @@ def summary(
     """
     closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
-    known = {name: law for name, law in laws.items() if law is not None}
     before = unseen.control_costs(initial_policy)
     flown = unseen.fly(algorithm.policies[live])
     J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
@@ -88,7 +87,7 @@ def summary(
         },
         "live": live,
         "better": better,
-        "closure": {name: named_weights(law) for name, law in known.items()},
+        "closure": {name: named_weights(law) for name, law in laws.items() if law is not None},
         "seconds": seconds_per_step(episodes),
     }
     if optimum is not None:

@@ -87,11 +87,7 @@ class Run:
             config=self.config.twinning,
             generator=generator,
         )
-        self.unseen: UnseenEpisodes = (
-            UnseenEpisodes(plant, self.config.unseen, compiled=compiled, device=device)
-            if env is None or env.closure is not None
-            else RealEpisodes(env, self.config.unseen, device=device)
-        )
+        self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
         self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
         self.episodes: list[dict[str, Any]] = []
         if config.resume:
@@ -204,6 +200,15 @@ def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled
     """The real system in simulation, with the sensors and the wear of the configuration."""
     system = {"noise": config.noise, "wear": config.wear(plant)}
     return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
+
+
+def judged_on(
+    plant: Plant, env: RealSystem | None, count: int, *, device: torch.device, compiled: bool
+) -> UnseenEpisodes:
+    """The unseen episodes: on the plant, or on a real system of which no closure is known."""
+    if env is None or env.closure is not None:
+        return UnseenEpisodes(plant, count, compiled=compiled, device=device)
+    return RealEpisodes(env, count, device=device)
 
 
 def require_simulation(
