@@ -74,7 +74,7 @@ class ReinforcementTwinning:
     """The algorithm; call :meth:`episode` once per real episode.
 
     Args:
-        env: the real system; a :class:`PlantEnv` of batch size 1, or any TorchRL environment with its entries.
+        env: the real system; a :class:`PlantEnv` of batch size 1, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
         model_free: π_mf, trained in place; starts live.
         model_based: π_mb, trained in place.
@@ -96,7 +96,7 @@ class ReinforcementTwinning:
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
         self.model_free = ModelFree(twin.plant, model_free, config.model_free, generator=generator)
         self.assimilation = Assimilation(twin, config.assimilation)
-        self.model_based = ModelBased(twin, model_based, config.model_based)
+        self.model_based = ModelBased(twin, model_based, config.model_based, generator=generator)
         self.distillation = Distillation(twin, config.distillation)
         self.long_term = LongTermMemory(config.long_term, generator=generator)
         self.short_term = ShortTermMemory(config.records)

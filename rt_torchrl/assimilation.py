@@ -70,8 +70,6 @@ class Replayed(NamedTuple):
         """In segments of that many intervals of length ``dt``, in the order of time; what is left over is dropped."""
         exogenous, measured, actions, _ = self
         batch, whole = len(exogenous), exogenous.shape[1] // segment
-        if whole == 0:
-            raise ValueError(f"segment={segment} exceeds the {exogenous.shape[1]} control intervals of a record.")
         n = whole * segment
         starts = torch.stack([measured[:, k * segment : (k + 1) * segment + 1] for k in range(whole)], 1)
         time = dt * segment * torch.arange(whole, dtype=torch.float64, device=exogenous.device)
@@ -95,6 +93,11 @@ class Assimilation:
     """
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
+        if config.segment > twin.plant.n_steps:
+            raise ValueError(
+                f"segment={config.segment} of the assimilation exceeds the {twin.plant.n_steps} control intervals of "
+                f"an episode of plant {twin.plant.name!r}; 0 replays whole records."
+            )
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
         self.second_order = LevenbergMarquardt(twin.closure)

@@ -3,12 +3,27 @@
 import shutil
 import sysconfig
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import cache
 from pathlib import Path
 
 import torch
 from hoptorch.scan import ensure_scan_backward
 from torch._inductor import config as inductor_config
+
+LIMITS = {
+    # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
+    "recompile_limit": 256,
+    "accumulated_recompile_limit": 4096,
+    # The dt of a second plant would otherwise become a symbol, which a scan cannot capture.
+    "specialize_float": True,
+}
+"""Settings of the tracer."""
+
+
+def raised_limits() -> AbstractContextManager[None]:
+    """The tracer's settings that this library compiles under, for as long as the context lasts."""
+    return torch._dynamo.config.patch(LIMITS)
 
 
 def compiled_if(compiled: bool, function: Callable, eager: Callable | None = None) -> Callable:
@@ -49,8 +64,5 @@ def _compile(function: Callable) -> Callable:
 def _prepare() -> None:
     # The scan's backward must have been probed before it is traced.
     ensure_scan_backward("cuda" if torch.cuda.is_available() else "cpu")
-    # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
-    torch._dynamo.config.recompile_limit = 256
-    torch._dynamo.config.accumulated_recompile_limit = 4096
-    # The dt of a second plant would otherwise become a symbol, which a scan cannot capture.
-    torch._dynamo.config.specialize_float = True
+    for name, value in LIMITS.items():
+        setattr(torch._dynamo.config, name, value)

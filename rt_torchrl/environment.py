@@ -74,40 +74,12 @@ class PlantEnv(EnvBase):
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
         self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
-        self._make_specs()
+        declare_specs(self, plant)
 
     @property
     def closure(self) -> nn.Module:
         """The true closure, as worn as in the episode that was flown last."""
         return self.plant.closure if self._wear is None else self._wear(max(self._episodes - 1, 0)).to(self.device)
-
-    def _make_specs(self) -> None:
-        plant, batch = self.plant, self.batch_size
-
-        def unbounded(n: int) -> Unbounded:
-            return Unbounded(shape=(*batch, n), dtype=torch.float64, device=self.device)
-
-        n_o, n_s, n_a, n_z = map(len, (plant.observations, plant.states, plant.actions, plant.inputs))
-        self.observation_spec = Composite(
-            observation=unbounded(n_o),
-            state=unbounded(n_s),
-            exogenous=unbounded(n_z),
-            applied=unbounded(n_a),
-            shape=batch,
-            device=self.device,
-        )
-        low, high = (
-            torch.tensor([getattr(a, bound) for a in plant.actions], dtype=torch.float64, device=self.device)
-            for bound in ("low", "high")
-        )
-        self.action_spec = Bounded(
-            low=low.expand(*batch, n_a), high=high.expand(*batch, n_a), shape=(*batch, n_a), dtype=torch.float64
-        ).to(self.device)
-        self.reward_spec = unbounded(1)
-        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=self.device)
-        self.done_spec = Composite(
-            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=self.device
-        )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -203,6 +175,34 @@ class PlantEnv(EnvBase):
         """The input of this interval; after the last one, still that of the last."""
         k = self._step_count.clamp(max=self.plant.n_steps - 1)
         return self._exogenous[torch.arange(len(k), device=self.device), k]
+
+
+def declare_specs(env: EnvBase, plant: Plant) -> None:
+    """Give an environment the entries of a plant; see :class:`PlantEnv`."""
+    batch, device = env.batch_size, env.device
+
+    def unbounded(n: int) -> Unbounded:
+        return Unbounded(shape=(*batch, n), dtype=torch.float64, device=device)
+
+    n_o, n_s, n_a, n_z = map(len, (plant.observations, plant.states, plant.actions, plant.inputs))
+    env.observation_spec = Composite(
+        observation=unbounded(n_o),
+        state=unbounded(n_s),
+        exogenous=unbounded(n_z),
+        applied=unbounded(n_a),
+        shape=batch,
+        device=device,
+    )
+    low, high = (
+        torch.tensor([getattr(a, bound) for a in plant.actions], dtype=torch.float64, device=device)
+        for bound in ("low", "high")
+    )
+    env.action_spec = Bounded(
+        low=low.expand(*batch, n_a), high=high.expand(*batch, n_a), shape=(*batch, n_a), dtype=torch.float64
+    ).to(device)
+    env.reward_spec = unbounded(1)
+    flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
+    env.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device)
 
 
 def _transition(

@@ -43,7 +43,7 @@ class UnseenEpisodes:
             raise ValueError(f"count={count} of unseen episodes must be at least 2 for a confidence interval.")
         generator = torch.Generator(device=device).manual_seed(seed)
         self.plant, self._compiled = plant, compiled
-        self.closure = plant.closure
+        self.closure: nn.Module | None = plant.closure
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
 
@@ -53,14 +53,23 @@ class UnseenEpisodes:
         rollout = Rollout(self.plant, self.closure, policy, compiled=self._compiled)
         return rollout(self.initial_state, self.exogenous)
 
+    def exogenous_of(self, flown: Trajectory) -> Float[Tensor, "count n n_z"]:
+        """What acted from outside in the episodes as flown."""
+        return self.exogenous
+
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
         """J_a of each episode."""
-        return control_cost(self.plant, self.fly(policy), self.exogenous)
+        return self.judge(self.fly(policy)).control_costs
+
+    def untrained_cost(self, policy: nn.Module) -> float:
+        """Mean J_a of one of many random initial policies."""
+        return self.control_costs(policy).mean().item()
 
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities of the episodes as flown."""
-        costs = control_cost(self.plant, flown, self.exogenous)
-        return Judged(costs, self.plant.merit(flown.states, flown.actions, self.exogenous))
+        exogenous = self.exogenous_of(flown)
+        costs = control_cost(self.plant, flown, exogenous)
+        return Judged(costs, self.plant.merit(flown.states, flown.actions, exogenous))
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
         """The kinds of episodes that this plant's results are also shown apart for."""
@@ -70,7 +79,7 @@ class UnseenEpisodes:
     def identification_costs(self, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
         """J_p of each episode: a twin with this closure replays what was flown, under the true disturbances."""
         rollout = Rollout(self.plant, closure, compiled=self._compiled)
-        replayed = rollout(self.initial_state, self.exogenous, flown.actions)
+        replayed = rollout(flown.states[:, 0], self.exogenous_of(flown), flown.actions)
         return identification_cost(self.plant, replayed, flown.states)
 
 
@@ -108,7 +117,8 @@ def untrained_costs(
     """
     device = unseen.initial_state.device
     generator = torch.Generator(device=device).manual_seed(seed)
-    return torch.stack([unseen.control_costs(make_policy(generator).to(device)).mean() for _ in range(starts)])
+    costs = [unseen.untrained_cost(make_policy(generator).to(device)) for _ in range(starts)]
+    return torch.tensor(costs, dtype=torch.float64, device=device)
 
 
 class Optimum(NamedTuple):

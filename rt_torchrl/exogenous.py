@@ -46,7 +46,7 @@ class ExogenousProcess:
     Args:
         record: z at every control interval.
         dt: control interval [s].
-        signals: the inputs; samples are held within their physical ranges.
+        signals: the inputs, which may be none; samples are held within their physical ranges.
         config: see :class:`ExogenousConfig`.
 
     Raises:
@@ -72,9 +72,12 @@ class ExogenousProcess:
         like = {"dtype": record.dtype, "device": record.device}
         self._low = torch.tensor([signal.low for signal in signals], **like)
         self._high = torch.tensor([signal.high for signal in signals], **like)
+        # Columns are written in place: a plant without inputs has none to stack.
         values = record.cpu().numpy()
-        large = np.stack([_large_scale(column, config) for column in values.T], -1)
-        covariance = np.stack([_windowed_autocovariance(column) for column in (values - large).T], -1)
+        large, covariance = np.empty_like(values), np.empty_like(values)
+        for k, column in enumerate(values.T):
+            large[:, k] = _large_scale(column, config)
+            covariance[:, k] = _windowed_autocovariance(column - large[:, k])
         self.mean: Float[Tensor, "n n_z"] = torch.as_tensor(large, **like)
         self.covariance: Float[Tensor, "n n_z"] = torch.as_tensor(covariance, **like)
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.descent import Descended, Descent, DescentConfig
+from rt_torchrl.short_horizon import ShortHorizon, ShortHorizonConfig
 from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
@@ -18,17 +19,19 @@ class ModelBasedConfig:
     """Parameters of step 5.
 
     Args:
-        iterations: n_mb, gradients per episode.
+        iterations: n_mb, gradients per episode; sweeps through whole virtual episodes with a short horizon.
         realisations: N_z of this step; None for that of the others. One virtual episode costs about as much as twenty,
             and where the initial states differ much, a plan made on one of them says little of the others.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         descent: how the policy's weights descend J_a.
+        short_horizon: planning over short windows, where the gradients of whole episodes say nothing.
     """
 
     iterations: int = 10
     realisations: int | None = None
     experience: int = 100
     descent: DescentConfig = field(default_factory=DescentConfig)
+    short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
 
     def __post_init__(self):
         if self.iterations < 0:
@@ -60,11 +63,16 @@ class ModelBased:
         twin: with the best closure so far, w_p*.
         policy: π_mb, updated in place.
         config: see :class:`ModelBasedConfig`.
+        generator: source of what a short horizon needs to be initialised; nothing is drawn without one.
     """
 
-    def __init__(self, twin: DigitalTwin, policy: nn.Module, config: ModelBasedConfig):
+    def __init__(self, twin: DigitalTwin, policy: nn.Module, config: ModelBasedConfig, *, generator: torch.Generator):
         self.twin, self.policy, self.config = twin, policy, config
-        self.descent = Descent(policy, config.descent)
+        self.descent: Descent | ShortHorizon
+        if config.short_horizon.window:
+            self.descent = ShortHorizon(twin, policy, config.short_horizon, generator=generator)
+        else:
+            self.descent = Descent(policy, config.descent)
 
     def restart(self) -> None:
         """Forget the state of the optimiser, because the policy's weights have jumped."""
@@ -79,13 +87,25 @@ class ModelBased:
         before = copy.deepcopy(self.policy.state_dict())
         with torch.no_grad():
             incumbent = self._cost(judged_on)
-        descended = self.descent.run(lambda: self._cost(planned_on), self.config.iterations)
+        descended = self._descend(planned_on)
         with torch.no_grad():
             accepted = bool(self._cost(judged_on) <= incumbent)
         if not accepted:
             self.policy.load_state_dict(before)
-            self.restart()
+            if isinstance(self.descent, Descent):
+                self.restart()
         return Plan(descended, accepted)
+
+    def _descend(self, planned_on: VirtualEpisodes) -> Descended:
+        if isinstance(self.descent, Descent):
+            return self.descent.run(lambda: self._cost(planned_on), self.config.iterations)
+        with torch.no_grad():
+            start = self._cost(planned_on).item()
+        gradients = [self.descent.sweep(*planned_on) for _ in range(self.config.iterations)]
+        self.policy.load_state_dict(self.descent.learner.state_dict())
+        with torch.no_grad():
+            end = self._cost(planned_on).item()
+        return Descended(start, end, gradients[0] if gradients else float("nan"), len(gradients))
 
     def _cost(self, episodes: VirtualEpisodes) -> Tensor:
         flown = self.twin.control(self.policy, episodes.initial_state, episodes.exogenous)

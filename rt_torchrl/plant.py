@@ -33,10 +33,12 @@ class Transition(NamedTuple):
 class Plant(nn.Module, ABC):
     """Physics and control problem of one system; see ``envs/`` for three of them.
 
-    A subclass names its signals in the four class attributes, and writes :meth:`vector_field`, :meth:`observe`,
-    :meth:`running_cost`, :meth:`discrepancy`, :meth:`draw_initial_state`, :meth:`draw_exogenous` and
-    :meth:`make_closure`. Every method is pure and takes any leading batch dimensions, features last, so that it can be
-    compiled, batched and differentiated: no clamp, detach, random number, device choice or Python branch on a tensor.
+    A subclass names its signals in the four class attributes (``inputs`` may be empty), and writes
+    :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`discrepancy`, :meth:`draw_initial_state`,
+    :meth:`draw_exogenous` and :meth:`make_closure`. Every method is pure and takes any leading batch dimensions,
+    features last, so that it can be compiled, batched and differentiated: no clamp, detach, random number, device
+    choice or Python branch on a tensor.
+    :func:`rt_torchrl.check_plant` finds where a subclass falls short of this.
 
     Args:
         dt: control interval and integration step Δt [s].
@@ -213,6 +215,11 @@ class Plant(nn.Module, ABC):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
+
+
+def has_own_step(plant: Plant) -> bool:
+    """Whether a plant steps in another way than by the Runge-Kutta step of :meth:`Plant.step`."""
+    return type(plant).step is not Plant.step
 
 
 def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy: str) -> None:

@@ -89,7 +89,7 @@ def summary(
         },
         "live": live,
         "better": better,
-        "closure": {name: named_weights(law) for name, law in laws.items()},
+        "closure": {name: named_weights(law) for name, law in laws.items() if law is not None},
         "closure_error": closure_errors(algorithm, laws),
         "seconds": seconds_per_step(episodes),
     }
@@ -115,8 +115,15 @@ def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]
     }
 
 
-def closure_errors(algorithm: ReinforcementTwinning, laws: dict[str, nn.Module]) -> dict[str, list[float]]:
-    """RMS error of every coefficient of the closures ``found`` and ``start`` where the last real episode went."""
+def closure_errors(
+    algorithm: ReinforcementTwinning, laws: dict[str, nn.Module | None]
+) -> dict[str, list[float]] | None:
+    """RMS error of every coefficient of the closures ``found`` and ``start`` where the last real episode went.
+
+    None if the real system's closure is not known.
+    """
+    if laws["true"] is None:
+        return None
     features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
     return {name: rms_error(laws[name], laws["true"], features).tolist() for name in ("found", "start")}
 
@@ -196,7 +203,7 @@ def closure_lines(closure: dict[str, Any]) -> list[str]:
     """Weights found, beside the true ones where the real plant has the same closure."""
     if not closure["found"] or not all(isinstance(value, float) for value in closure["found"].values()):
         return []
-    true = closure["true"] or {}
+    true = closure.get("true") or {}
     lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}{'true':>12}"]
     for name, value in closure["found"].items():
         known = f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"

@@ -25,6 +25,8 @@ from rt_torchrl.environment import PlantEnv
 from rt_torchrl.evaluation import Judged, UnseenEpisodes, exact_optimum, untrained_costs
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
+from rt_torchrl.real_episodes import RealEpisodes
+from rt_torchrl.real_system import RealSystem
 from rt_torchrl.run_config import RunConfig
 from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.twin import DigitalTwin
@@ -38,14 +40,17 @@ class Run:
     Args:
         config: see :class:`RunConfig`.
         plant: the real system in simulation, and the twin's physics.
+        env: the real system, where it is not a plant in simulation. It is judged on ``plant`` under ``env.closure``;
+            where that is not known, on real episodes: four times ``unseen`` of them (the policy before, both after, and
+            the live one again for the twin), and one for each of twenty random starts.
         believed: the twin's physics where they are not those of the real system; None where they are.
         plant_figures: figures only this plant has.
         baselines: classical controllers to judge beside the policies, by name.
         animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
-        ValueError: before any work, if the device does not exist, the run folder cannot be written or is taken, or the
-            checkpoint to resume from does not fit.
+        ValueError: before any work, if the device does not exist, the run folder cannot be written or is taken, the
+            checkpoint to resume from does not fit, or options need a plant in simulation and there is an ``env``.
     """
 
     def __init__(
@@ -53,6 +58,7 @@ class Run:
         config: RunConfig,
         plant: Plant,
         *,
+        env: RealSystem | None = None,
         believed: Plant | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[ClassicalController]] | None = None,
@@ -63,6 +69,7 @@ class Run:
         self.plant_figures, self.animate = plant_figures, animate
         device = require_device(config.device)
         compiled = can_compile(device) if config.compiled is None else config.compiled
+        require_simulation(config, plant, env, baselines)
         if config.threads:
             torch.set_num_threads(config.threads)
         logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -72,16 +79,14 @@ class Run:
         policies = {role: policy.to(device) for role, policy in config.make_policies(plant, generator).items()}
         closure = config.make_closure(plant, generator).to(device)
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
-        system = {"noise": config.noise, "wear": config.wear(plant)}
-        env = PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
         self.algorithm = ReinforcementTwinning(
-            env,
+            simulated(plant, config, device=device, compiled=compiled) if env is None else env,
             DigitalTwin(believed or plant, closure, engine=config.engine, compiled=compiled),
             **policies,
             config=self.config.twinning,
             generator=generator,
         )
-        self.unseen = UnseenEpisodes(plant, self.config.unseen, compiled=compiled, device=device)
+        self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
         self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
         self.episodes: list[dict[str, Any]] = []
         if config.resume:
@@ -97,7 +102,7 @@ class Run:
         (self.folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
         dashboard = Dashboard(self.folder)
         gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)
-        dashboard.scalar("gradient/relative gap of parallel to odeint_adjoint, short horizon", gap)
+        dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
         with tqdm(total=self.config.episodes, initial=len(self.episodes), unit="episode", dynamic_ncols=True) as bar:
             try:
                 while len(self.episodes) < self.config.episodes:
@@ -109,7 +114,7 @@ class Run:
         if not self.episodes:
             raise SystemExit("interrupted before the first episode was done; nothing to report.")
         self._drop_half_an_episode()
-        self.unseen.closure = self.algorithm.env.closure
+        self._follow_wear()
         judged = report.judge(self.unseen, self.algorithm.policies, self.baselines)
         metrics = self._results(gap, judged)
         self._draw(dashboard, judged)
@@ -124,7 +129,7 @@ class Run:
         record["closure"] = report.named_weights(self.algorithm.twin.closure)
         every = self.config.unseen_every
         if every and (len(self.episodes) + 1) % every == 0:
-            self.unseen.closure = self.algorithm.env.closure
+            self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.switch.live]
             record["J_a_unseen"] = self.unseen.control_costs(acting).mean().item()
         self.episodes.append(record)
@@ -133,6 +138,11 @@ class Run:
         every = self.config.figures_every
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
             dashboard.figures(self._figures(self._snapshot()), len(self.episodes) - 1)
+
+    def _follow_wear(self) -> None:
+        """Judge on the real system as it is now; one of unknown closure is judged itself."""
+        if self.algorithm.env.closure is not None:
+            self.unseen.closure = self.algorithm.env.closure
 
     def _drop_half_an_episode(self) -> None:
         """After an interrupt, go back to the end of the last whole episode."""
@@ -187,6 +197,40 @@ def can_compile(device: torch.device) -> bool:
     if missing:
         print(f"This machine lacks {missing}: running without torch.compile, several times slower.")
     return missing is None
+
+
+def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:
+    """The real system in simulation, with the sensors and the wear of the configuration."""
+    system = {"noise": config.noise, "wear": config.wear(plant)}
+    return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
+
+
+def judged_on(
+    plant: Plant, env: RealSystem | None, count: int, *, device: torch.device, compiled: bool
+) -> UnseenEpisodes:
+    """The unseen episodes: on the plant, or on a real system of which no closure is known."""
+    if env is None or env.closure is not None:
+        return UnseenEpisodes(plant, count, compiled=compiled, device=device)
+    return RealEpisodes(env, count, device=device)
+
+
+def require_simulation(
+    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[ClassicalController]] | None
+) -> None:
+    """Refuse with a real system what only a plant in simulation can do.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    if env is None:
+        return
+    if config.noise or config.wear(plant) is not None:
+        raise ValueError(f"noise={config.noise} and wear are of a plant in simulation; this run has a real system.")
+    if env.closure is None and (config.reference or baselines):
+        raise ValueError(
+            "reference and baselines are flown on the plant under the true closure, and the real system's is not "
+            "known; leave them out, or give the RealSystem its closure."
+        )
 
 
 def require_device(name: str) -> torch.device:

@@ -18,7 +18,8 @@ class Snapshot:
     """Input of every figure.
 
     Args:
-        plant: with the true closure.
+        plant: with the true closure, if that is known.
+        known: whether it is; not that of a real system.
         closure: the learned closure.
         initial_closure: the closure that the training started from.
         policies: both policies.
@@ -31,6 +32,7 @@ class Snapshot:
     """
 
     plant: Plant
+    known: bool
     closure: nn.Module
     initial_closure: nn.Module
     policies: dict[Role, nn.Module]
@@ -53,6 +55,7 @@ class Snapshot:
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(
             plant=twin.plant,
+            known=algorithm.env.closure is not None,
             closure=twin.closure,
             initial_closure=initial_closure,
             policies=algorithm.policies,

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.engines import Backpropagation, ContinuousAdjoint, ParallelAdjoint
 from rt_torchrl.interval import Drive, Interval
-from rt_torchrl.plant import Plant
+from rt_torchrl.plant import Plant, has_own_step
 
 Engine = Literal["parallel", "odeint_adjoint", "autograd"]
 ENGINES = {"parallel": ParallelAdjoint, "odeint_adjoint": ContinuousAdjoint, "autograd": Backpropagation}
@@ -46,7 +46,8 @@ class Rollout:
         compiled: compile with torch.compile; eager is quicker for short horizons.
 
     Raises:
-        ValueError: if the engine does not exist or a module is not in double precision.
+        ValueError: if the engine does not exist, does not know the plant's own step, or a module is not in double
+            precision.
     """
 
     def __init__(
@@ -60,6 +61,11 @@ class Rollout:
     ):
         if engine not in ENGINES:
             raise ValueError(f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}.")
+        if engine == "odeint_adjoint" and has_own_step(plant):
+            raise ValueError(
+                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} has a step of its own; "
+                "use parallel or autograd."
+            )
         for role, module in (("closure", closure), ("policy", policy)):
             require_double(role, module)
         self.plant = plant
@@ -80,13 +86,19 @@ class Rollout:
             initial_state: s_0 of each realisation.
             exogenous: z, held over each interval.
             command: actions from a record; None with a policy.
-            start: time of s_0 [s], one for all or one for each realisation.
+            start: time of s_0 [s], one for all realisations or one for each; ``odeint_adjoint`` takes only the former.
 
         Raises:
-            ValueError: if shapes do not fit the plant and each other, or commands are given beside a policy.
+            ValueError: if shapes do not fit the plant and each other, commands are given beside a policy, or the engine
+                does not take a start for each realisation.
             DivergenceError: if a state is not finite; says which plant, realisation, time and state.
         """
         self._validate(initial_state, exogenous, command)
+        if isinstance(start, Tensor) and isinstance(self._engine, ContinuousAdjoint):
+            raise ValueError(
+                "engine='odeint_adjoint' integrates all realisations over the same span and takes no start for each; "
+                "use parallel or autograd, or whole records (segment=0)."
+            )
         drive = drive_of(self.plant, exogenous, command, start=start)
         torch._dynamo.maybe_mark_dynamic(initial_state, 0)
         ends = self._engine.end_states(self.interval, initial_state.contiguous(), drive)
@@ -152,13 +164,15 @@ def require_finite(
     )
 
 
-def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Tensor = 0.0) -> Drive:
-    """The drive, time first, of inputs and commands that come batch first; ``start`` as in :meth:`Rollout.__call__`."""
+def drive_of(
+    plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Float[Tensor, " batch"] = 0.0
+) -> Drive:
+    """The drive, time first, of inputs and commands that come batch first; ``start`` as in :class:`Rollout`."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
     commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()
     drive = Drive(t, exogenous.transpose(0, 1).contiguous(), commands)
-    for tensor in drive[1:]:
+    for tensor in drive if isinstance(start, Tensor) else drive[1:]:
         torch._dynamo.maybe_mark_dynamic(tensor, 1)  # one compiled graph for all batch sizes
     return drive
 

@@ -37,11 +37,16 @@ class DigitalTwin:
         *,
         start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
-        """Virtual episodes under recorded actions; see :meth:`Rollout.__call__` for shapes and errors."""
+        """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
         return self._replay(initial_state, exogenous, actions, start=start)
 
     def control(
-        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+        self,
+        policy: nn.Module,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
-        """Virtual episodes under a policy; see :meth:`Rollout.__call__` for shapes and errors."""
-        return self._rollout(policy)(initial_state, exogenous)
+        """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`."""
+        return self._rollout(policy)(initial_state, exogenous, start=start)

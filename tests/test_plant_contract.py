@@ -1,6 +1,5 @@
 """What every plant fulfils: each folder under rt_torchrl.envs, found by itself, and the linear-quadratic oracle."""
 
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -11,9 +10,10 @@ from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
+from rt_torchrl import check_plant
 from rt_torchrl.catalogue import plants
 from rt_torchrl.environment import PlantEnv
-from rt_torchrl.trajectory import Rollout, control_cost
+from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
 CLASSES = {"linear_quadratic": LinearQuadratic} | plants()
@@ -41,23 +41,6 @@ def plant(kind):
     return shortened(kind, 50)
 
 
-def visited(plant, count, seed=1):
-    """Arguments of the vector field met on real episodes under random commands: t, state, applied action, input."""
-    generator = seeded(seed)
-    state, exogenous = plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
-    low, high = action_range(plant)
-    share = torch.rand(count, plant.n_steps, len(plant.actions), generator=generator, dtype=torch.float64)
-    with torch.no_grad():
-        flown = Rollout(plant, plant.closure)(state, exogenous, low + share * (high - low))
-    at = torch.arange(count) % plant.n_steps
-    rows = torch.arange(count)
-    return at * plant.dt, flown.states[rows, at], flown.actions[rows, at], exogenous[rows, at]
-
-
-def action_range(plant):
-    return (torch.tensor([getattr(a, b) for a in plant.actions], dtype=torch.float64) for b in ("low", "high"))
-
-
 def fly(plant, *, batch=1, seed=0):
     """A real episode under the plant's initial policy, with the policy."""
     policy = plant.make_policy(seeded(5))
@@ -73,19 +56,15 @@ def test_plants_are_found():
     assert "wind_turbine" in CLASSES
 
 
-def test_signals_are_named_and_fit_the_draws(kind, plant):
+def test_is_named_after_its_folder(kind, plant):
     assert plant.name == next(name for name, found in CLASSES.items() if found is kind)
     for group in (plant.states, plant.actions, plant.inputs, plant.observations):
-        assert group and len({signal.name for signal in group}) == len(group)
-        assert all(signal.unit and signal.symbol and signal.unit in signal.label for signal in group)
-    assert all(math.isfinite(a.low) and math.isfinite(a.high) for a in plant.actions)
-    state, exogenous = plant.draw_initial_state(3, seeded()), plant.draw_exogenous(3, seeded())
-    assert state.shape == (3, len(plant.states)) and exogenous.shape == (3, plant.n_steps, len(plant.inputs))
-    for drawn, signals in ((state, plant.states), (exogenous, plant.inputs)):
-        assert drawn.dtype == torch.float64
-        low, high = (torch.tensor([getattr(s, b) for s in signals], dtype=torch.float64) for b in ("low", "high"))
-        assert ((drawn >= low) & (drawn <= high)).all()
-    assert plant.observe(torch.zeros(3).double(), state, exogenous[:, 0]).shape == (3, len(plant.observations))
+        assert all(signal.unit in signal.label for signal in group)
+
+
+def test_fulfils_the_contract(plant):
+    """With the annotations checked at run time, which tracing does not stand; that is in a process of its own below."""
+    check_plant(plant, episodes=2, steps=10, traced=False)
 
 
 def test_default_episode_is_a_whole_number_of_steps(kind):
@@ -96,69 +75,13 @@ def test_default_episode_is_a_whole_number_of_steps(kind):
             kind(**{"dt": plant.dt, "horizon": plant.horizon, **change})
 
 
-def test_randomness_comes_from_the_generator_alone(plant):
-    def draws(seed):
-        policy, closure = plant.make_policy(seeded(seed)), plant.make_closure(seeded(seed))
-        tensors = [plant.draw_initial_state(2, seeded(seed)), plant.draw_exogenous(2, seeded(seed))]
-        return tensors + [*policy.parameters(), *closure.parameters()]
-
-    first = draws(1)
-    torch.manual_seed(99)
-    assert all(torch.equal(a, b) for a, b in zip(first, draws(1), strict=True))
-    other = draws(2)
-    # A problem may fix its start, and a closure its first coefficients; inputs and the policy are drawn.
-    assert not any(torch.equal(a, b) for a, b in zip(first[1:3], other[1:3], strict=True))
-    assert not torch.equal(first[1][0], first[1][1])
-
-
-def test_vector_field_takes_any_leading_dimensions(plant):
-    t, state, action, exogenous = visited(plant, 6)
-    closure = plant.make_closure(seeded())
-    shapes = [x.reshape(2, 3, *x.shape[1:]) for x in (t, state, action, exogenous)]
-    together = plant.vector_field(*shapes, closure)
-    costs = plant.running_cost(*shapes)
-    assert together.shape == (2, 3, len(plant.states)) and costs.shape == (2, 3)
-    for k in range(6):
-        row = (t[k], state[k], action[k], exogenous[k])
-        # The same arithmetic; vector instructions may round a power or an exponential in the last bits.
-        torch.testing.assert_close(together[k // 3, k % 3], plant.vector_field(*row, closure), rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(costs[k // 3, k % 3], plant.running_cost(*row), rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("which", ["true", "learned"])
-def test_vector_field_is_differentiable(plant, which):
-    """gradcheck in units of each argument's size, at states that episodes visit, by both modes of differentiation."""
-    closure = plant.closure if which == "true" else plant.make_closure(seeded())
-    t, *arguments = visited(plant, 4)
-    scales = [1.0 + x.abs().amax(0) for x in arguments]
-    rates = plant.vector_field(t, *arguments, closure)
-    assert rates.isfinite().all()
-    size = 1e-3 + rates.abs().amax(0).detach()
-
-    def scaled(*values):
-        return plant.vector_field(t, *(x * s for x, s in zip(values, scales, strict=True)), closure) / size
-
-    inputs = [(x / s).detach().requires_grad_() for x, s in zip(arguments, scales, strict=True)]
-    # Differences of numbers of order one with a step of 1e-6: rounding 1e-10, curvature 1e-12.
-    assert torch.autograd.gradcheck(scaled, inputs, eps=1e-6, atol=1e-6, rtol=1e-6, check_forward_ad=True)
-
-
-def test_closure_reaches_the_state(plant):
-    """Every weight of the learned closure changes the vector field somewhere."""
-    closure = plant.make_closure(seeded())
-    t, *arguments = visited(plant, 16)
-    rates = plant.vector_field(t, *arguments, closure)
-    scale = 1e-3 + rates.detach().abs().amax(0)
-    gradients = torch.autograd.grad((rates / scale).square().sum(), list(closure.parameters()))
-    assert all((gradient != 0).all() for gradient in gradients)
-
-
-def test_policy_acts_within_the_ranges(plant):
-    policy, (low, high) = plant.make_policy(seeded()), action_range(plant)
-    # Observations are scaled to order one.
-    command = policy(3.0 * torch.rand(200, len(plant.observations), generator=seeded(), dtype=torch.float64) - 1.5)
-    assert command.shape == (200, len(plant.actions))
-    assert ((command >= low) & (command <= high)).all()
+def test_episodes_and_policies_are_drawn(plant):
+    """A problem may fix its start, and a closure its first coefficients; inputs, where there are some, are drawn."""
+    one, other = (plant.draw_exogenous(2, seeded(seed)) for seed in (1, 2))
+    if plant.inputs:
+        assert not torch.equal(one, other) and not torch.equal(one[0], one[1])
+    policies = [list(plant.make_policy(seeded(seed)).parameters()) for seed in (1, 2)]
+    assert any(not torch.equal(a, b) for a, b in zip(*policies, strict=True))
 
 
 def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
@@ -207,37 +130,27 @@ def test_environment_is_seeded(plant):
     assert torch.equal(flights[0], flights[1]) and not torch.equal(flights[0], flights[2])
 
 
-TRACE = """
+CHECK = """
 import sys
 sys.path.insert(0, "tests")
-import torch
-from test_plant_contract import CLASSES, seeded, shortened, visited
+from test_plant_contract import CLASSES, shortened
+from rt_torchrl import check_plant
 
 for name, kind in CLASSES.items():
-    plant = shortened(kind, 50)
-    arguments = visited(plant, 4)
-    closure = plant.make_closure(seeded())
-    def everything(t, state, action, exogenous):
-        rates = plant.vector_field(t, state, action, exogenous, plant.closure)
-        end, applied = plant.step(t, state, action, exogenous, closure)
-        return end, applied, rates, plant.running_cost(t, state, applied, exogenous), plant.observe(t, end, exogenous)
-
     try:
-        traced = torch.compile(everything, fullgraph=True, backend="eager")
-        for found, expected in zip(traced(*arguments), everything(*arguments), strict=True):
-            torch.testing.assert_close(found, expected, rtol=1e-13, atol=1e-13)
-        print("traced", name)
-    except Exception as error:
-        print(name, error, file=sys.stderr)
+        check_plant(shortened(kind, 50))
+        print("fulfilled by", name)
+    except ValueError as error:
+        print(error, file=sys.stderr)
 """
 
 
 @pytest.fixture(scope="module")
-def tracing():
+def checking():
     """In a process of its own: the run-time checks of this one cannot be traced."""
     root = Path(__file__).parent.parent
-    return subprocess.run([sys.executable, "-c", TRACE], cwd=root, capture_output=True, text=True)
+    return subprocess.run([sys.executable, "-c", CHECK], cwd=root, capture_output=True, text=True)
 
 
-def test_is_one_graph_without_branches_on_tensors(plant, tracing):
-    assert f"traced {plant.name}\n" in tracing.stdout, tracing.stderr[-3000:]
+def test_fulfils_the_contract_and_is_one_graph(plant, checking):
+    assert f"fulfilled by {plant.name}\n" in checking.stdout, checking.stderr[-3000:]

@@ -1,7 +1,12 @@
 """What the README shows is true."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -21,3 +26,32 @@ def test_its_code_runs(monkeypatch):
 def test_its_files_exist():
     for path in re.findall(r"\]\(((?!http|#)[^)]+)\)", README) + re.findall(r"uv run (recipes/\S+\.py)", README):
         assert (ROOT / path).exists(), path
+
+
+def test_the_tutorial_runs(tmp_path):
+    """In a process of its own, as a user runs it: the check of the plant traces, which this process could not."""
+    text = (ROOT / "recipes" / "own_plant.md").read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    lines = [line for line in code.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) < 80
+    small = code.replace("episodes=4, unseen=10", "episodes=1, unseen=2")
+    assert small != code
+    command = [sys.executable, "-c", small]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    upper, lower = map(float, re.findall(r"outlet': ([\d.e-]+)", done.stdout)[:2])
+    # The inflow is measured without noise: to rounding.
+    assert upper == pytest.approx(5e-5, rel=1e-9) and lower == pytest.approx(4e-5, rel=1e-9)
+
+
+def test_the_tutorial_says_what_the_check_says():
+    from rt_torchrl import PlantContractError
+
+    code = re.findall(
+        r"```python\n(.*?)```", (ROOT / "recipes" / "own_plant.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    scope = {"__name__": "tutorial"}
+    exec(code[0], scope)
+    with pytest.raises(PlantContractError, match="is too long for the eigenvalue"):
+        scope["check_plant"](scope["TwoTanks"](dt=600.0, horizon=1200.0), traced=False)

@@ -107,6 +107,7 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
     """
     columns = tracked_weights(snapshot.episodes)
     true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
+    true = true if snapshot.known else {}
     wide = min(3, len(columns))
     rows = -(-len(columns) // wide)
     size = (0.6 + 3.6 * wide, 1.3 + 2.6 * rows)

@@ -1,0 +1,1 @@
+"""Gymnasium's pendulum: a real system that is not this library's own."""

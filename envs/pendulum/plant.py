@@ -1,0 +1,183 @@
+r"""Gymnasium's ``Pendulum-v1`` as a plant: a rod that a weak motor can only swing up."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.envs.pendulum.merit import merit
+from rt_torchrl.envs.pendulum.models import UniformRod
+from rt_torchrl.plant import Plant, Transition
+from rt_torchrl.policies import SaturatedMLP
+from rt_torchrl.signal import Signal
+
+
+class Pendulum(Plant):
+    r"""A rod on a pivot with a motor that is too weak to lift it straight up.
+
+    .. math:: \ddot\theta = c_g\,g\sin\theta + c_u\,u, \qquad c_g = \frac{3}{2l}, \quad c_u = \frac{3}{ml^2}
+
+    ====  ===============  =========================================  =======  ==============================
+    kind  name             symbol                                     unit     range
+    ====  ===============  =========================================  =======  ==============================
+    s     angle            :math:`\theta`, zero upright               rad      ±π
+    s     angular_speed    :math:`\dot\theta`                         rad/s    ±8, where Gymnasium stops it
+    a     torque           :math:`u`                                  N m      ±2
+    e     cosine           :math:`\cos\theta`                         -        ±1
+    e     sine             :math:`\sin\theta`                         -        ±1
+    e     scaled_speed     :math:`\dot\theta/8`                       -        ±1
+    ====  ===============  =========================================  =======  ==============================
+
+    There is no exogenous input.
+
+    Args:
+        dt: control interval [s]; Gymnasium's is 0.05.
+        horizon: length of an episode T_o [s]; Gymnasium's is 200 intervals.
+        closure: c_g and c_u of the real rod; None for Gymnasium's, of 1 kg and 1 m.
+        gravity: g [m/s²]; Gymnasium's is 10.
+        guess: share of the true mass and length that the twin starts from.
+
+    Raises:
+        ValueError: if ``gravity`` or ``guess`` is not positive.
+
+    Source: gymnasium, ``classic_control/pendulum.py``.
+    """
+
+    name = "pendulum"
+
+    greatest_torque, greatest_speed = 2.0, 8.0  # [N m], [rad/s]
+    greatest_initial_speed = 1.0  # [rad/s]
+    hidden = (32, 32)
+
+    states = (
+        Signal(symbol=r"\theta", name="angle", unit="rad", low=-math.pi, high=math.pi),
+        Signal(symbol=r"\dot\theta", name="angular_speed", unit="rad/s", low=-8.0, high=8.0),
+    )
+    actions = (Signal(symbol="u", name="torque", unit="N m", low=-2.0, high=2.0),)
+    inputs = ()
+    observations = (
+        Signal(symbol=r"\cos\theta", name="cosine", unit="-", low=-1.0, high=1.0),
+        Signal(symbol=r"\sin\theta", name="sine", unit="-", low=-1.0, high=1.0),
+        Signal(symbol=r"\dot\theta/8", name="scaled_speed", unit="-", low=-1.0, high=1.0),
+    )
+
+    def __init__(
+        self,
+        *,
+        dt: float = 0.05,
+        horizon: float = 10.0,
+        closure: nn.Module | None = None,
+        gravity: float = 10.0,
+        guess: float = 0.5,
+    ):
+        super().__init__(dt=dt, horizon=horizon, closure=UniformRod.true() if closure is None else closure)
+        for argument, value in (("gravity", gravity), ("guess", guess)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{argument}={value} of the pendulum must be positive and finite.")
+        self.gravity, self.guess = gravity, guess
+
+    # The system
+
+    def vector_field(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch 2"],
+        action: Float[Tensor, "*batch 1"],
+        exogenous: Float[Tensor, "*#batch 0"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch 2"]:
+        r"""dθ/dt and d²θ/dt² = c_g g sin θ + c_u u.
+
+        Args:
+            t: time [s]; unused.
+            state: θ [rad], dθ/dt [rad/s].
+            action: torque u [N m].
+            exogenous: nothing.
+            closure: c_g [1/m] and c_u [1/(kg m²)] at (cos θ, sin θ, dθ/dt).
+        """
+        (theta, rate), (u,) = state.unbind(-1), action.unbind(-1)
+        sine = theta.sin()
+        c_g, c_u = closure(torch.stack([theta.cos(), sine, rate], -1)).unbind(-1)
+        return torch.stack([rate, c_g * self.gravity * sine + c_u * u], -1)
+
+    def actuate(
+        self, state: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 1"]
+    ) -> Float[Tensor, "*batch 1"]:
+        """The motor gives at most ±2 N m."""
+        return command.clamp(-self.greatest_torque, self.greatest_torque)
+
+    def step(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch 2"],
+        command: Float[Tensor, "*batch 1"],
+        exogenous: Float[Tensor, "*#batch 0"],
+        closure: nn.Module,
+    ) -> Transition:
+        r"""Gymnasium's own step, semi-implicit Euler with a stop at ±8 rad/s, because it is the real system here.
+
+        .. math:: \dot\theta' = \mathrm{stop}(\dot\theta + \ddot\theta\,\Delta t), \qquad
+            \theta' = \theta + \dot\theta'\,\Delta t
+
+        The angle is kept within ±π, as it can be told from its sine and cosine.
+        """
+        applied = self.actuate(state, command)
+        theta, rate = state.unbind(-1)
+        acceleration = self.vector_field(t, state, applied, exogenous, closure)[..., 1]
+        rate = (rate + acceleration * self.dt).clamp(-self.greatest_speed, self.greatest_speed)
+        return Transition(torch.stack([wrapped(theta + rate * self.dt), rate], -1), applied)
+
+    # The control problem
+
+    def observe(
+        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 2"], exogenous: Float[Tensor, "*#batch 0"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Gymnasium's observation, with the speed scaled to order one."""
+        theta, rate = state.unbind(-1)
+        return torch.stack([theta.cos(), theta.sin(), rate / self.greatest_speed], -1)
+
+    def running_cost(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch 2"],
+        applied: Float[Tensor, "*batch 1"],
+        exogenous: Float[Tensor, "*#batch 0"],
+    ) -> Float[Tensor, "*batch"]:
+        """θ² + 0.1 (dθ/dt)² + 0.001 u² with θ within ±π: minus Gymnasium's reward, so that results compare."""
+        theta, rate = state.unbind(-1)
+        return wrapped(theta) ** 2 + 0.1 * rate**2 + 0.001 * applied[..., 0] ** 2
+
+    def discrepancy(
+        self, state: Float[Tensor, "*#batch 2"], measured: Float[Tensor, "*#batch 2"]
+    ) -> Float[Tensor, "*batch"]:
+        """½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² that of a hanging rod of 1 m."""
+        turn, rate = (state - measured).unbind(-1)
+        return 0.5 * (wrapped(turn) ** 2 + rate**2 / 15.0)
+
+    def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
+        return merit(self, states, applied, exogenous)
+
+    # Randomness
+
+    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 2"]:
+        """Any angle, and a speed of at most 1 rad/s: where Gymnasium's episodes start."""
+        share = 2.0 * torch.rand(batch, 2, generator=generator, dtype=torch.float64, device=generator.device) - 1.0
+        return torch.stack([math.pi * share[:, 0], self.greatest_initial_speed * share[:, 1]], -1)
+
+    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 0"]:
+        """Nothing acts on the pendulum from outside."""
+        return torch.zeros(batch, self.n_steps, 0, dtype=torch.float64, device=generator.device)
+
+    def make_closure(self, generator: torch.Generator) -> nn.Module:
+        """A rod whose mass and length are ``guess`` times the true ones; draws nothing."""
+        return UniformRod.guess(self.guess)
+
+    def make_policy(self, generator: torch.Generator) -> nn.Module:
+        """A perceptron: no affine law of cos θ, sin θ and dθ/dt both swings the rod up and holds it there."""
+        return SaturatedMLP(len(self.observations), self.actions, hidden=self.hidden, generator=generator)
+
+
+def wrapped(angle: Tensor) -> Tensor:
+    """The same angle within [−π, π), as Gymnasium's ``angle_normalize``."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -1,0 +1,40 @@
+"""Gymnasium's ``Pendulum-v1`` itself, in the terms of the plant."""
+
+import torch
+from torch import Tensor, nn
+from torchrl.envs import GymWrapper
+
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.real_system import Reading, RealSystem
+
+
+def angle_and_speed(observation: Tensor) -> Tensor:
+    """θ [rad] and dθ/dt [rad/s] of (cos θ, sin θ, dθ/dt)."""
+    cosine, sine, rate = observation.unbind(-1)
+    return torch.stack([torch.atan2(sine, cosine), rate], -1)
+
+
+def gymnasium_pendulum(
+    plant: Pendulum, *, seed: int = 0, closure: nn.Module | None = None, device: torch.device | str = "cpu"
+) -> RealSystem:
+    """The real system, which reports in single precision.
+
+    Args:
+        plant: with Gymnasium's time step.
+        seed: of the initial states.
+        closure: Gymnasium's own mass and length if they are to be known, for judging on the plant.
+        device: where its entries go.
+
+    Raises:
+        ValueError: if Gymnasium is not installed, or the plant's gravity, time step or horizon are not to be had of it.
+    """
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise ValueError("the pendulum needs Gymnasium: install the extra, pip install 'rt_torchrl[gym]'.") from error
+    env = gymnasium.make("Pendulum-v1", g=plant.gravity, max_episode_steps=plant.n_steps)
+    if env.unwrapped.dt != plant.dt:
+        raise ValueError(f"dt={plant.dt} s of the plant must be that of Gymnasium's pendulum, {env.unwrapped.dt} s.")
+    return RealSystem(
+        GymWrapper(env), plant, state=Reading(of=angle_and_speed), closure=closure, seed=seed, device=device
+    )

@@ -1,0 +1,115 @@
+"""The methods of a plant with arguments that its episodes meet."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rt_torchrl.contract.draws import seeded
+from rt_torchrl.plant import Plant
+from rt_torchrl.trajectory import Rollout
+
+Arguments = dict[str, Tensor]
+
+
+class Method(NamedTuple):
+    """A method as a function of named tensors: which it takes, and name and trailing shape of what it gives."""
+
+    name: str
+    call: Callable[..., object]
+    takes: tuple[str, ...]
+    gives: dict[str, tuple[int, ...]]
+
+    def outputs(self, arguments: Arguments) -> tuple[object, ...]:
+        """What it gives for arguments by name; others than it takes are left out."""
+        found = self.call(*(arguments[name] for name in self.takes))
+        return tuple(found) if self.name == "step" and isinstance(found, tuple) else (found,)
+
+
+class Calls:
+    """Times, states, commands, actions and inputs of episodes, time first as the gradient engines stack them.
+
+    Args:
+        plant: the plant.
+        arguments: ``t`` is ``n 1``; ``state``, ``command``, ``applied``, ``exogenous`` and ``measured`` (states of
+            another episode) are ``n batch`` and their width.
+        seed: of the twin's closure.
+    """
+
+    def __init__(self, plant: Plant, arguments: Arguments, seed: int):
+        self.plant, self.arguments, self.seed = plant, arguments, seed
+        self.closure: nn.Module = plant.make_closure(seeded(seed))
+
+    @classmethod
+    def at_the_start(cls, plant: Plant, episodes: int, seed: int) -> "Calls":
+        """The first interval of two groups of episodes, which needs no method of the plant but its draws."""
+        generator = seeded(seed)
+        state = plant.draw_initial_state(2 * episodes, generator)
+        exogenous = plant.draw_exogenous(2 * episodes, generator)[:, 0]
+        command = random_commands(plant, (2 * episodes,), generator)
+        rows = [x.reshape(2, episodes, -1) for x in (state, command, exogenous)]
+        return cls(plant, _named(torch.zeros(2, 1, dtype=torch.float64), *rows, rows[1]), seed)
+
+    @classmethod
+    @torch.no_grad()
+    def in_flight(cls, plant: Plant, episodes: int, steps: int, seed: int) -> "Calls":
+        """All intervals of flights of the true plant under random commands.
+
+        Raises:
+            DivergenceError: if a flight leaves the finite numbers.
+        """
+        generator = seeded(seed)
+        state = plant.draw_initial_state(episodes, generator)
+        exogenous = plant.draw_exogenous(episodes, generator)[:, :steps]
+        command = random_commands(plant, (episodes, steps), generator)
+        flown = Rollout(plant, plant.closure)(state, exogenous, command)
+        t = plant.dt * torch.arange(steps, dtype=torch.float64).unsqueeze(-1)
+        rows = [x.transpose(0, 1).contiguous() for x in (flown.states[:, :-1], command, exogenous, flown.actions)]
+        return cls(plant, _named(t, *rows), seed)
+
+    def methods(self) -> list[Method]:
+        """Every method with its arguments; those that take a closure with the true one and with the twin's."""
+        plant = self.plant
+        n_s, n_a, n_o = len(plant.states), len(plant.actions), len(plant.observations)
+        now = ("t", "state", "applied", "exogenous")
+        found = [
+            Method("observe", plant.observe, ("t", "state", "exogenous"), {"observation": (n_o,)}),
+            Method("running_cost", plant.running_cost, now, {"cost": ()}),
+            Method("discrepancy", plant.discrepancy, ("state", "measured"), {"cost": ()}),
+            Method("actuate", plant.actuate, ("state", "command"), {"action": (n_a,)}),
+            Method("latch", plant.latch, ("state", "applied"), {"state": (n_s,)}),
+        ]
+        for closure in (plant.closure, self.closure):
+            field = _under(plant.vector_field, closure)
+            found.append(Method("vector_field", field, now, {"rate": (n_s,)}))
+            found.append(
+                Method("step", _under(plant.step, closure), _commanded(now), {"state": (n_s,), "applied": (n_a,)})
+            )
+        return found
+
+    def some(self, count: int) -> Arguments:
+        """At most so many times, spread over the flights, with all episodes."""
+        n = len(self.arguments["t"])
+        at = torch.linspace(0, n - 1, min(count, n)).round().long()
+        return {name: value[at].clone() for name, value in self.arguments.items()}
+
+
+def random_commands(plant: Plant, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """Uniform within the ranges of the actions."""
+    low, high = (torch.tensor([getattr(a, b) for a in plant.actions], dtype=torch.float64) for b in ("low", "high"))
+    share = torch.rand(*shape, len(plant.actions), generator=generator, dtype=torch.float64)
+    return low + share * (high - low)
+
+
+def _named(t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor, applied: Tensor) -> Arguments:
+    names = ("t", "state", "command", "exogenous", "applied", "measured")
+    return dict(zip(names, (t, state, command, exogenous, applied, state.roll(1, 1)), strict=True))
+
+
+def _commanded(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple("command" if name == "applied" else name for name in names)
+
+
+def _under(method: Callable[..., object], closure: nn.Module) -> Callable[..., object]:
+    return lambda *arguments: method(*arguments, closure)

@@ -1,0 +1,124 @@
+"""What a plant draws: initial states, inputs, closures and policies."""
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor, nn
+
+from rt_torchrl.plant import Plant
+from rt_torchrl.signal import Signal
+
+BATCH = 3
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def draws(plant: Plant, seed: int) -> Iterator[str]:
+    """Shape, precision, range and source of the initial states and of the inputs."""
+    n_s, n_z = len(plant.states), len(plant.inputs)
+    wanted = {
+        "draw_initial_state": (lambda: plant.draw_initial_state(BATCH, seeded(seed)), (BATCH, n_s), plant.states),
+        "draw_exogenous": (
+            lambda: plant.draw_exogenous(BATCH, seeded(seed)),
+            (BATCH, plant.n_steps, n_z),
+            plant.inputs,
+        ),
+    }
+    for name, (draw, shape, group) in wanted.items():
+        drawn = draw()
+        problem = misshapen(drawn, shape)
+        if problem:
+            yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}; expected {wanted_as(shape)}."
+            continue
+        yield from _out_of_range(name, drawn, group)
+        yield from _other_sources(name, draw)
+
+
+def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
+    """What is wrong with a value that should be a finite float64 tensor of that shape; None if nothing."""
+    if not isinstance(value, Tensor):
+        return f"a {type(value).__name__}"
+    if tuple(value.shape) != shape:
+        return f"shape {tuple(value.shape)}"
+    if value.dtype != torch.float64:
+        return f"{value.dtype}"
+    if not value.isfinite().all():
+        return f"{int((~value.isfinite()).sum())} values that are not finite"
+    return None
+
+
+def wanted_as(shape: tuple[int, ...]) -> str:
+    return f"finite numbers of shape {shape} in torch.float64"
+
+
+def _out_of_range(name: str, drawn: Tensor, group: tuple[Signal, ...]) -> Iterator[str]:
+    for signal, values in zip(group, drawn.unbind(-1), strict=True):
+        if (values < signal.low).any() or (values > signal.high).any():
+            yield (
+                f"{name}: draws {signal.name!r} from {values.min():g} to {values.max():g} {signal.unit}, outside "
+                f"[{signal.low:g}, {signal.high:g}]; draw within the Signal's range, or widen it."
+            )
+
+
+def _other_sources(name: str, draw: Callable[[], Tensor]) -> Iterator[str]:
+    """Torch's global numbers may be drawn, as layers do before they are overwritten, but nothing may depend on them."""
+    kept = torch.random.get_rng_state()
+    first = draw()
+    torch.random.set_rng_state(kept)
+    same = torch.equal(first, draw())
+    torch.manual_seed(1 + torch.initial_seed())
+    unmoved = torch.equal(first, draw())
+    torch.random.set_rng_state(kept)
+    if not same:
+        yield (
+            f"{name}: gives something else each time for generators of the same seed; take every random number from "
+            "the generator that is passed in, and change nothing of the plant."
+        )
+    elif not unmoved:
+        yield f"{name}: depends on torch's global random numbers; pass generator=generator to every random function."
+
+
+def modules(plant: Plant, seed: int) -> Iterator[str]:
+    """Precision and source of the weights of closures and policy, and what the policy does."""
+    made = {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
+    for name, make in made.items():
+        first = make(seeded(seed))
+        if not isinstance(first, nn.Module):
+            yield f"{name}: gives a {type(first).__name__}; expected a torch.nn.Module."
+            continue
+        yield from _single_precision(name, first)
+        yield from _other_sources(name, lambda make=make: _weights(make(seeded(seed))))
+        if not any(weight.requires_grad for weight in first.parameters()):
+            yield f"{name}: has no trainable weights; what is learned must be an nn.Parameter with requires_grad."
+    if not isinstance(plant.closure, nn.Module):
+        yield f"closure: is a {type(plant.closure).__name__}; pass a torch.nn.Module to Plant.__init__."
+        return
+    yield from _single_precision("closure", plant.closure)
+    yield from _commands(plant, seed)
+
+
+def _weights(module: nn.Module) -> Tensor:
+    weights = [weight.detach().double().flatten() for weight in module.state_dict().values()]
+    return torch.cat(weights) if weights else torch.empty(0)
+
+
+def _single_precision(name: str, module: nn.Module) -> Iterator[str]:
+    for weight, value in module.named_parameters():
+        if value.dtype != torch.float64:
+            yield f"{name}: has {weight} in {value.dtype}; expected torch.float64: call .double()."
+
+
+def _commands(plant: Plant, seed: int) -> Iterator[str]:
+    """On observations of order one, as they should be scaled."""
+    policy = plant.make_policy(seeded(seed))
+    count, n_o = 50, len(plant.observations)
+    seen = 3.0 * torch.rand(count, n_o, generator=seeded(seed), dtype=torch.float64) - 1.5
+    command = policy(seen)
+    problem = misshapen(command, (count, len(plant.actions)))
+    if problem:
+        shape = (count, len(plant.actions))
+        yield f"make_policy: its commands on {count} observations have {problem}; expected {wanted_as(shape)}."
+    else:
+        yield from _out_of_range("make_policy", command.detach(), plant.actions)

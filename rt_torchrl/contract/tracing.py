@@ -1,0 +1,74 @@
+"""Forward mode and one graph: what the engines and the compiler need of the methods."""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from rt_torchrl.compilation import raised_limits
+from rt_torchrl.contract.calls import Arguments, Calls
+from rt_torchrl.engines.parallel_adjoint import linearise
+from rt_torchrl.interval import Drive, Interval
+
+REMEDY = (
+    "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
+    "throughout"
+)
+MANY = 3
+
+
+def forward_mode(calls: Calls) -> Iterator[str]:
+    """The Jacobians of the step as the parallel engine takes them, by batched forward-mode products, against reverse.
+
+    Both are exact: they differ by rounding, of numbers of a millionth of the greatest and above.
+    """
+    arguments = calls.some(MANY)
+    drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
+    interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
+    try:
+        jacobians = linearise(interval, state.detach(), drive)
+    except Exception as error:
+        yield f"step: torch.func.jvp under vmap fails: {_first_line(error)} {_where(error)}Expected {REMEDY}."
+        return
+    rows = [torch.autograd.grad(end.sum(), state, retain_graph=True)[0] for end in interval(state, drive).unbind(-1)]
+    reverse = torch.stack(rows, -2)
+    gap = ((jacobians - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
+    if gap > 1e-6:
+        yield (
+            f"step: its Jacobian by forward mode differs from that by reverse mode, by {gap:.1e}; an own "
+            "torch.autograd.Function needs a jvp that is right."
+        )
+
+
+def tracing(calls: Calls) -> Iterator[str]:
+    """Each method as one graph; traced without a compiler, so that it is the plant and not the machine that fails."""
+    arguments = calls.some(MANY)
+    for method in calls.methods():
+
+        def traced(arguments: Arguments, method=method) -> tuple[Tensor, ...]:
+            return method.outputs(arguments)
+
+        try:
+            with raised_limits():
+                found = torch.compile(traced, fullgraph=True, backend="eager")(arguments)
+        except Exception as error:
+            yield f"{method.name}: is not one graph: {_first_line(error)} {_where(error)}Expected {REMEDY}."
+            continue
+        for (name, _), one, other in zip(method.gives.items(), found, method.outputs(arguments), strict=True):
+            if not torch.allclose(one, other, rtol=1e-10, atol=1e-10):
+                yield f"{method.name}: {name} is another one when it is traced; expected {REMEDY}."
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__
+
+
+def _where(error: Exception) -> str:
+    """The last line of the user's code that the compiler names."""
+    lines = str(error).splitlines()
+    places = [k for k, line in enumerate(lines) if line.strip().startswith('File "')]
+    if not places:
+        return ""
+    code = lines[places[-1] + 1].strip() if places[-1] + 1 < len(lines) else ""
+    return f"({lines[places[-1]].strip()}: {code}) "

@@ -1,0 +1,178 @@
+"""The pendulum against Gymnasium itself: its step, its reward, its identification and, slowly, its swing-up."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from rt_torchrl.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.envs.pendulum.models import UniformRod
+from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
+from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
+from rt_torchrl.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.memory import Record
+from rt_torchrl.trajectory import Rollout, control_cost
+from rt_torchrl.twin import DigitalTwin
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def gymnasium_steps(states, commands, *, mass=1.0, length=1.0):
+    """States and rewards of Gymnasium's own class after one step from each state, in double precision."""
+    env = gymnasium.make("Pendulum-v1").unwrapped
+    env.reset()
+    env.m, env.l = mass, length
+    ends, rewards = [], []
+    for state, command in zip(states.numpy(), commands.numpy(), strict=True):
+        env.state = state.copy()
+        _, reward, *_ = env.step(command)
+        ends.append(env.state.copy())
+        rewards.append(reward)
+    return torch.from_numpy(np.stack(ends)), torch.tensor(rewards, dtype=torch.float64)
+
+
+def somewhere(count, seed=0):
+    """States over the whole range, also where the speed is stopped, and commands beyond the motor's."""
+    share = 2.0 * torch.rand(count, 3, generator=seeded(seed), dtype=torch.float64) - 1.0
+    return torch.stack([math.pi * share[:, 0], 8.0 * share[:, 1]], -1), 3.0 * share[:, 2:]
+
+
+@pytest.mark.parametrize(("mass", "length"), [(1.0, 1.0), (0.7, 1.3)])
+def test_a_step_is_gymnasiums(mass, length):
+    states, commands = somewhere(500)
+    plant = Pendulum(closure=UniformRod(torch.tensor([mass, length], dtype=torch.float64)))
+    nothing, t = torch.zeros(500, 0).double(), torch.zeros(500).double()
+    end, applied = plant.step(t, states, commands, nothing, plant.closure)
+    theirs, rewards = gymnasium_steps(states, commands, mass=mass, length=length)
+    # The same operations in another order: rounding of numbers up to 8.
+    torch.testing.assert_close(end[:, 1], theirs[:, 1], rtol=0, atol=1e-13)
+    assert wrapped(end[:, 0] - theirs[:, 0]).abs().max() < 1e-13
+    torch.testing.assert_close(-plant.running_cost(t, states, applied, nothing), rewards, rtol=1e-13, atol=1e-13)
+    # The stops of torque and speed have been met, and not everywhere.
+    for stopped in (applied.abs() == 2.0, end[:, 1].abs() == 8.0):
+        assert 5 < stopped.sum() < 495
+
+
+def test_a_whole_episode_is_gymnasiums():
+    """Two hundred steps of random torque; a rod near its upright position multiplies errors by e^4 in a second."""
+    plant = Pendulum()
+    state, commands = somewhere(1)[0], 2.0 * torch.rand(1, 200, 1, generator=seeded(1), dtype=torch.float64) - 1.0
+    flown = Rollout(plant, plant.closure)(state, torch.zeros(1, 200, 0).double(), commands)
+    env = gymnasium.make("Pendulum-v1").unwrapped
+    env.reset()
+    env.state = state[0].numpy().copy()
+    for command in commands[0].numpy():
+        env.step(command)
+    end = torch.from_numpy(env.state)
+    assert wrapped(flown.states[0, -1, 0] - end[0]).abs() < 1e-9 and (flown.states[0, -1, 1] - end[1]).abs() < 1e-9
+
+
+def test_the_real_system_reports_gymnasiums_reward_and_starts():
+    plant = Pendulum()
+    system = gymnasium_pendulum(plant, seed=3)
+    episode = system.rollout(200)
+    assert episode.shape == (1, 200) and episode["next", "truncated"][0, -1]
+    states, actions = episode["state"][0], episode["action"][0]
+    _, rewards = gymnasium_steps(states, actions)
+    # Gymnasium reports cosine, sine and speed in single precision: 6e-8 of numbers up to 8, in costs up to 16.
+    torch.testing.assert_close(episode["next", "reward"][0, :, 0], rewards, rtol=1e-6, atol=1e-6)
+    following, _ = gymnasium_steps(states, actions)
+    assert wrapped(following[:, 0] - episode["next", "state"][0, :, 0]).abs().max() < 5e-6
+    torch.testing.assert_close(following[:, 1], episode["next", "state"][0, :, 1], rtol=0, atol=5e-6)
+    assert states[0, 1].abs() <= 1.0
+
+
+def test_wrapped_is_the_short_way_round():
+    angles = torch.tensor([0.0, 3.0, 3.5, -3.5, 7.0, -100.0], dtype=torch.float64)
+    found = wrapped(angles)
+    torch.testing.assert_close(found, torch.atan2(angles.sin(), angles.cos()), rtol=0, atol=1e-13)
+
+
+def a_record(plant, seed):
+    """One episode of Gymnasium's pendulum under an untrained policy and exploration."""
+    generator = seeded(seed)
+    policy = plant.make_policy(generator)
+    actor = LivePolicy(plant, policy, ExplorationConfig(spread=0.5, correlation_time=0.3), generator=generator)
+    actor.begin(policy, strength=1.0)
+    system = gymnasium_pendulum(plant, seed=seed)
+    episode = system.rollout(plant.n_steps, TensorDictModule(actor, ["observation"], ["action"]))[0]
+    states = torch.cat([episode["state"], episode["next", "state"][-1:]])
+    return Record(states, episode["exogenous"], episode["next", "applied"])
+
+
+@pytest.mark.parametrize("shares", [(0.5, 0.5), (1.5, 1.5), (0.5, 1.5), (1.5, 0.5)])
+def test_mass_and_length_follow_from_one_episode(shares):
+    plant = Pendulum()
+    closure = UniformRod(torch.tensor(shares, dtype=torch.float64))
+    config = AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", window=10)
+    Assimilation(DigitalTwin(plant, closure), config).update([a_record(plant, 0)], [], 1, seeded())
+    # Single precision of what is reported, over 2000 numbers.
+    torch.testing.assert_close(closure.coefficients.detach(), torch.ones(2).double(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"gravity": 0.0}, "gravity=0.0"), ({"guess": -1.0}, "guess=-1.0")],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Pendulum(**options)
+
+
+def test_another_time_step_than_gymnasiums_is_refused():
+    with pytest.raises(ValueError, match=r"dt=0.025 s of the plant must be that of Gymnasium's pendulum, 0.05 s"):
+        gymnasium_pendulum(Pendulum(dt=0.025))
+
+
+def test_the_engine_that_knows_no_own_step_is_refused():
+    plant = Pendulum()
+    with pytest.raises(ValueError, match="odeint_adjoint.*has a step of its own; use parallel or autograd"):
+        Rollout(plant, plant.closure, plant.make_policy(seeded()), engine="odeint_adjoint")
+
+
+def test_engines_agree_without_inputs():
+    """The exact gradients of two engines on a plant that has no exogenous input."""
+    plant, gradients = Pendulum(horizon=1.0), []
+    state, nothing = plant.draw_initial_state(3, seeded()), plant.draw_exogenous(3, seeded())
+    for engine in ("parallel", "autograd"):
+        policy, closure = plant.make_policy(seeded(1)), plant.make_closure(seeded())
+        flown = Rollout(plant, closure, policy, engine=engine)(state, nothing)
+        weights = [*closure.parameters(), *policy.parameters()]
+        found = torch.autograd.grad(control_cost(plant, flown, nothing).mean(), weights)
+        gradients.append(torch.cat([part.flatten() for part in found]))
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)  # rounding
+
+
+def test_the_recipe_trains_on_gymnasium(tmp_path):
+    small = ["--episodes", "1", "--unseen", "2", "--horizon", "2.0", "--compiled", "False", "--figures-every", "0"]
+    small += ["--twinning.model-free.critic-iterations", "2", "--twinning.model-free.actor-iterations", "2"]
+    small += ["--twinning.model-based.iterations", "1", "--twinning.virtual-episodes", "2"]
+    command = [sys.executable, str(RECIPE), *small, "--log-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]["found"]
+    # One record of 40 intervals in single precision.
+    assert found == pytest.approx({"mass": 1.0, "length": 1.0}, rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_it_swings_up_within_ten_real_episodes(tmp_path, seed):
+    command = [sys.executable, str(RECIPE), "--seed", str(seed), "--log-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    summary = json.loads((tmp_path / "metrics.json").read_text())["summary"]
+    better = summary["unseen"]["merit"][summary["better"]]
+    # A return of about −145 is what good policies have from Gymnasium's starts; a rod that hangs has −1200 and below.
+    assert better["return [-]"]["mean"] > -200.0 and better["upright in the last quarter [%]"]["mean"] > 95.0

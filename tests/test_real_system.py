@@ -1,0 +1,238 @@
+"""Environments of others as the real system: their entries, units and limits, whole trainings on them, what is refused.
+
+The oracle is the oracle plant's own environment, handed over as if somebody else had written it: in other units, under
+other keys. A training on it must be the training on the plant itself.
+"""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from tensordict import TensorDict
+from test_run import SMALL
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import check_env_specs
+
+from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem
+from rt_torchrl.real_episodes import RealEpisodes
+from rt_torchrl.run_config import RunConfig
+from rt_torchrl.runner import Run
+
+MILLIMETRES = torch.tensor([1e3, 1e3], dtype=torch.float64)
+
+
+class Rig(EnvBase):
+    """The oracle plant behind a foreign interface: mm and mm/s, a volt for every half newton from 1 V up, no batch."""
+
+    def __init__(self, plant, ends_after=None, **options):
+        super().__init__(batch_size=[])
+        self.inner, self.ends_after = PlantEnv(plant, **options), ends_after
+        one = Unbounded(shape=(1,), dtype=torch.float64)
+        two = Unbounded(shape=(2,), dtype=torch.float64)
+        self.observation_spec = Composite(sensors=Composite(encoder=two, wind=one.clone()), motor=one.clone())
+        self.action_spec = Composite(volts=Bounded(low=-3.0, high=5.0, shape=(1,), dtype=torch.float64))
+        self.reward_spec = Unbounded(shape=(1,), dtype=torch.float64)
+
+    def _set_seed(self, seed):
+        self.inner.set_seed(seed)
+
+    def _told(self, found):
+        sensors = {"encoder": MILLIMETRES * found["state"][0], "wind": found["exogenous"][0]}
+        return {"sensors": TensorDict(sensors), "motor": found["applied"][0]}
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.found, self.count = self.inner.reset(), 0
+        return TensorDict({**self._told(self.found), "done": torch.tensor([False])})
+
+    def _step(self, tensordict):
+        force = 0.5 * (tensordict["volts"] - 1.0)
+        self.found = self.inner.step(self.found.set("action", force[None]))["next"].exclude("reward")
+        self.count += 1
+        done = torch.tensor([self.count == self.ends_after])
+        return TensorDict({**self._told(self.found), "reward": torch.zeros(1).double(), "done": done})
+
+
+STATE = Reading(keys=(("sensors", "encoder"),), scale=1e-3)
+WIND = Reading(keys=(("sensors", "wind"),))
+VOLTS = Actuation(key="volts", scale=0.5, offset=-0.5)
+
+
+def connected(plant, *, rig=None, **options):
+    options = {"state": STATE, "exogenous": WIND, "actuation": VOLTS, **options}
+    return RealSystem(rig or Rig(plant), plant, **options)
+
+
+def test_it_fulfils_its_specs():
+    check_env_specs(connected(LinearQuadratic(horizon=1.0)))
+
+
+@pytest.mark.parametrize("applied", [None, Reading(keys=("motor",))])
+def test_its_entries_are_those_of_the_plant_itself(applied):
+    plant = LinearQuadratic(horizon=2.0)
+    system = connected(plant, applied=applied)
+    own = PlantEnv(plant)
+    found = system.reset()
+    own.reset()
+    own._state, own._exogenous = found["state"].clone(), system.env.inner._exogenous.clone()
+    generator = torch.Generator().manual_seed(0)
+    for k in range(20):
+        action = 4.0 * torch.rand(1, 1, generator=generator, dtype=torch.float64) - 2.0
+        one = system.step(found.set("action", action))["next"]
+        other = own.step(TensorDict({"action": action.clone()}, batch_size=[1]))["next"]
+        for key in ("state", "exogenous", "observation", "applied", "reward"):
+            # Units there and back: rounding.
+            torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-13)
+        assert one["truncated"].item() == one["done"].item() == (k == 19) and not one["terminated"].item()
+        found = one.exclude("reward")
+
+
+def test_a_seed_fixes_every_episode_by_its_number():
+    def starts(system, count):
+        found = []
+        for _ in range(count):
+            system.reset()
+            found.append(system.rollout(10)["state"][0, 0])  # resets again, as a collector does
+        return torch.stack(found)
+
+    plant = LinearQuadratic(horizon=1.0)
+    first = starts(connected(plant, seed=3), 3)
+    assert torch.equal(first, starts(connected(plant, seed=3), 3))
+    assert not torch.equal(first[0], first[1]) and not torch.equal(first, starts(connected(plant, seed=4), 3))
+    later = connected(plant, seed=3)
+    later.load_state_dict({"seed": 3, "episodes": 2})
+    assert torch.equal(starts(later, 1), first[2:])
+
+
+def test_a_system_without_seeds_goes_on_as_it_is():
+    plant = LinearQuadratic(horizon=1.0)
+    rig = Rig(plant, seed=5)
+    starts = [connected(plant, rig=rig, seed=None).reset()["state"] for _ in range(2)]
+    assert not torch.equal(*starts)
+
+
+def run_on(env, folder, **options):
+    config = RunConfig(log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options)
+    return Run(config, LinearQuadratic(horizon=2.0), env=env)
+
+
+def test_a_run_on_it_is_resumed_to_the_bit(tmp_path):
+    def run(folder, episodes, **options):
+        plant = LinearQuadratic(horizon=2.0)
+        return run_on(connected(plant, closure=plant.closure), folder, episodes=episodes, **options).train()
+
+    whole = run(tmp_path / "whole", 3)
+    run(tmp_path / "parts", 2)
+    parts = run(tmp_path / "parts", 3, resume=True)
+    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
+        assert {**one, "seconds": None} == {**other, "seconds": None}
+    assert "true" in whole["summary"]["closure"]
+
+
+def test_one_of_unknown_closure_is_judged_itself(tmp_path):
+    system = connected(LinearQuadratic(horizon=2.0))
+    run = run_on(system, tmp_path, episodes=2, unseen_every=1)
+    assert isinstance(run.unseen, RealEpisodes)
+    metrics = run.train()
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    summary = metrics["summary"]
+    assert "true" not in summary["closure"] and (tmp_path / "figures" / "states.png").exists()
+    policy, costs = run.algorithm.policies["model_based"], summary["unseen"]["costs"]["model_based"]
+    # The same episodes again, in a loop of our own.
+    again = connected(LinearQuadratic(horizon=2.0))
+    again.set_seed(1_000_000)
+    for expected in costs:
+        found, total = again.reset(), 0.0
+        for _ in range(20):
+            found = again.step(found.set("action", policy(found["observation"]).detach()))["next"]
+            total -= found["reward"].item() / 20
+        assert total == pytest.approx(expected, rel=1e-9)
+    # Judging has not moved the sequence of training episodes.
+    assert system.state_dict() == {"seed": 0, "episodes": 2}
+
+
+def test_the_twin_of_it_finds_the_truth(tmp_path):
+    """The rig is the oracle plant, whose four coefficients one record without noise shows to rounding."""
+    assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
+    config = RunConfig(
+        log_dir=tmp_path,
+        compiled=False,
+        unseen=2,
+        episodes=1,
+        twinning=dataclasses.replace(SMALL, assimilation=assimilation),
+    )
+    plant = LinearQuadratic(horizon=4.0)
+    found = Run(config, plant, env=connected(plant)).train()["summary"]["closure"]["found"]["matrix"]
+    torch.testing.assert_close(torch.tensor(found), torch.tensor(plant.true_closure), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"state": Reading(keys=("position",))},
+            r"state is read from \['position'\], .*does not report; it has .*encoder",
+        ),
+        ({"state": WIND}, r"state, read from .*has shape \(1,\); the plant needs \(2,\), which is \['position'"),
+        ({"exogenous": None}, r"exogenous=\(\) must be a Reading, or a constant for each input of \['disturbance'\]"),
+        ({"exogenous": Reading(keys=("gust",))}, r"exogenous is read from \['gust'\]"),
+        ({"applied": Reading(keys=("current",))}, r"applied is read from \['current'\]"),
+        ({"actuation": Actuation(key="amperes")}, "key='amperes' of the actuation is no action"),
+        (
+            {"actuation": Actuation(key="volts", scale=0.25, offset=-0.5)},
+            r"\[-2, 2\] N, the environment's over \[-1.25, ",
+        ),
+        ({"actuation": Actuation(key="volts", scale=-0.5, offset=-0.5)}, r"the environment's over \[-3, 1\]"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_anything_moves(options, message):
+    rig = Rig(LinearQuadratic())
+    rig._reset = rig._step = None
+    with pytest.raises(ValueError, match=message):
+        connected(LinearQuadratic(), rig=rig, **options)
+
+
+def test_a_constant_stands_in_for_an_input_that_is_not_reported():
+    found = connected(LinearQuadratic(), exogenous=(0.3,)).reset()
+    assert found["exogenous"].tolist() == [[0.3]]
+
+
+def test_a_batch_of_systems_is_refused():
+    with pytest.raises(ValueError, match=r"batch_size=\(3,\) of the environment must be"):
+        RealSystem(PlantEnv(LinearQuadratic(), batch_size=3), LinearQuadratic(), state=STATE)
+
+
+def test_what_is_no_environment_of_torchrl_is_refused(unchecked):
+    with pytest.raises(ValueError, match="env is a object; wrap it first, such as torchrl.envs.GymWrapper"):
+        RealSystem(object(), LinearQuadratic(), state=STATE)
+
+
+def test_an_episode_that_ends_early_is_refused():
+    plant = LinearQuadratic(horizon=2.0)
+    system = connected(plant, rig=Rig(plant, ends_after=7))
+    with pytest.raises(ValueError, match=r"ended the episode after 7 of 20 intervals .* at most 0.7 s"):
+        system.rollout(20)
+
+
+def test_a_reading_that_is_not_finite_is_refused():
+    """When it is read; of the zeros that stand in for a report before that, it may be anything."""
+    plant = LinearQuadratic()
+    share = Reading(keys=(("sensors", "encoder"),), of=lambda mm: mm / mm.abs().sum())
+    system = connected(plant, rig=Rig(plant), state=share)
+    assert system.reset()["state"].isfinite().all()
+    plant.draw_initial_state = lambda batch, generator: torch.zeros(batch, 2).double()
+    with pytest.raises(ValueError, match=r"state \['position', 'velocity'\], read from .*is not finite: \[nan, nan\]"):
+        system.reset()
+
+
+def test_a_scale_of_zero_is_refused():
+    with pytest.raises(ValueError, match=r"scale=\(1.0, 0.0\)"):
+        Actuation(scale=(1.0, 0.0))
+
+
+@pytest.mark.parametrize("options", [{"noise": 0.1}, {"reference": True}])
+def test_options_of_a_simulation_are_refused(options, tmp_path):
+    with pytest.raises(ValueError, match="real system"):
+        run_on(connected(LinearQuadratic(horizon=2.0)), tmp_path, **options)

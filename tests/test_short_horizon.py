@@ -1,0 +1,117 @@
+"""Planning over short windows on the oracle plant: its targets, its critic and its policies against direct sums."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.descent import Descent, DescentConfig
+from rt_torchrl.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
+from rt_torchrl.short_horizon import ShortHorizon, ShortHorizonConfig
+from rt_torchrl.trajectory import control_cost
+from rt_torchrl.twin import DigitalTwin
+
+CONFIG = ShortHorizonConfig(window=10, critic_hidden=(32, 32))
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def episodes(plant, count, seed):
+    return VirtualEpisodes(plant.draw_initial_state(count, seeded(seed)), plant.draw_exogenous(count, seeded(seed)))
+
+
+def planner(plant, config=CONFIG, **kind):
+    policy = plant.make_policy(seeded(3))
+    return ShortHorizon(DigitalTwin(plant, plant.closure), policy, config, generator=seeded(1), **kind)
+
+
+def test_targets_are_discounted_sums():
+    plan = planner(LinearQuadratic(), dataclasses.replace(CONFIG, discount=0.9, mixing=0.7))
+    costs, seen = (torch.rand(3, n, *width, generator=seeded(n)).double() for n, width in ((5, ()), (6, (2,))))
+    values = plan.target(seen)[..., 0].detach()
+    for b in range(3):
+        for k in range(5):
+            # By the definition: sums of every length m, weighted by (1 − λ)λ^(m−1), the longest by the rest.
+            expected, weight = 0.0, 1.0
+            for m in range(1, 5 - k + 1):
+                total = sum(0.1 * 0.9**j * costs[b, k + j] for j in range(m)) + 0.9**m * values[b, k + m]
+                share = weight * 0.3 if m < 5 - k else weight
+                expected, weight = expected + share * total, weight * 0.7
+            found = plan._targets(costs, seen)[b, k]
+            torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)  # rounding
+
+
+def test_the_critic_learns_what_the_policy_costs():
+    """With a policy that stands still: the critic against discounted sums over long flights, which it never sees."""
+    plant = LinearQuadratic(noise=0.0)
+    plan = planner(plant, dataclasses.replace(CONFIG, policy_rate=1e-12, discount=0.9))
+    for k in range(30):
+        plan.sweep(*episodes(plant, 32, k))
+    state, inputs = episodes(plant, 200, 1000)
+    with torch.no_grad():
+        flown = plan.twin.control(plan.policy, state, inputs)
+        t = plant.dt * torch.arange(50, dtype=torch.float64)
+        costs = plant.running_cost(t, flown.states[:, :-1], flown.actions, inputs)
+        true = (0.1 * 0.9 ** torch.arange(50) * costs).sum(-1) / plan.reference
+        found = plan.critic(state)[:, 0]
+    # A perceptron of 64 units after 150 windows; without γ^n v(e_n) the values would be a third too small.
+    assert (found - true).square().mean() < 0.03 * true.var()
+
+
+def test_it_comes_near_the_best_policy():
+    plant = LinearQuadratic()
+    plan, unseen = planner(plant, dataclasses.replace(CONFIG, policy_rate=2e-2)), episodes(plant, 50, 99)
+
+    def cost(policy):
+        return control_cost(plant, plan.twin.control(policy, *unseen), unseen.exogenous).mean()
+
+    before, best = cost(plan.policy).item(), copy.deepcopy(plan.policy)
+    optimum = Descent(best, DescentConfig(optimiser="lbfgs", rate=1.0)).run(lambda: cost(best), 30).best
+    for k in range(25):
+        plan.sweep(*episodes(plant, 16, k))
+    # Discounting 50 intervals by 0.98 makes it another problem, close by.
+    assert optimum < cost(plan.learner).item() < optimum + 0.1 * (before - optimum)
+    assert torch.equal(plan.policy.gain, plant.make_policy(seeded(3)).gain)
+
+
+def test_a_plan_is_kept_only_where_it_is_better():
+    plant = LinearQuadratic()
+    policy = plant.make_policy(seeded(3))
+    twin = DigitalTwin(plant, plant.closure)
+    config = ModelBasedConfig(iterations=1, short_horizon=dataclasses.replace(CONFIG, policy_rate=100.0))
+    model_based = ModelBased(twin, policy, config, generator=seeded(1))
+    before = copy.deepcopy(policy)
+    plan = model_based.update(episodes(plant, 8, 0), episodes(plant, 8, 1))
+    # A step of 100 in a gain of 0.1 is a wild one; what was learned goes on, and π_mb stays.
+    assert not plan.accepted and torch.equal(policy.gain, before.gain)
+    assert not torch.equal(model_based.descent.learner.gain, before.gain)
+    model_based.restart()
+    assert torch.equal(model_based.descent.learner.gain, before.gain)
+
+
+def test_its_state_is_all_it_goes_on_from():
+    plant = LinearQuadratic(horizon=2.0)
+    one, other = planner(plant), planner(plant)
+    for k in range(3):
+        one.sweep(*episodes(plant, 4, k))
+    other.load_state_dict(copy.deepcopy(one.state_dict()))
+    assert one.sweep(*episodes(plant, 4, 9)) == other.sweep(*episodes(plant, 4, 9))
+    assert torch.equal(one.learner.gain, other.learner.gain)
+
+
+def test_a_window_longer_than_an_episode_is_refused():
+    with pytest.raises(ValueError, match="window=10 exceeds the 5 control intervals"):
+        planner(LinearQuadratic(horizon=0.5))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"window": -1}, {"discount": 1.0}, {"mixing": 0.0}, {"critic_iterations": 0}, {"policy_rate": 0.0}],
+)
+def test_bad_parameters_are_refused(options):
+    with pytest.raises(ValueError, match=f"{next(iter(options))}="):
+        ShortHorizonConfig(**options)
