@@ -40,10 +40,10 @@ def test_torque_is_the_square_law_far_below_and_constant_power_far_above():
     assert policy(observed(plant, 115.0, 20.0))[0].item() == pytest.approx(43_093.55, rel=1e-6)
 
 
-@pytest.mark.parametrize(("omega", "rate", "beta"), [(126.0, 0.0, 5.0), (124.8, 0.7, 12.0), (123.0, -0.4, 8.0)])
+@pytest.mark.parametrize(("omega", "rate", "beta"), [(126.0, 0.0, 5.0), (124.5, 0.7, 12.0), (123.0, -0.4, 8.0)])
 def test_pitch_moves_by_the_increment_of_the_scheduled_law(omega, rate, beta):
     plant = InstrumentedTurbine()
-    push = 1.0787 * 1.570796 * rate + 0.462299 * (omega - 124.8)  # K_P and K_I in degrees
+    push = 1.0787 * 1.570796 * rate + 0.462299 * (omega - 124.5)  # K_P and K_I in degrees
     expected = beta + 0.5 * push / (1.0 + beta / 6.302335)
     # The constants above have seven digits.
     assert nominal(plant)(observed(plant, omega, beta, rate))[1].item() == pytest.approx(expected, rel=1e-5)
@@ -81,7 +81,7 @@ def test_instruments_change_nothing_of_the_turbine():
 def test_with_jonkmans_constants_it_flies_as_his_controller():
     plant = InstrumentedTurbine()
     state, wind = plant.draw_initial_state(4, generator(5)), plant.draw_exogenous(4, generator(5))
-    flown = Rollout(plant, plant.closure, nominal(plant, reference_speed=122.9096))(state, wind)
+    flown = Rollout(plant, plant.closure, nominal(plant, reference_speed=122.9096, switch_speed=120.0))(state, wind)
     power, expected = (
         plant.merit(f.states, f.actions, wind)["mean power [MW]"]
         for f in (flown, JonkmanController(plant).fly(state, wind))

@@ -23,8 +23,8 @@ class GainScheduled(nn.Module):
 
     The weights are the logarithms of K, K_P, K_I and β_K over their values in ``NOMINAL``, those of Jonkman's
     controller. The set-points are no weights: the reference power of the turbine's J_a, K ω_g³, is a fifth below what
-    the drivetrain gives at rated speed, and a set-point that follows J_a throws that power away. ω_ref lies 1.5 % above
-    rated speed, because a tighter speed than Jonkman's otherwise spills wind that his rotor stores.
+    the drivetrain gives at rated speed, and a set-point that follows J_a throws that power away. ω_s is a little below
+    Jonkman's 120 rad/s and ω_ref 1.3 % above rated speed, because a speed held tighter than his spills wind otherwise.
 
     Args:
         plant: an :class:`InstrumentedTurbine`, for scales, ranges and the control interval.
@@ -53,8 +53,8 @@ class GainScheduled(nn.Module):
         plant: Plant,
         *,
         detuning: float = math.log(2.0),
-        reference_speed: float = 124.8,
-        switch_speed: float = 120.0,
+        reference_speed: float = 124.5,
+        switch_speed: float = 118.5,
         switch_width: float = 1.0,
         switch_pitch: float = 1.0,
         generator: torch.Generator,
