@@ -4,7 +4,6 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.evaluation import UnseenEpisodes
-from rt_torchrl.plant import has_own_step
 from rt_torchrl.trajectory import Engine, Rollout, control_cost
 
 STEPS = 40
@@ -13,10 +12,10 @@ STEPS = 40
 def engine_gap(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes) -> float:
     """Relative gap ‖g_parallel − g_reference‖/‖g_reference‖ of dJ_a over closure and policy weights.
 
-    The reference is ``odeint_adjoint``, or ``autograd`` for a plant with a step of its own. Over a short horizon and
+    The reference is ``odeint_adjoint``, or ``autograd`` for a plant with a scheme of its own. Over a short horizon and
     two episodes, eager, so that it costs seconds and not minutes.
     """
-    slow: Engine = "autograd" if has_own_step(unseen.plant) else "odeint_adjoint"
+    slow: Engine = "autograd" if unseen.plant.own_scheme else "odeint_adjoint"
     fast, reference = (_gradient(closure, policy, unseen, engine) for engine in ("parallel", slow))
     return ((fast - reference).norm() / reference.norm()).item()
 

@@ -55,6 +55,8 @@ class Plant(nn.Module, ABC):
     actions: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     observations: tuple[Signal, ...]
+    own_scheme: bool = False
+    """Whether :meth:`step` is another scheme, to be kept to the last digit; ``odeint_adjoint`` is then refused."""
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module):
         super().__init__()
@@ -215,11 +217,6 @@ class Plant(nn.Module, ABC):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
-
-
-def has_own_step(plant: Plant) -> bool:
-    """Whether a plant steps in another way than by the Runge-Kutta step of :meth:`Plant.step`."""
-    return type(plant).step is not Plant.step
 
 
 def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy: str) -> None:

@@ -8,8 +8,9 @@ episode is cut into windows of n intervals, and what comes after a window is est
     J_w = (1 - \gamma)\sum_{k<n}\gamma^kL_k + \gamma^n\,v(e_n), \qquad
     v(e_k) \approx (1 - \gamma)\sum_{j\ge0}\gamma^jL_{k+j}
 
-whose targets are mixed over the window's lengths by λ. The policy takes one step for each window, on the exact gradient
-of J_w through the twin; the critic's smoothness hides the cliffs beyond.
+whose targets are mixed over the window's lengths by λ. The policy takes one step for each window, on the exact
+gradient of J_w through the twin; the critic's smoothness hides the cliffs beyond. It is no guarantee: of seven
+trainings on the pendulum one stayed in a minimum where the rod is held upright but not swung up.
 
 Source: Xu et al., *Accelerated policy learning with parallel differentiable simulation*, ICLR 2022 (SHAC).
 """

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.engines import Backpropagation, ContinuousAdjoint, ParallelAdjoint
 from rt_torchrl.interval import Drive, Interval
-from rt_torchrl.plant import Plant, has_own_step
+from rt_torchrl.plant import Plant
 
 Engine = Literal["parallel", "odeint_adjoint", "autograd"]
 ENGINES = {"parallel": ParallelAdjoint, "odeint_adjoint": ContinuousAdjoint, "autograd": Backpropagation}
@@ -46,7 +46,7 @@ class Rollout:
         compiled: compile with torch.compile; eager is quicker for short horizons.
 
     Raises:
-        ValueError: if the engine does not exist, does not know the plant's own step, or a module is not in double
+        ValueError: if the engine does not exist, does not know the plant's own scheme, or a module is not in double
             precision.
     """
 
@@ -61,10 +61,10 @@ class Rollout:
     ):
         if engine not in ENGINES:
             raise ValueError(f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}.")
-        if engine == "odeint_adjoint" and has_own_step(plant):
+        if engine == "odeint_adjoint" and plant.own_scheme:
             raise ValueError(
-                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} has a step of its own; "
-                "use parallel or autograd."
+                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} steps by a scheme of its "
+                "own; use parallel or autograd."
             )
         for role, module in (("closure", closure), ("policy", policy)):
             require_double(role, module)
