@@ -196,7 +196,7 @@ def test_wrong_options_are_refused(option, message):
 def test_a_segment_longer_than_the_record_is_refused():
     twin, flown, exogenous = recorded(LinearQuadratic(horizon=2.0), batch=1)
     record = Record(flown.states[0], exogenous[0], flown.actions[0])
-    with pytest.raises(ValueError, match="segment=21 exceeds the 20 control intervals"):
+    with pytest.raises(ValueError, match="segment=21 of the assimilation exceeds the 20 control"):
         Assimilation(twin, AssimilationConfig(segment=21, inputs="record")).update([record], [], 1, seeded())
 
 
