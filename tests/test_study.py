@@ -210,7 +210,7 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     assert np.allclose(line.get_ydata(), [5.0, 1.05, 1.0])
     violins = charts.robustness(found.entries)
     labels = [label.get_text() for label in violins.axes[0].get_xticklabels()]
-    assert labels == ["twinning", "model free", "model based", "twinning, other", "PD", "oracle"]
+    assert labels == ["twinning", "model free", "model based", "twinning,\nother", "PD", "oracle"]
     harder = charts.variants(found.costs).axes[0]
     assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %"]
     assert np.allclose(harder.lines[1].get_ydata(), 1.5 / 1.05)

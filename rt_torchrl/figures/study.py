@@ -9,6 +9,8 @@ from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, cap
 from rt_torchrl.study.findings import Entry
 
 ARMS = {"twinning": REAL, **ROLES}
+POLICIES = ("#7f3c8d", "#a0522d", "#e75480", "#6b8e23")
+"""Colours of twinning with other policies, in their order."""
 YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
 WIDEST_LINEAR = 5.0
 """Ratio of the greatest to the least cost above which an axis is logarithmic."""
@@ -29,9 +31,8 @@ def learning(entries: dict[str, list[Entry]]) -> Figure:
             if entry.curves and entry.curves[0]:
                 length = min(map(len, entry.curves))
                 curves = np.array([curve[:length] for curve in entry.curves])
-                episode, colour = np.arange(1, length + 1), ARMS.get(entry.name)
-                (line,) = ax.plot(episode, curves.mean(0), color=colour, linewidth=1.8, label=shown(entry.name))
-                colour = line.get_color()
+                episode, colour = np.arange(1, length + 1), _colours(found)[entry.name]
+                ax.plot(episode, curves.mean(0), color=colour, linewidth=1.8, label=shown(entry.name))
                 ax.fill_between(episode, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0.0)
             elif entry.name == "oracle":
                 ax.axhline(entry.mean, label="oracle", **REFERENCE_LINE)
@@ -53,12 +54,12 @@ def robustness(entries: dict[str, list[Entry]]) -> Figure:
         costs = [entry.costs.ravel() for entry in found]
         violins = ax.violinplot(costs, showmeans=False, showextrema=True, widths=0.8)
         for body, entry in zip(violins["bodies"], found, strict=True):
-            body.set_facecolor(ARMS.get(entry.name, REFERENCE))
+            body.set_facecolor(_colours(found)[entry.name])
         _bars(ax, [values.mean() for values in costs])
         together = np.concatenate(costs)
         if together.min() > 0 and together.max() > WIDEST_LINEAR * together.min():
             ax.set_yscale("log")
-        ax.set_xticks(range(1, len(found) + 1), [shown(entry.name) for entry in found])
+        ax.set_xticks(range(1, len(found) + 1), [shown(entry.name).replace(", ", ",\n") for entry in found])
         caption(ax, f"{shown(plant)}: $J_a$")
     return figure
 
@@ -86,6 +87,13 @@ def variants(costs: dict[str, dict[str, list[float]]]) -> Figure:
 def _bars(ax: Axes, means: list[float]) -> None:
     for column, mean in enumerate(means, 1):
         ax.plot([column - 0.3, column + 0.3], [mean, mean], color="0.1", linewidth=2.0)
+
+
+def _colours(entries: list[Entry]) -> dict[str, str]:
+    """Of each arm, policy and yardstick."""
+    others = [entry.name for entry in entries if entry.curves and entry.name not in ARMS]
+    policies = {name: POLICIES[k % len(POLICIES)] for k, name in enumerate(others)}
+    return {entry.name: (ARMS | policies).get(entry.name, REFERENCE) for entry in entries}
 
 
 def shown(name: str) -> str:
