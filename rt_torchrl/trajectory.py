@@ -62,8 +62,8 @@ class Rollout:
             raise ValueError(f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}.")
         if engine == "odeint_adjoint" and plant.own_scheme:
             raise ValueError(
-                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} steps by a scheme of its "
-                "own; use parallel or autograd."
+                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} steps by a scheme of "
+                "its own; use parallel or autograd."
             )
         for role, module in (("closure", closure), ("policy", policy)):
             require_double(role, module)
