@@ -74,17 +74,15 @@ def summary(
     J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
     after = {role: judged[role].control_costs.mean() for role in ROLES}
     better = min(ROLES, key=lambda role: after[role].item())
+    means = {"J_p": J_p, "J_p_before": J_p_before, "J_a_untrained": untrained}
+    means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
     found = {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": (after[role] / before[role].mean()).item() for role in ROLES},
         **{f"J_a_over_untrained_{role}": (after[role] / untrained.mean()).item() for role in ROLES},
         "unseen": {
             "episodes": len(unseen.initial_state),
-            "J_p": mean_with_confidence(J_p),
-            "J_p_before": mean_with_confidence(J_p_before),
-            "J_a_before": mean_with_confidence(before["model_based"]),
-            "J_a_before_model_free": mean_with_confidence(before["model_free"]),
-            "J_a_untrained": mean_with_confidence(untrained),
+            **{name: mean_with_confidence(values) for name, values in means.items()},
             **results(unseen, judged),
         },
         "live": live,
