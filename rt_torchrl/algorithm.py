@@ -11,9 +11,7 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
@@ -21,12 +19,11 @@ from rt_torchrl.distillation import Distillation, DistillationConfig, same_archi
 from rt_torchrl.environment import PlantEnv
 from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.flight import FlightCollector
+from rt_torchrl.flight import EpisodeCollector, FlightCollector
 from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, ShortTermMemory
 from rt_torchrl.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
 from rt_torchrl.model_free import ModelFree, ModelFreeConfig
 from rt_torchrl.switching import PolicySwitch, Role, SwitchConfig
-from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
 Arm = Literal["twinning", "model_free", "model_based"]
@@ -103,7 +100,10 @@ class ReinforcementTwinning:
         self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
         self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
         self.actor = LivePolicy(twin.plant, self.policies[self.switch.live], config.exploration, generator=generator)
-        self.collector = collector_of(env, self.actor, twin.plant.n_steps)
+        simulated = isinstance(env, PlantEnv)
+        self.collector = (
+            FlightCollector(env, self.actor) if simulated else EpisodeCollector(env, self.actor, twin.plant.n_steps)
+        )
         self.episodes_done = 0
 
     def episode(self) -> TensorDict:
@@ -193,9 +193,7 @@ class ReinforcementTwinning:
 
     def virtual_costs(self, episodes: VirtualEpisodes) -> dict[Role, Tensor]:
         """Mean J_a of each policy over virtual episodes."""
-        flown = {role: self.twin.control(policy, *episodes) for role, policy in self.policies.items()}
-        plant, exogenous = self.twin.plant, episodes.exogenous
-        return {role: control_cost(plant, trajectory, exogenous).mean() for role, trajectory in flown.items()}
+        return {role: self.twin.cost(policy, *episodes) for role, policy in self.policies.items()}
 
     def clone(self, costs: dict[Role, Tensor], judged_on: VirtualEpisodes) -> TensorDict:
         """The live policy into the idle one: a copy of its weights, or a distillation into another architecture.
@@ -225,15 +223,6 @@ class ReinforcementTwinning:
                 return report.set_non_tensor("event", "keep").set_non_tensor("reason", reason)
         (self.model_free if self.switch.idle == "model_free" else self.model_based).restart()
         return report
-
-
-def collector_of(env: EnvBase, actor: LivePolicy, n_steps: int) -> Collector:
-    """TorchRL's collector of one episode a time; for a system in simulation the one that does not step in Python."""
-    if isinstance(env, PlantEnv):
-        return FlightCollector(env, actor)
-    policy = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
-    options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False, "total_frames": -1}
-    return Collector(env, policy, frames_per_batch=n_steps, **options)
 
 
 def findings(**values: float | Tensor) -> TensorDict:

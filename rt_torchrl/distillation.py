@@ -22,7 +22,6 @@ from torchrl.objectives import BCLoss
 from rt_torchrl.descent import Descent, DescentConfig
 from rt_torchrl.model_based import VirtualEpisodes
 from rt_torchrl.plant import Plant
-from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
 
@@ -97,7 +96,8 @@ class Distillation:
             if number:
                 observations.append(self._thinned(self._observed(idle, draw())))
             error = imitate(self.twin.plant, live, idle, torch.cat(observations), self.config.iterations)
-        cost = self._cost(idle, judged_on)
+        with torch.no_grad():
+            cost = self.twin.cost(idle, *judged_on).item()
         accepted = cost <= to_beat
         if not accepted:
             idle.load_state_dict(before)
@@ -109,11 +109,6 @@ class Distillation:
         flown = self.twin.control(policy, *episodes)
         t = plant.dt * torch.arange(exogenous.shape[1], dtype=torch.float64, device=exogenous.device)
         return plant.observe(t, flown.states[:, :-1], exogenous).flatten(0, 1)
-
-    @torch.no_grad()
-    def _cost(self, policy: nn.Module, episodes: VirtualEpisodes) -> float:
-        flown = self.twin.control(policy, *episodes)
-        return control_cost(self.twin.plant, flown, episodes.exogenous).mean().item()
 
     def _thinned(self, observations: Float[Tensor, "n n_o"]) -> Float[Tensor, "m n_o"]:
         return observations[:: -(-len(observations) // self.config.samples)]

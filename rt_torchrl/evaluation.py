@@ -59,7 +59,8 @@ class UnseenEpisodes:
 
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
         """J_a of each episode."""
-        return self.judge(self.fly(policy)).control_costs
+        flown = self.fly(policy)
+        return control_cost(self.plant, flown, self.exogenous_of(flown))
 
     def untrained_cost(self, policy: nn.Module) -> float:
         """Mean J_a of one of many random initial policies."""

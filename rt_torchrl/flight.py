@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 
 from rt_torchrl.compilation import compiled_if
 from rt_torchrl.engines.recurrence import march, march_by_scan
@@ -39,8 +40,28 @@ class ExploringInterval(Interval):
         return (self.policy(observation) + noise).clamp(self.low, self.high)
 
 
-class FlightCollector(Collector):
-    """TorchRL's collector for a :class:`PlantEnv`: the same entries and draws, without a Python step per interval.
+class EpisodeCollector(Collector):
+    """TorchRL's collector of one whole episode a time, from its reset on.
+
+    Args:
+        env: the real system.
+        actor: what acts on it.
+        n_steps: control intervals of an episode.
+    """
+
+    def __init__(self, env: EnvBase, actor: LivePolicy, n_steps: int):
+        super().__init__(
+            env,
+            TensorDictModule(actor, in_keys=["observation"], out_keys=["action"]),
+            frames_per_batch=n_steps * env.batch_size.numel(),
+            total_frames=-1,
+            reset_at_each_iter=True,
+            auto_register_policy_transforms=False,
+        )
+
+
+class FlightCollector(EpisodeCollector):
+    """The same for a :class:`PlantEnv`: the same entries and draws, without a Python step per interval.
 
     A step of an environment costs some 0.4 ms, an interval in a compiled scan a tenth of it; an episode of the drone or
     the tank has 10 000 of them.
@@ -51,9 +72,7 @@ class FlightCollector(Collector):
     """
 
     def __init__(self, env: PlantEnv, actor: LivePolicy):
-        policy = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
-        options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False, "total_frames": -1}
-        super().__init__(env, policy, frames_per_batch=env.plant.n_steps * env.batch_size.numel(), **options)
+        super().__init__(env, actor, env.plant.n_steps)
         self.actor = actor
         self._march = compiled_if(env.compiled, march_by_scan, march)
 

@@ -18,8 +18,10 @@ from rt_torchrl.gauss_newton import NormalEquations
 from rt_torchrl.plant import Plant
 from rt_torchrl.resampling import Segment
 from rt_torchrl.sensitivity import Sensitivities
-from rt_torchrl.trajectory import DivergenceError
+from rt_torchrl.trajectory import require_finite
 from rt_torchrl.twin import DigitalTwin
+
+REMEDY = "Check the units of the log's columns, use a smaller dt, or start from a closure nearer to the system."
 
 
 class InitialStates(nn.Module):
@@ -108,7 +110,7 @@ class Misfit:
         ends, S = self._sensitivities(
             first[None], record.exogenous[None], record.actions[None], start=start, initial=True
         )
-        self._require_finite(ends[0], start)
+        require_finite(self.plant, ends[0, :, None], first[None], [self.twin.closure], start=start, remedy=REMEDY)
         states = torch.cat([first[None], ends[0]])
         at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
         S = torch.cat([at_start[None], S[0]])
@@ -133,15 +135,3 @@ class Misfit:
         free = len(self.initial.free)
         own = self._shown + number * free + torch.arange(free)
         return torch.cat([torch.arange(self._shown), own])
-
-    def _require_finite(self, ends: Tensor, start: float) -> None:
-        finite = ends.isfinite().all(-1)
-        if finite.all():
-            return
-        k = int(finite.int().argmin())
-        raise DivergenceError(
-            f"twin of plant {self.plant.name!r} diverged at t = {start + (k + 1) * self.plant.dt:g} s of the log, "
-            f"under {type(self.twin.closure).__name__}; the state before was "
-            f"{ends[k - 1].tolist() if k else 'the initial state'}. Check the units of the columns, use a smaller dt, "
-            "or start from a closure nearer to the system."
-        )

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.short_horizon import ShortHorizon, ShortHorizonConfig
-from rt_torchrl.trajectory import control_cost
 from rt_torchrl.twin import DigitalTwin
 
 
@@ -108,5 +107,4 @@ class ModelBased:
         return Descended(start, end, gradients[0] if gradients else float("nan"), len(gradients))
 
     def _cost(self, episodes: VirtualEpisodes) -> Tensor:
-        flown = self.twin.control(self.policy, episodes.initial_state, episodes.exogenous)
-        return control_cost(self.twin.plant, flown, episodes.exogenous).mean()
+        return self.twin.cost(self.policy, *episodes)

@@ -138,6 +138,7 @@ def require_finite(
     modules: Sequence[nn.Module | None],
     *,
     start: float | Float[Tensor, " batch"] = 0.0,
+    remedy: str = "Use a smaller dt, or weights nearer to ones that are known to work.",
 ) -> None:
     """Refuse a trajectory that has left the finite numbers.
 
@@ -147,6 +148,7 @@ def require_finite(
         initial_state: s_0.
         modules: closure and policy it was computed with, for the message.
         start: time of s_0 [s], one for all or one for each realisation.
+        remedy: what the user can do, for the message.
 
     Raises:
         DivergenceError: with plant, realisation, time and the last state that was finite.
@@ -160,7 +162,7 @@ def require_finite(
     raise DivergenceError(
         f"plant {plant.name!r} diverged in realisation {realisation} at t = {began + (k + 1) * plant.dt:g} s: "
         f"{plant.states[component].name} is not finite; the state before was {last}, the weights those of "
-        f"{' and '.join(weights)}. Use a smaller dt, or weights nearer to ones that are known to work."
+        f"{' and '.join(weights)}. {remedy}"
     )
 
 

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plant import Plant
 from rt_torchrl.sensitivity import Sensitivities
-from rt_torchrl.trajectory import Engine, Rollout, Trajectory
+from rt_torchrl.trajectory import Engine, Rollout, Trajectory, control_cost
 
 
 class DigitalTwin:
@@ -50,3 +50,9 @@ class DigitalTwin:
     ) -> Trajectory:
         """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`."""
         return self._rollout(policy)(initial_state, exogenous, start=start)
+
+    def cost(
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+    ) -> Float[Tensor, ""]:
+        """Mean J_a of virtual episodes under a policy."""
+        return control_cost(self.plant, self.control(policy, initial_state, exogenous), exogenous).mean()

@@ -53,8 +53,8 @@ def test_a_perceptron_learns_an_affine_law():
     # The law is a perceptron of one unit; sixteen of them come within some thousandths of it in 400 gradients.
     assert found.accepted and found.error < 5e-3 and error < 1e-2, (found, error)
     assert torch.equal(before, weights(live))
-    judge = Distillation(DigitalTwin(PLANT, PLANT.closure), DistillationConfig())._cost
-    costs = [judge(policy, draw(seed=4)) for policy in (live, idle)]
+    twin = DigitalTwin(PLANT, PLANT.closure)
+    costs = [twin.cost(policy, *draw(seed=4)).item() for policy in (live, idle)]
     assert found.cost == pytest.approx(costs[1], rel=1e-12)
     # J_a is stationary nowhere near this law, so that a difference of the actions of 0.2 % of 4 N shows as such.
     assert costs[1] == pytest.approx(costs[0], rel=1e-2)

@@ -3,13 +3,11 @@
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
 
 from rt_torchrl.catalogue import plants
 from rt_torchrl.environment import PlantEnv
 from rt_torchrl.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.flight import FlightCollector
+from rt_torchrl.flight import EpisodeCollector, FlightCollector
 from rt_torchrl.trajectory import DivergenceError
 
 
@@ -23,9 +21,7 @@ def system(plant, batch=1, **options):
 
 def stepped(env, actor):
     """TorchRL's own collector."""
-    policy = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
-    options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False, "total_frames": -1}
-    return Collector(env, policy, frames_per_batch=env.plant.n_steps * env.batch_size.numel(), **options)
+    return EpisodeCollector(env, actor, env.plant.n_steps)
 
 
 def episodes(collector, actor, policy, strengths):
