@@ -3,13 +3,14 @@
 from abc import ABC, abstractmethod
 
 import torch
-from hoptorch.scan import scan
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.compilation import compiled_if
+from rt_torchrl.engines.recurrence import march, march_by_scan
+from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
-from rt_torchrl.trajectory import Trajectory
+from rt_torchrl.trajectory import Trajectory, drive_of
 
 
 class ClassicalController(nn.Module, ABC):
@@ -44,7 +45,7 @@ class ClassicalController(nn.Module, ABC):
         for bound in ("low", "high"):
             limits = torch.tensor([getattr(a, bound) for a in plant.actions], dtype=torch.float64)
             self.register_buffer(f"{bound}_action", limits)
-        self._flight = compiled_if(compiled, flight_by_scan, flight)
+        self._march = compiled_if(compiled, march_by_scan, march)
 
     def named_gains(self) -> dict[str, float]:
         """The gains by name."""
@@ -61,40 +62,45 @@ class ClassicalController(nn.Module, ABC):
         """Command, held to the ranges of the actions by the caller, and the new memory."""
 
     @torch.no_grad()
-    def fly(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> Trajectory:
-        """Real episodes under this controller."""
-        n_s = len(self.plant.states)
+    def fly(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        closure: nn.Module | None = None,
+    ) -> Trajectory:
+        """Real episodes under this controller, of a system with this closure; None for the plant's own."""
+        closure = self.plant.closure if closure is None else closure
+        loop, n_s = ControlledInterval(self, closure), len(self.plant.states)
         start = torch.cat([initial_state, self.first_memory(initial_state)], -1)
-        t = self.plant.dt * torch.arange(exogenous.shape[1], dtype=torch.float64, device=exogenous.device)
-        flown = self._flight(self, start, t.unsqueeze(-1), exogenous.transpose(0, 1).contiguous()).transpose(0, 1)
-        states = torch.cat([initial_state.unsqueeze(1), flown[..., :n_s]], 1)
-        return Trajectory(states, flown[..., start.shape[1] :])
+        drive = drive_of(self.plant, exogenous, None)
+        carries = torch.cat([start.unsqueeze(0), self._march(loop, start, drive)])
+        states = carries[..., :n_s].transpose(0, 1)
+        command = loop.commanded(carries[:-1].flatten(0, 1))[0].unflatten(0, carries[:-1].shape[:2])
+        return Trajectory(states, self.plant.actuate(states[:, :-1], command.transpose(0, 1)))
 
 
-def interval(controller: ClassicalController, carry: Tensor, t: Tensor, exogenous: Tensor) -> tuple[Tensor, Tensor]:
-    """(state, memory) after an interval, and the action applied in it."""
-    plant, n_s = controller.plant, len(controller.plant.states)
-    state, memory = carry[..., :n_s], carry[..., n_s:]
-    command, memory = controller.act(state, memory)
-    command = command.clamp(controller.low_action, controller.high_action)
-    end, applied = plant.step(t, state, command, exogenous, plant.closure)
-    return torch.cat([end, memory], -1), applied
+class ControlledInterval(Interval):
+    """One control interval of a system under a classical controller; its state is (s, m).
 
+    Args:
+        controller: with its plant.
+        closure: of the system.
+    """
 
-def flight(controller: ClassicalController, start: Tensor, t: Tensor, exogenous: Tensor) -> Tensor:
-    """(state, memory, action) of every interval, time first, by a loop."""
-    carry, found = start, []
-    for now, z in zip(t, exogenous, strict=True):
-        carry, applied = interval(controller, carry, now, z)
-        found.append(torch.cat([carry, applied], -1))
-    return torch.stack(found)
+    def __init__(self, controller: ClassicalController, closure: nn.Module | None):
+        super().__init__(controller.plant, closure, controller)
 
+    def commanded(
+        self, carry: Float[Tensor, "batch n_c"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """The command within the ranges of the actions, and the new memory."""
+        n_s = len(self.plant.states)
+        command, memory = self.policy.act(carry[..., :n_s], carry[..., n_s:])
+        return command.clamp(self.policy.low_action, self.policy.high_action), memory
 
-def flight_by_scan(controller: ClassicalController, start: Tensor, t: Tensor, exogenous: Tensor) -> Tensor:
-    """The same by one ``scan``, for the compiler."""
-
-    def body(carry, x):
-        carry, applied = interval(controller, carry, *x)
-        return carry.contiguous(), torch.cat([carry, applied], -1)
-
-    return scan(body, start.clone(memory_format=torch.contiguous_format), (t, exogenous))[1]
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """(state, memory) at the end of the interval."""
+        command, memory = self.commanded(state)
+        s = state[..., : len(self.plant.states)]
+        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
+        return torch.cat([end, memory], -1)

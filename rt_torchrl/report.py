@@ -46,9 +46,10 @@ def progress(record: dict[str, Any]) -> str:
 def judge(
     unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, ClassicalController]
 ) -> dict[str, Judged]:
-    """Both policies, then the classical controllers, on the unseen episodes."""
+    """Both policies, then the classical controllers, on the unseen episodes of the system as it is."""
     judged = {role: unseen.judge(unseen.fly(policies[role])) for role in ROLES}
-    flown = {name: law.fly(unseen.initial_state, unseen.exogenous) for name, law in baselines.items()}
+    episodes = unseen.initial_state, unseen.exogenous, unseen.closure
+    flown = {name: law.fly(*episodes) for name, law in baselines.items()}
     return judged | {name: unseen.judge(trajectory) for name, trajectory in flown.items()}
 
 

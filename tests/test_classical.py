@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from test_model_free import optimal_gain
 
 from rt_torchrl.classical import ClassicalController
@@ -15,7 +15,9 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.evaluation import Judged
+from rt_torchrl.evaluation import Judged, UnseenEpisodes
+from rt_torchrl.policies import SaturatedAffine
+from rt_torchrl.report import judge
 from rt_torchrl.trajectory import control_cost
 from rt_torchrl.tuning import tune
 
@@ -48,6 +50,22 @@ def test_a_flight_is_the_plants_steps_under_the_saturated_command():
         torch.testing.assert_close(flown.states[:, k + 1], state, rtol=1e-13, atol=1e-13)
         torch.testing.assert_close(flown.actions[:, k], applied, rtol=1e-13, atol=1e-13)
     assert (flown.actions.abs() == 2.0).any()
+
+
+def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
+    plant = LinearQuadratic(horizon=3.0)
+    worn = LinearClosure(0.5 * torch.tensor(plant.true_closure))
+    state, exogenous = episodes(plant)
+    flown = PD(plant).fly(state, exogenous, worn)
+    t = torch.zeros(1, dtype=torch.float64)
+    end = plant.step(t, state, flown.actions[:, 0], exogenous[:, 0], worn).state
+    torch.testing.assert_close(flown.states[:, 1], end, rtol=1e-13, atol=1e-13)
+    unseen = UnseenEpisodes(plant, 4)
+    unseen.closure = worn
+    affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
+    judged = judge(unseen, {"model_based": affine, "model_free": affine}, {"PD": PD(plant)})["PD"]
+    own = PD(plant).fly(unseen.initial_state, unseen.exogenous, worn)
+    assert torch.equal(judged.control_costs, control_cost(plant, own, unseen.exogenous))
 
 
 COMPARISON = """
