@@ -20,8 +20,8 @@ from rt_torchrl.figures import study as charts
 from rt_torchrl.run_config import QUICK_UNSEEN
 from rt_torchrl.runner import main_of
 from rt_torchrl.study import page, report
-from rt_torchrl.study.findings import Entry, Results, acting_cost, arm_entry, weight_errors, yardstick_entry
-from rt_torchrl.study.training import VARIANTS, Training
+from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
+from rt_torchrl.study.training import CHANGED, VARIANTS, Training
 from rt_torchrl.study.yardsticks import classical, oracle
 
 ARMS = ("twinning", "model_free", "model_based")
@@ -49,7 +49,7 @@ class Config:
     Args:
         plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
         seeds: trainings of every arm.
-        variant_seeds: trainings of twinning under each kind of sensor noise and model error; 0 leaves them out.
+        variant_seeds: trainings of every arm under each kind of sensor noise and model error; 0 leaves them out.
         jobs: trainings side by side, one thread each; 0 takes one for every core.
         backend: of joblib; ray spreads over a Ray cluster and needs the extra ``ray``.
         unseen: number of unseen episodes that everything is judged on.
@@ -83,23 +83,27 @@ class Config:
         """Where what is computed is kept; short trainings apart, or the whole study would take them for its own."""
         return self.folder / "quick" if self.quick else self.folder
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options of every training."""
+        return ("--quick",) if self.quick else ("--unseen", str(self.unseen))
+
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Of a plant: those of every variant and arm, a list over the seeds."""
         seeds, others = (1, min(self.variant_seeds, 1)) if self.quick else (self.seeds, self.variant_seeds)
-        options = ("--quick",) if self.quick else ("--unseen", str(self.unseen))
-        recipe, base = Path(__file__).with_name(f"{plant}.py"), self.kept / "runs" / plant
+        base = self.kept / "runs" / plant
 
         def every(arm: str, variant: str, count: int, *further: str, folder: str = "") -> list[Training]:
             place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
-            every_option = (*options, "--unseen-every", "1", *further)
-            common = {"recipe": recipe, "arm": arm, "variant": variant, "options": every_option}
+            every_option = (*self.options, "--unseen-every", "1", *further)
+            common = {"recipe": recipe_of(plant), "arm": arm, "variant": variant, "options": every_option}
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
         for name, policy in POLICIES.get(plant, {}).items():
             found["nominal", name] = every("twinning", "nominal", seeds, *policy, folder="-".join(policy).strip("-"))
         harder = [variant for variant in VARIANTS if variant != "nominal"] if others else []
-        return found | {(variant, "twinning"): every("twinning", variant, others) for variant in harder}
+        return found | {(variant, arm): every(arm, variant, others) for variant in harder for arm in ARMS}
 
     def yardsticks(self, plant: str) -> dict[str, Callable[[], dict[str, Any]]]:
         """The oracle and the classical controllers of a plant; each is computed once and kept."""
@@ -108,10 +112,16 @@ class Config:
         starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
         best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
         tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
+        tuned |= {"recipe": recipe_of(plant), "options": self.options}
         found = {"oracle": partial(oracle, plant, place / "oracle.json", **best)}
         for name, kind in CONTROLLERS[plant].items():
             found[name] = partial(classical, plant, kind, place / f"{name}.json", **tuned)
         return found
+
+
+def recipe_of(plant: str) -> Path:
+    """The recipe of a plant."""
+    return Path(__file__).with_name(f"{plant}.py")
 
 
 def compute(config: Config) -> None:
@@ -148,15 +158,24 @@ def entries_of(config: Config, plant: str) -> list[Entry]:
     return found + yardsticks[1:] + yardsticks[:1]
 
 
+def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
+    """Every arm under every variant; with model error the classical controllers too."""
+    trainings = config.trainings(plant)
+    variants = dict.fromkeys(variant for variant, _ in trainings if variant != "nominal")
+    found = {variant: [arm_entry(arm, trainings[variant, arm]) for arm in ARMS] for variant in variants}
+    if found:
+        tasks = {name: config.yardsticks(plant)[name] for name in CONTROLLERS[plant]}
+        found[CHANGED] += [yardstick_entry(name, task()["changed"]) for name, task in tasks.items()]
+    return found
+
+
 def gather(config: Config) -> Results:
     """Everything the report is written from."""
-    results = Results({}, {}, {}, {})
+    results = Results({}, {}, {})
     for plant in config.chosen():
-        groups = {v: group for (v, arm), group in config.trainings(plant).items() if arm == "twinning"}
-        found = {variant: [training.metrics()["summary"] for training in group] for variant, group in groups.items()}
-        results.entries[plant], results.summaries[plant] = entries_of(config, plant), found["nominal"]
-        results.costs[plant] = {v: [acting_cost(summary) for summary in group] for v, group in found.items()}
-        results.errors[plant] = {v: weight_errors(group) for v, group in found.items()}
+        nominal = config.trainings(plant)["nominal", "twinning"]
+        results.entries[plant], results.variants[plant] = entries_of(config, plant), harder_of(config, plant)
+        results.summaries[plant] = [training.metrics()["summary"] for training in nominal]
     return results
 
 
@@ -166,7 +185,8 @@ def draw(config: Config, results: Results) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
     if config.variant_seeds:
-        drawn["variants"] = charts.variants(results.costs)
+        drawn["variants"] = charts.variants(results.entries, results.variants)
+        drawn["following"] = charts.following(results.entries, results.variants)
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import tyro
 
+from rt_torchrl.catalogue import plants
 from rt_torchrl.figures import study as charts
 from rt_torchrl.study import page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
-from rt_torchrl.study.training import VARIANTS, Training
-from rt_torchrl.study.yardsticks import kept
+from rt_torchrl.study.training import CHANGED, VARIANTS, Training
+from rt_torchrl.study.yardsticks import changed_closure, kept
 
 EPISODES = 30
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -58,7 +60,7 @@ def finished(tmp_path, seed, shift, **options):
     costs = (1.0 + shift + 0.1 * np.random.default_rng(7).standard_normal(EPISODES)).tolist()
     found = training(tmp_path, seed, **options)
     found.folder.mkdir()
-    episodes = [{"J_a_unseen": 5.0}, {"J_a_unseen": 1.05}, {"J_a_unseen": 1.0}]
+    episodes = [{"J_a_unseen": cost, "J_p": cost / 100} for cost in (5.0, 1.05, 1.0)]
     (found.folder / "metrics.json").write_text(json.dumps({"summary": summary(costs), "episodes": episodes}))
     return found
 
@@ -111,6 +113,7 @@ def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
     assert entry.mean == pytest.approx(entry.costs.mean(1).mean())
     assert entry.weight_error == pytest.approx([0.1] * 3) and entry.J_p_ratio == [1e-3] * 3
     assert entry.episodes_to(1.0) == [2, 2, 2] and entry.episodes_to(0.5) == [None] * 3
+    assert entry.twin_errors == [pytest.approx([0.05, 0.0105, 0.01])] * 3
     low, high = entry.interval()
     assert low < entry.mean < high
 
@@ -157,11 +160,12 @@ def results(tmp_path):
     halves = [Entry(name="model_free", costs=twinning.costs * 3.0, merit=twinning.merit, curves=[[3.0]] * 2)]
     halves.append(Entry(name="model_based", costs=twinning.costs, merit=twinning.merit, curves=twinning.curves))
     halves.append(Entry(name="twinning, other", costs=twinning.costs * 2.0, merit=twinning.merit, curves=[[2.0]] * 2))
-    costs = {"nominal": [1.0, 1.1], "noise 1 %": [1.5]}
-    errors = {"nominal": [0.01, 0.02], "noise 1 %": []}
+    noisy = [Entry(name=e.name, costs=1.5 * e.costs[:1], merit=e.merit) for e in (twinning, *halves[:2])]
+    changed = [Entry(name=e.name, costs=e.costs, merit=e.merit, twin_errors=e.twin_errors) for e in (twinning, *halves)]
+    variants = {"noise 1 %": noisy, CHANGED: [*changed[:3], yardsticks[0]]}
     summaries = [t.metrics()["summary"] for t in trainings]
     plant = "flapping_wing"
-    return Results({plant: [twinning, *halves, *yardsticks]}, {plant: summaries}, {plant: costs}, {plant: errors})
+    return Results({plant: [twinning, *halves, *yardsticks]}, {plant: summaries}, {plant: variants})
 
 
 def test_the_report_says_what_was_found(tmp_path):
@@ -173,9 +177,14 @@ def test_the_report_says_what_was_found(tmp_path):
     assert "Twinning against the classical PD: **better**" in text
     assert "Twinning, other against the classical PD: **worse**" in text
     assert "(4.18 ± 0.01)e-1" in text and "no result" in text and "FIGURE" in text
-    assert "| flapping wing | noise 1 % | 1.5 | 1.429 | – |" in text
-    numbers = report.numbers(found)["flapping_wing"]
-    assert json.loads(json.dumps(numbers))["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
+    (row,) = [line for line in text.splitlines() if line.startswith("| noise 1 % | twinning |")]
+    assert "| 1.500 |" in row
+    assert any(line.startswith("| model error | PD |") and "| 1.000 |" in line for line in text.splitlines())
+    assert "Twinning, noise 1 %: against model based alone **neither better nor worse**" in text
+    assert "against model free alone **better**" in text
+    numbers = json.loads(json.dumps(report.numbers(found)["flapping_wing"]))
+    assert numbers["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
+    assert numbers["variants"]["noise 1 %"]["twinning"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
 
 
 def computed(tmp_path, backend, jobs=2):
@@ -211,9 +220,13 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     violins = charts.robustness(found.entries)
     labels = [label.get_text() for label in violins.axes[0].get_xticklabels()]
     assert labels == ["twinning", "model free", "model based", "twinning,\nother", "PD", "oracle"]
-    harder = charts.variants(found.costs).axes[0]
-    assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %"]
-    assert np.allclose(harder.lines[1].get_ydata(), 1.5 / 1.05)
+    harder = charts.variants(found.entries, found.variants).axes[0]
+    assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %", "model error"]
+    points = [line for line in harder.lines if np.allclose(line.get_xdata(), 0.8)]
+    assert np.allclose([line.get_ydata() for line in points], 1.5, rtol=0.05) and len(points) == 1
+    following = charts.following(found.entries, found.variants).axes[0]
+    assert [line.get_label() for line in following.lines] == ["nominal", "model error"]
+    assert np.allclose(following.lines[1].get_ydata(), [0.05, 0.0105, 0.01])
 
 
 def test_the_page_holds_its_figures(tmp_path):
@@ -238,6 +251,20 @@ def test_every_variant_is_an_option_of_every_recipe(plant):
         assert harder.model_error == (name == "model error")
 
 
+def test_a_system_with_model_error_ends_as_its_recipe_says():
+    turbine, drone, tank = (plants()[name]() for name in ("wind_turbine", "flapping_wing", "cryogenic_tank"))
+    recipes = [RECIPES / f"{name}.py" for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]
+    worn = changed_closure(turbine, recipes[0], ())
+    speeds, pitch = torch.tensor([[7.6]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    features = torch.cat([speeds, pitch], -1)
+    assert worn(features).item() < 0.95 * turbine.closure(features).item()
+    # The drone's real body is the plant's own; it is the twin that believes in a lighter one.
+    assert changed_closure(drone, recipes[1], ()) is None
+    fouled = changed_closure(tank, recipes[2], ("--episodes", "11"))
+    ratio = fouled.log_coefficients.exp() / tank.closure.log_coefficients.exp()
+    assert ratio.tolist() == pytest.approx([1.0, 0.98**10, 1.0])
+
+
 def test_a_plant_that_does_not_exist_is_refused():
     config = recipe("study").Config
     with pytest.raises(ValueError, match="must be all, or some of wind_turbine, flapping_wing, cryogenic_tank"):
@@ -251,10 +278,11 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     assert {key: len(group) for key, group in groups.items() if key[0] == "nominal"} == {
         ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based")
     }
-    assert [key for key in groups if key[0] != "nominal"] == [(v, "twinning") for v in VARIANTS if v != "nominal"]
+    arms = ("twinning", "model_free", "model_based")
+    assert [key for key in groups if key[0] != "nominal"] == [(v, a) for v in VARIANTS if v != "nominal" for a in arms]
     assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
     folders = {t.folder for group in groups.values() for t in group}
-    assert len(folders) == 3 * 3 + 4 * 2
+    assert len(folders) == 3 * 3 + 4 * 3 * 2
     policies = [name for v, name in config.trainings("wind_turbine") if v == "nominal"][3:]
     assert policies == ["twinning, gain-scheduled", "twinning, with bias", "twinning, perceptron"]
     (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]

@@ -5,10 +5,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, caption, legend_below, panels
+from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, TWIN, caption, legend_below, panels
 from rt_torchrl.study.findings import Entry
+from rt_torchrl.study.training import CHANGED
 
 ARMS = {"twinning": REAL, **ROLES}
+ARM_SHIFT = {"twinning": -0.2, "model_based": 0.0, "model_free": 0.2}
 POLICIES = ("#7f3c8d", "#a0522d", "#e75480", "#6b8e23")
 """Colours of twinning with other policies, in their order."""
 YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
@@ -29,11 +31,7 @@ def learning(entries: dict[str, list[Entry]]) -> Figure:
     for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
         for entry in found:
             if entry.curves and entry.curves[0]:
-                length = min(map(len, entry.curves))
-                curves = np.array([curve[:length] for curve in entry.curves])
-                episode, colour = np.arange(1, length + 1), _colours(found)[entry.name]
-                ax.plot(episode, curves.mean(0), color=colour, linewidth=1.8, label=shown(entry.name))
-                ax.fill_between(episode, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0.0)
+                _spread(ax, entry.curves, color=_colours(found)[entry.name], label=shown(entry.name))
             elif entry.name == "oracle":
                 ax.axhline(entry.mean, label="oracle", **REFERENCE_LINE)
             else:
@@ -64,24 +62,60 @@ def robustness(entries: dict[str, list[Entry]]) -> Figure:
     return figure
 
 
-def variants(costs: dict[str, dict[str, list[float]]]) -> Figure:
-    """Mean J_a of twinning under sensor noise and model error over its nominal one, a point for every seed, by plant.
+def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[Entry]]]) -> Figure:
+    """Mean J_a of every arm under sensor noise and model error over twinning's nominal one, a point for every seed.
 
     Args:
-        costs: of each plant and variant, a value for every seed; ``nominal`` is the reference.
+        entries: of each plant as it is.
+        harder: of each plant and variant.
     """
-    title = "Twinning under noise and model error: $J_a$ over the nominal mean"
-    size = (max(7.5, 4.6 * len(costs)), 3.8)
-    figure, axes = panels(1, len(costs), title=title, size=size, sharey=True)
-    for ax, (plant, found) in zip(axes.flat, costs.items(), strict=True):
-        nominal = float(np.mean(found["nominal"]))
-        for column, values in enumerate(found.values()):
-            ax.plot([column] * len(values), np.array(values) / nominal, "o", color=REAL, alpha=0.7)
+    title = "Noise and model error: $J_a$ over twinning's nominal mean; a point for each seed"
+    size = (max(7.5, 4.6 * len(entries)), 4.2)
+    figure, axes = panels(1, len(entries), title=title, size=size, sharey=True)
+    for ax, (plant, nominal) in zip(axes.flat, entries.items(), strict=True):
+        columns = {"nominal": nominal} | harder[plant]
+        unit = next(entry.mean for entry in nominal if entry.name == "twinning")
+        for column, found in enumerate(columns.values()):
+            for arm in (entry for entry in found if entry.name in ARMS):
+                means, place = arm.costs.mean(1) / unit, column + ARM_SHIFT[arm.name]
+                label = shown(arm.name) if column == 0 else None
+                ax.plot([place] * len(means), means, "o", color=ARMS[arm.name], alpha=0.7, markersize=5, label=label)
         ax.axhline(1.0, **REFERENCE_LINE)
-        ax.set_xticks(range(len(found)), list(found), rotation=30, ha="right")
+        ax.set_xticks(range(len(columns)), list(columns), rotation=30, ha="right")
         ax.set_yscale("log")
         caption(ax, shown(plant))
+    legend_below(figure, list(axes.flat))
     return figure
+
+
+def following(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[Entry]]]) -> Figure:
+    """J_p of twinning's twin after each real episode, as the twin knows the system and with model error, by plant.
+
+    Args:
+        entries: of each plant as it is.
+        harder: of each plant and variant; ``model error`` is shown.
+    """
+    size = (max(7.5, 4.6 * len(entries)), 3.8)
+    figure, axes = panels(1, len(entries), title="The twin's error after each real episode", size=size)
+    for ax, (plant, nominal) in zip(axes.flat, entries.items(), strict=True):
+        for label, found, colour in (("nominal", nominal, REAL), (CHANGED, harder[plant][CHANGED], TWIN)):
+            arm = next(entry for entry in found if entry.name == "twinning")
+            _spread(ax, arm.twin_errors, color=colour, label=label)
+        ax.set_yscale("log")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_xlabel("real episodes")
+        caption(ax, f"{shown(plant)}: $J_p$")
+    legend_below(figure, list(axes.flat))
+    return figure
+
+
+def _spread(ax: Axes, curves: list[list[float]], *, color: str, label: str) -> None:
+    """Mean and range over the seeds, as long as all have come."""
+    length = min(map(len, curves))
+    values = np.array([curve[:length] for curve in curves])
+    episode = np.arange(1, length + 1)
+    ax.plot(episode, values.mean(0), color=color, linewidth=1.8, label=label)
+    ax.fill_between(episode, values.min(0), values.max(0), color=color, alpha=0.15, linewidth=0.0)
 
 
 def _bars(ax: Axes, means: list[float]) -> None:

@@ -24,6 +24,7 @@ class Entry:
         J_p_ratio: cost of the twin after over before, of each seed.
         weight_error: greatest relative error of a closure's weight, of each seed.
         curves: mean J_a of the live policy on the unseen episodes after each real episode, a list for each seed.
+        twin_errors: J_p of the twin over the records it holds, after each real episode, a list for each seed.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Entry:
     J_p_ratio: list[float] = field(default_factory=list)
     weight_error: list[float] = field(default_factory=list)
     curves: list[list[float]] = field(default_factory=list)
+    twin_errors: list[list[float]] = field(default_factory=list)
 
     @property
     def mean(self) -> float:
@@ -88,6 +90,7 @@ def arm_entry(name: str, trainings: list[Training]) -> Entry:
         J_p_ratio=[summary["J_p_ratio"] for summary in summaries] if twinned else [],
         weight_error=weight_errors(summaries) if twinned else [],
         curves=[[e["J_a_unseen"] for e in metrics["episodes"] if "J_a_unseen" in e] for metrics in found],
+        twin_errors=[[e["J_p"] for e in metrics["episodes"]] for metrics in found] if twinned else [],
     )
 
 
@@ -95,11 +98,6 @@ def yardstick_entry(name: str, found: dict[str, Any]) -> Entry:
     """An oracle or a classical controller."""
     merit = {quantity: values["mean"] for quantity, values in found["merit"].items()}
     return Entry(name=name, costs=np.array([found["costs"]]), merit=merit)
-
-
-def acting_cost(summary: dict[str, Any]) -> float:
-    """Mean J_a, on the unseen episodes, of the policy that acts at the end of a training."""
-    return summary["unseen"][f"J_a_{summary['live']}"]["mean"]
 
 
 def weight_errors(summaries: list[dict[str, Any]]) -> list[float]:
@@ -118,11 +116,9 @@ def weight_error(closure: dict[str, Any]) -> float | None:
 class Results(NamedTuple):
     """Everything the report is written from, by plant.
 
-    ``entries`` of the tables, ``summaries`` of the nominal twinning runs, and by variant ``costs`` of the acting policy
-    and ``errors`` of the closure's weights, a value for each twinning run.
+    ``entries`` of the tables, ``summaries`` of the nominal twinning runs, and the entries of every ``variants``.
     """
 
     entries: dict[str, list[Entry]]
     summaries: dict[str, list[dict[str, Any]]]
-    costs: dict[str, dict[str, list[float]]]
-    errors: dict[str, dict[str, list[float]]]
+    variants: dict[str, dict[str, list[Entry]]]

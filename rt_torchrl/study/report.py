@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 
 from rt_torchrl.figures.study import shown
-from rt_torchrl.study.findings import Entry, Results, difference
+from rt_torchrl.study import variants
+from rt_torchrl.study.findings import Entry, Results
 from rt_torchrl.study.page import table
+from rt_torchrl.study.rows import COST_HEADER, TWIN_HEADER, compared, cost_cells, merit_cells, twin_cells
 
 CLOSE = 1.05
 """Twinning's mean over the oracle's that counts as having reached it."""
@@ -17,14 +19,12 @@ PAPER = {
 }
 """The paper's table of learning performance: ratios of J_p, of J_a model-based and of J_a model-free."""
 PAPER_TEXT = "Cost after training over the mean cost before, over the seeds of twinning; the paper has five."
-VARIANT_TEXT = (
-    "Sensors that err by a share of what they read, and what the twin does not know: a rotor that is worn from the "
-    "middle of the training on, a body a third heavier than the twin believes, a heat exchanger that fouls."
-)
 CAPTIONS = {
     "learning": "Mean cost of the live policy on unseen episodes after each real episode, with the range of the seeds.",
     "robustness": "Distribution of the cost over the unseen episodes, all seeds together.",
-    "variants": "Twinning under sensor noise and model error, over its nominal cost; a point for each seed.",
+    "variants": "Every arm under sensor noise and model error, over twinning's nominal cost; a point for each seed.",
+    "following": "The twin's error after each real episode, as the twin knows the system and with model error; "
+    "band: range of the seeds.",
 }
 RUN_CAPTIONS = {
     "learning_curves": "Costs, the twin's error and who was live; vertical lines are swaps and clones.",
@@ -57,24 +57,12 @@ PLANT_CAPTIONS = {
 def merit_table(entries: list[Entry]) -> str:
     """Every arm and yardstick of a plant with J_a, its interval, the regret and the plant's own quantities."""
     oracle = next(entry for entry in entries if entry.name == "oracle")
-    header = [
-        "",
-        "J_a",
-        "95 % interval",
-        "over oracle",
-        *oracle.merit,
-        "J_p ratio",
-        "weight error",
-        "episodes to 110 %",
-    ]
+    header = ["", *COST_HEADER, "over oracle", *oracle.merit, *TWIN_HEADER, "episodes to 110 %"]
     rows = []
     for entry in entries:
-        low, high = entry.interval()
-        cells = [shown(entry.name), f"{entry.mean:.4g}", f"{low:.4g} … {high:.4g}", f"{entry.mean / oracle.mean:.3f}"]
-        cells += [f"{value:.4g}" for value in entry.merit.values()]
-        cells += [f"{np.mean(entry.J_p_ratio):.1e}" if entry.J_p_ratio else "–"]
-        cells += [f"{100 * max(entry.weight_error):.2g} %" if entry.weight_error else "–"]
+        cells = [shown(entry.name), *cost_cells(entry), f"{entry.mean / oracle.mean:.3f}"]
         reached = entry.episodes_to(oracle.mean)
+        cells += [*merit_cells(entry), *twin_cells(entry)]
         cells += [", ".join("never" if k is None else str(k) for k in reached) if reached else "–"]
         rows.append(cells)
     return table(header, rows)
@@ -88,17 +76,13 @@ def verdicts(entries: list[Entry]) -> str:
     lines = [f"- Within 5 % of the oracle: **{'yes' if share <= CLOSE else 'no'}** ({share:.3f})."]
     for half in ("model_based", "model_free"):
         if half in named:
-            low, high = difference(twinning, named[half])
-            word = "worse" if low > 0 else "better" if high < 0 else "neither better nor worse"
-            lines.append(f"- Against {shown(half)} alone: **{word}** (difference {low:.3g} … {high:.3g}).")
+            lines.append(f"- Against {shown(half)} alone: {compared(twinning, named[half])}.")
     contenders = [entry for entry in entries if entry.name.startswith("twinning")]
     classical = [entry for entry in entries if not entry.curves and entry.name != "oracle"]
     for contender in contenders:
         for entry in classical:
-            low, high = difference(contender, entry)
-            word = "better" if high < 0 else "worse" if low > 0 else "neither better nor worse"
-            named = f"{shown(contender.name).capitalize()} against the classical {shown(entry.name)}"
-            lines.append(f"- {named}: **{word}** (difference {low:.3g} … {high:.3g}).")
+            pair = f"{shown(contender.name).capitalize()} against the classical {shown(entry.name)}"
+            lines.append(f"- {pair}: {compared(contender, entry)}.")
     return "\n".join(lines)
 
 
@@ -123,19 +107,6 @@ def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:
     return table(header, rows)
 
 
-def variant_table(costs: dict[str, dict[str, list[float]]], errors: dict[str, dict[str, list[float]]]) -> str:
-    """Twinning's mean J_a and the twin's greatest weight error under noise and model error."""
-    header = ["", "", "J_a, mean over seeds", "over nominal", "weight error"]
-    rows = []
-    for plant, found in costs.items():
-        nominal = np.mean(found["nominal"])
-        for variant, values in found.items():
-            error = errors[plant][variant]
-            cells = [shown(plant), variant, f"{np.mean(values):.4g}", f"{np.mean(values) / nominal:.3f}"]
-            rows.append([*cells, f"{100 * max(error):.2g} %" if error else "–"])
-    return table(header, rows)
-
-
 def sections(results: Results, *, figures: list[str], quick: bool, command: str) -> list[str]:
     """The report's Markdown, section by section.
 
@@ -151,8 +122,11 @@ def sections(results: Results, *, figures: list[str], quick: bool, command: str)
     for plant, entries in results.entries.items():
         found += [f"## {shown(plant).capitalize()}", merit_table(entries), verdicts(entries)]
     found += ["## The paper's table of learning performance", PAPER_TEXT, paper_table(results.summaries)]
-    if any(len(costs) > 1 for costs in results.costs.values()):
-        found += ["## Sensor noise and model error", VARIANT_TEXT, variant_table(results.costs, results.errors)]
+    if any(results.variants.values()):
+        found += ["## Sensor noise and model error", variants.TEXT]
+        for plant, harder in results.variants.items():
+            found += [f"### {shown(plant).capitalize()}", variants.merit_table(harder, results.entries[plant])]
+            found += [variants.verdicts(harder)]
     return [*found, "## Figures", *figures]
 
 
@@ -160,19 +134,25 @@ def numbers(results: Results) -> dict[str, Any]:
     """What ``study.json`` holds."""
     return {
         plant: {
-            "entries": {
-                entry.name: {
-                    "J_a": entry.mean,
-                    "confidence_interval": entry.interval(),
-                    "J_a_of_each_seed": entry.costs.mean(1).tolist(),
-                    "merit": entry.merit,
-                    "J_p_ratio": entry.J_p_ratio,
-                    "weight_error": entry.weight_error,
-                    "J_a_unseen": entry.curves,
-                }
-                for entry in entries
+            "entries": {entry.name: figures_of(entry) for entry in entries},
+            "variants": {
+                variant: {entry.name: figures_of(entry) for entry in harder}
+                for variant, harder in results.variants[plant].items()
             },
-            "variants": {"J_a": results.costs[plant], "weight_error": results.errors[plant]},
         }
         for plant, entries in results.entries.items()
+    }
+
+
+def figures_of(entry: Entry) -> dict[str, Any]:
+    """What ``study.json`` holds of a row."""
+    return {
+        "J_a": entry.mean,
+        "confidence_interval": entry.interval(),
+        "J_a_of_each_seed": entry.costs.mean(1).tolist(),
+        "merit": entry.merit,
+        "J_p_ratio": entry.J_p_ratio,
+        "weight_error": entry.weight_error,
+        "J_a_unseen": entry.curves,
+        "J_p": entry.twin_errors,
     }

@@ -11,12 +11,14 @@ import tyro
 from rt_torchrl.algorithm import Arm
 from rt_torchrl.recipe import load_recipe
 
+CHANGED = "model error"
+"""The variant whose real system is not what the twin was made for."""
 VARIANTS: dict[str, tuple[str, ...]] = {
     "nominal": (),
     "noise 0.5 %": ("--noise", "0.005"),
     "noise 1 %": ("--noise", "0.01"),
     "noise 5 %": ("--noise", "0.05"),
-    "model error": ("--model-error",),
+    CHANGED: ("--model-error",),
 }
 """What is made harder, by name, as options of every recipe."""
 

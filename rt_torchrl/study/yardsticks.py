@@ -6,11 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import tyro
+from torch import nn
 
 from rt_torchrl.catalogue import plants
 from rt_torchrl.classical import ClassicalController
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.evaluation import UnseenEpisodes, exact_optimum
+from rt_torchrl.plant import Plant
+from rt_torchrl.recipe import load_recipe
+from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.tuning import tune
 
 TRAINING_SEED = 0
@@ -53,7 +58,15 @@ def oracle(plant: str, path: Path, *, unseen: int, starts: int, iterations: int,
 
 
 def classical(
-    plant: str, kind: type[ClassicalController], path: Path, *, unseen: int, episodes: int, evaluations: int
+    plant: str,
+    kind: type[ClassicalController],
+    path: Path,
+    *,
+    unseen: int,
+    episodes: int,
+    evaluations: int,
+    recipe: Path,
+    options: tuple[str, ...],
 ) -> dict[str, Any]:
     """A classical controller, tuned by a simplex search on training episodes and judged on the unseen ones.
 
@@ -64,9 +77,12 @@ def classical(
         unseen: number of unseen episodes.
         episodes: number of training episodes.
         evaluations: flights of all of them that the search may take.
+        recipe: of the plant.
+        options: of its trainings; with them and its model error it tells how the real system ends.
 
     Returns:
-        ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`.
+        ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`; the same on the system with model error
+        under ``changed``.
     """
 
     def compute() -> dict[str, Any]:
@@ -79,7 +95,20 @@ def classical(
             state = system.draw_initial_state(episodes, generator)
             tune(controller, state, system.draw_exogenous(episodes, generator), evaluations=evaluations)
         judged = UnseenEpisodes(system, unseen, compiled=compiled)
-        found = judged.judge(controller.fly(judged.initial_state, judged.exogenous))
-        return {"gains": controller.named_gains(), "costs": found.control_costs.tolist()} | found.statistics()
+
+        def record(closure: nn.Module | None) -> dict[str, Any]:
+            found = judged.judge(controller.fly(judged.initial_state, judged.exogenous, closure))
+            return {"costs": found.control_costs.tolist()} | found.statistics()
+
+        changed = record(changed_closure(system, recipe, options))
+        return {"gains": controller.named_gains()} | record(None) | {"changed": changed}
 
     return kept(path, compute)
+
+
+def changed_closure(system: Plant, recipe: Path, options: tuple[str, ...]) -> nn.Module | None:
+    """Closure of the real system at the end of a training with model error; None for the plant's own."""
+    module = load_recipe(recipe)
+    config = tyro.cli(module.Config, args=[*VARIANTS[CHANGED], *options]).effective()
+    wear = config.wear(system)
+    return None if wear is None else wear(config.episodes - 1)
