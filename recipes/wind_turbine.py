@@ -17,6 +17,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.wear import worn_table
 from rt_torchrl.model_based import ModelBasedConfig
@@ -56,6 +57,8 @@ class Config(RunConfig):
         turbulence: turbulence intensity σ/U [-].
         wind_files: TurbSim files (.hh or .bts) to draw the wind from instead.
         model_error: from the middle of the training on the rotor is worn: 10 % less lift, 50 % more drag.
+        real: the real system: the plant in simulation, or rosco for the simulator of NREL's ROSCO toolbox, which is
+            then judged on itself and compared with ROSCO's controller; it needs the extra rosco.
     """
 
     policy: Literal["paper", "bias", "mlp", "scheduled"] = "paper"
@@ -65,6 +68,7 @@ class Config(RunConfig):
     turbulence: float = 0.16
     wind_files: tuple[Path, ...] = ()
     model_error: bool = False
+    real: Literal["simulation", "rosco"] = "simulation"
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
     @classmethod
@@ -91,8 +95,11 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
-    baselines = {"Jonkman": JonkmanController}
-    Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines).train()
+    plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
+    if config.real == "rosco":
+        env = rosco_turbine(plant, seed=config.seed, device=config.device)
+        system = {"env": env, "baselines": {"ROSCO": RoscoController}}
+    Run(config, plant, plant_figures=figures.figures_of, **system).train()
 
 
 if __name__ == "__main__":

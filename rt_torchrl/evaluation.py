@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 from torch import Tensor, nn
 
+from rt_torchrl.classical import ClassicalController
 from rt_torchrl.descent import Descent, DescentConfig
 from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import Rollout, Trajectory, control_cost, identification_cost
@@ -52,6 +53,10 @@ class UnseenEpisodes:
         """The episodes under a policy, on the real system."""
         rollout = Rollout(self.plant, self.closure, policy, compiled=self._compiled)
         return rollout(self.initial_state, self.exogenous)
+
+    def fly_baseline(self, law: ClassicalController) -> Trajectory:
+        """The episodes under a classical controller, on the system as it is."""
+        return law.fly(self.initial_state, self.exogenous, self.closure)
 
     def exogenous_of(self, flown: Trajectory) -> Float[Tensor, "count n n_z"]:
         """What acted from outside in the episodes as flown."""

@@ -1,11 +1,15 @@
 """Unseen episodes on a real system whose true closure nobody knows."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from jaxtyping import Bool, Float
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from rt_torchrl.classical import ClassicalController
 from rt_torchrl.evaluation import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.plant import Plant
 from rt_torchrl.real_system import RealSystem
 from rt_torchrl.trajectory import Trajectory
 
@@ -14,6 +18,27 @@ class Flown(Trajectory):
     """A trajectory as measured, with the exogenous input that acted in it."""
 
     exogenous: Float[Tensor, "count n n_z"]
+
+
+class RealController(nn.Module, ABC):
+    """A controller that can only be flown on the real system.
+
+    Args:
+        plant: physics and control problem of the twin.
+        compiled: compile what can be.
+    """
+
+    def __init__(self, plant: Plant, *, compiled: bool = False):
+        super().__init__()
+        self.plant = plant
+
+    @abstractmethod
+    def fly_real(self, count: int, *, seed: int) -> Flown:
+        """As many episodes of the sequence that belongs to a seed."""
+
+
+Baseline = ClassicalController | RealController
+"""What policies are compared with: on the plant, or on a real system of which no closure is known."""
 
 
 class RealEpisodes(UnseenEpisodes):
@@ -39,6 +64,9 @@ class RealEpisodes(UnseenEpisodes):
     def untrained_cost(self, policy: nn.Module) -> float:
         """J_a of one episode: that of a random policy is a matter of its order of size."""
         return self.judge(self._flown(policy, 1)).control_costs.mean().item()
+
+    def fly_baseline(self, law: RealController) -> Flown:
+        return law.fly_real(self._count, seed=UNSEEN_SEED)
 
     @torch.no_grad()
     def _flown(self, policy: nn.Module, count: int) -> Flown:

@@ -101,6 +101,11 @@ def in_units(values: Tensor, scale: float | Sequence[float], offset: float | Seq
     return torch.as_tensor(offset, **like) + torch.as_tensor(scale, **like) * values
 
 
+def episode_seed(seed: int, number: int) -> int:
+    """What a real system is seeded with for an episode, from 0, of the sequence that belongs to a seed."""
+    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0] >> 1)
+
+
 class RealSystem(EnvBase):
     """An environment that somebody else wrote, with the entries of a :class:`PlantEnv`.
 
@@ -209,8 +214,7 @@ class RealSystem(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         if self._seed is not None:
             # Of the episode, not of the reset: a collector may reset more than once before it steps.
-            state = np.random.SeedSequence((self._seed, self._episodes)).generate_state(1)
-            self.env.set_seed(int(state[0] >> 1), static_seed=True)
+            self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
         self._reported, self._step_count = self.env.reset(), 0
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64)
         return self._entries(applied, ended=False)

@@ -8,8 +8,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.classical import ClassicalController
 from rt_torchrl.evaluation import Judged, Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.real_episodes import Baseline
 from rt_torchrl.switching import Role
 from rt_torchrl.visited import rms_error, visited_features
 
@@ -43,14 +43,10 @@ def progress(record: dict[str, Any]) -> str:
 
 
 @torch.no_grad()
-def judge(
-    unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, ClassicalController]
-) -> dict[str, Judged]:
+def judge(unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, Baseline]) -> dict[str, Judged]:
     """Both policies, then the classical controllers, on the unseen episodes of the system as it is."""
     judged = {role: unseen.judge(unseen.fly(policies[role])) for role in ROLES}
-    episodes = unseen.initial_state, unseen.exogenous, unseen.closure
-    flown = {name: law.fly(*episodes) for name, law in baselines.items()}
-    return judged | {name: unseen.judge(trajectory) for name, trajectory in flown.items()}
+    return judged | {name: unseen.judge(unseen.fly_baseline(law)) for name, law in baselines.items()}
 
 
 @torch.no_grad()

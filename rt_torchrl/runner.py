@@ -18,14 +18,13 @@ from tqdm import tqdm
 
 from rt_torchrl import checkpoint, figures, report
 from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.classical import ClassicalController
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.dashboard import Dashboard
 from rt_torchrl.environment import PlantEnv
 from rt_torchrl.evaluation import Judged, UnseenEpisodes, exact_optimum, untrained_costs
 from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
-from rt_torchrl.real_episodes import RealEpisodes
+from rt_torchrl.real_episodes import Baseline, RealController, RealEpisodes
 from rt_torchrl.real_system import RealSystem
 from rt_torchrl.run_config import RunConfig
 from rt_torchrl.snapshot import Snapshot
@@ -45,7 +44,8 @@ class Run:
             the live one again for the twin), and one for each of twenty random starts.
         believed: the twin's physics where they are not those of the real system; None where they are.
         plant_figures: figures only this plant has.
-        baselines: classical controllers to judge beside the policies, by name.
+        baselines: controllers to judge beside the policies, by name: classical ones, or with an ``env`` of unknown
+            closure a :class:`RealController`.
         animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
@@ -61,7 +61,7 @@ class Run:
         env: RealSystem | None = None,
         believed: Plant | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
-        baselines: dict[str, type[ClassicalController]] | None = None,
+        baselines: dict[str, type[Baseline]] | None = None,
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
@@ -215,7 +215,7 @@ def judged_on(
 
 
 def require_simulation(
-    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[ClassicalController]] | None
+    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
 ) -> None:
     """Refuse with a real system what only a plant in simulation can do.
 
@@ -226,10 +226,11 @@ def require_simulation(
         return
     if config.noise or config.wear(plant) is not None:
         raise ValueError(f"noise={config.noise} and wear are of a plant in simulation; this run has a real system.")
-    if env.closure is None and (config.reference or baselines):
+    on_the_plant = [name for name, law in (baselines or {}).items() if not issubclass(law, RealController)]
+    if env.closure is None and (config.reference or on_the_plant):
         raise ValueError(
-            "reference and baselines are flown on the plant under the true closure, and the real system's is not "
-            "known; leave them out, or give the RealSystem its closure."
+            f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "
+            "and the real system's is not known; leave them out, or give the RealSystem its closure."
         )
 
 

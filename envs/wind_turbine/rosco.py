@@ -1,0 +1,260 @@
+"""NREL's ROSCO simulator of the 5-MW turbine as a real system, and ROSCO's own controller to compare with.
+
+The simulator owns its loop and calls a controller; here that call is answered by a policy. See
+https://github.com/NREL/ROSCO; Apache License 2.0.
+"""
+
+import contextlib
+import io
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rt_torchrl.calling_simulator import CallingSimulator, Controller
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.real_episodes import Flown, RealController
+from rt_torchrl.real_system import Reading, RealSystem, episode_seed
+
+STEP = 0.1
+"""Time step of ROSCO's simulator, which integrates the rotor by Euler's method [s]."""
+
+
+@cache
+def rosco() -> ModuleType:
+    """The toolbox, with its modules.
+
+    Raises:
+        ValueError: if it is not installed.
+    """
+    try:
+        import rosco
+        from rosco.toolbox import control_interface, controller, sim, turbine, utilities  # noqa: F401
+        from rosco.toolbox.inputs import validation  # noqa: F401
+    except ImportError as error:
+        raise ValueError(
+            "the real system of ROSCO needs its toolbox: install the extra, pip install 'rt_torchrl[rosco]'."
+        ) from error
+    return rosco
+
+
+def examples() -> Path:
+    """Where ROSCO's package keeps the reference turbines."""
+    return Path(rosco().__file__).parent.parent / "Examples"
+
+
+@cache
+def parameters() -> dict[str, Any]:
+    """ROSCO's own tuning input of the NREL 5-MW turbine."""
+    return rosco().toolbox.inputs.validation.load_rosco_yaml(str(examples() / "Tune_Cases" / "NREL5MW.yaml"))
+
+
+@cache
+def nrel5mw() -> Any:
+    """ROSCO's model of the turbine, read from its OpenFAST input."""
+    case = examples() / "Test_Cases" / "NREL-5MW"
+    with contextlib.redirect_stdout(io.StringIO()):
+        turbine = rosco().toolbox.turbine.Turbine(parameters()["turbine_params"])
+        table = str(case / "Cp_Ct_Cq.NREL5MW.txt")
+        turbine.load_from_fast("NREL-5MW.fst", str(case), rot_source="txt", txt_filename=table)
+    turbine.table = table
+    return turbine
+
+
+class Instruments:
+    """The state of the plant as it is measured: rotor speed and actuators as told, the filters run along.
+
+    Args:
+        plant: whose filters these are.
+        state: at the start of the episode; filters and actuators begin there.
+    """
+
+    def __init__(self, plant: WindTurbine, state: Tensor):
+        self.plant, self.state = plant, state.clone()
+        self._filters = [k for k, s in enumerate(plant.states) if s.name not in ("rotor_speed", *MEASURED)]
+
+    def start(self, rotor_speed: float) -> None:
+        self.state[0] = rotor_speed
+
+    def advance(self, rotor_speed: float, wind: float) -> None:
+        """Over one step of the simulator, under the wind that acted in it: the filters by Heun's method."""
+        before, after = self.state, self.state.clone()
+        after[0] = rotor_speed
+        slope = self._slope(before, wind)
+        after[self._filters] += STEP * slope
+        after[self._filters] += 0.5 * STEP * (self._slope(after, wind) - slope)
+        self.state = after
+
+    def _slope(self, state: Tensor, wind: float) -> Tensor:
+        exogenous = state.new_tensor([wind])
+        rate = self.plant.vector_field(state.new_zeros(()), state, state[4:6], exogenous, self.plant.closure)
+        return rate[self._filters]
+
+    def latch(self, applied: Tensor) -> None:
+        """Remember what the actuators are told."""
+        self.state = self.plant.latch(self.state, applied)
+
+
+MEASURED = ("generator_torque", "blade_pitch")
+"""States of the plant that are the actuators'."""
+
+
+class Answer:
+    """Stands where ROSCO's simulator expects its interface to a compiled controller.
+
+    Args:
+        plant: the twin's physics, whose signals and actuators these are.
+        start: state at the start of the episode.
+        wind: of every control interval [m/s].
+        decide: (torque [N m], pitch [deg]) to apply from a state, the wind of the interval to come, and what the
+            simulator tells; asked every ``every`` steps, and in between what was applied is held.
+        every: steps of the simulator between two decisions.
+    """
+
+    def __init__(
+        self,
+        plant: WindTurbine,
+        start: Tensor,
+        wind: np.ndarray,
+        decide: Callable[[Tensor, float, Mapping[str, Any]], Tensor],
+        every: int,
+    ):
+        self.plant, self._instruments, self._wind = plant, Instruments(plant, start), wind
+        self._decide, self._every, self._step = decide, every, 0
+
+    def call_controller(self, told: Mapping[str, Any]) -> tuple[float, float, float]:
+        """Torque [N m], pitch [rad] and yaw rate [rad/s], as ROSCO's interface returns them."""
+        speed = float(told["rot_speed"])
+        if self._step == 0:
+            self._instruments.start(speed)
+        else:
+            self._instruments.advance(speed, float(told["ws"]))
+        if self._step % self._every == 0:
+            k = min(self._step // self._every, len(self._wind) - 1)
+            self._instruments.latch(self._decide(self._instruments.state, float(self._wind[k]), told))
+        self._step += 1
+        torque, pitch = self._instruments.state[4:6].tolist()
+        share = self.plant.cut_in(torch.tensor(self.plant.gear_ratio * speed, dtype=torch.float64)).item()
+        return torque * share, math.radians(pitch), 0.0
+
+    def kill_discon(self) -> None:
+        """Nothing to unload."""
+
+
+def simulate(plant: WindTurbine, seed: int, answer: Callable[[Tensor, np.ndarray], Any]) -> None:
+    """One episode of ROSCO's simulator, with start and wind as the plant draws them from a seed.
+
+    Args:
+        plant: the twin's physics.
+        seed: of the episode.
+        answer: makes the controller interface from start state and wind.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    start = plant.draw_initial_state(1, generator)[0]
+    wind = plant.draw_exogenous(1, generator)[0, :, 0].numpy()
+    # The simulator moves once before its first call and the wind of a step stands at its end.
+    series = np.concatenate([wind[:1], wind[:1], wind.repeat(steps_of(plant))])
+    interface = answer(start, wind)
+    simulator = rosco().toolbox.sim.Sim(nrel5mw(), interface)
+    with torch.no_grad():
+        simulator.sim_ws_series(
+            STEP * np.arange(len(series)), series, rotor_rpm_init=start[0].item() * 30.0 / math.pi, make_plots=False
+        )
+
+
+def steps_of(plant: WindTurbine) -> int:
+    """Steps of the simulator in a control interval.
+
+    Raises:
+        ValueError: if the interval is no multiple of a step.
+    """
+    steps = round(plant.dt / STEP)
+    if steps < 1 or not math.isclose(steps * STEP, plant.dt):
+        raise ValueError(f"dt={plant.dt} s must be a multiple of the {STEP} s of ROSCO's simulator, such as 0.5.")
+    return steps
+
+
+def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | str = "cpu") -> RealSystem:
+    """The real system. Ranges and rates of the actuators are the plant's, because ROSCO's simulator has none.
+
+    Args:
+        plant: the twin's physics; start and wind of every episode are as it draws them.
+        seed: of the episodes.
+        device: where its entries go.
+
+    Raises:
+        ValueError: if ROSCO is not installed, or the plant's control interval does not fit.
+    """
+    every = steps_of(plant)
+    rosco()
+
+    def run(seed: int, controller: Controller) -> None:
+        def decide(state: Tensor, wind: float, told: Mapping[str, Any]) -> Tensor:
+            command = controller({"state": state.numpy(), "wind": [wind]})
+            return plant.actuate(state, torch.from_numpy(command))
+
+        simulate(plant, seed, lambda start, wind: Answer(plant, start, wind, decide, every))
+
+    env = CallingSimulator(run, {"state": len(plant.states), "wind": 1}, plant.actions)
+    wind = Reading(keys=("wind",))
+    return RealSystem(env, plant, state=Reading(keys=("state",)), exogenous=wind, seed=seed, device=device)
+
+
+class RoscoController(RealController):
+    """ROSCO's compiled controller, as ROSCO tunes it for this turbine, in ROSCO's simulator.
+
+    It decides at every step of the simulator; what counts as applied in a control interval is what it asks for at the
+    start of it. For its arguments see :class:`RealController`.
+    """
+
+    def fly_real(self, count: int, *, seed: int) -> Flown:
+        """The episodes that :func:`rosco_turbine` runs from the same seed."""
+        found = [self._episode(episode_seed(seed, number)) for number in range(count)]
+        states, applied, wind = (torch.stack(part) for part in zip(*found, strict=True))
+        flown = Flown(states, applied)
+        flown.exogenous = wind.unsqueeze(-1)
+        return flown
+
+    def _episode(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+        """States, applied actions and wind at every control interval."""
+        every = steps_of(self.plant)
+        states, applied, winds = [], [], []
+        with tempfile.TemporaryDirectory() as folder:
+            interface = controller_interface(Path(folder))
+
+            def decide(state: Tensor, wind: float, told: Mapping[str, Any]) -> Tensor:
+                torque, pitch, _ = interface.call_controller(told)
+                states.append(state)
+                applied.append(torch.tensor([torque, math.degrees(pitch)], dtype=torch.float64))
+                winds.append(wind)
+                return applied[-1]
+
+            simulate(self.plant, seed, lambda start, wind: Answer(self.plant, start, wind.repeat(every), decide, 1))
+            with contextlib.redirect_stdout(io.StringIO()):
+                interface.kill_discon()
+        wind = torch.tensor(winds[::every][:-1], dtype=torch.float64)
+        return torch.stack(states[::every]), torch.stack(applied[::every])[:-1], wind
+
+
+def controller_interface(folder: Path) -> Any:
+    """ROSCO's controller, tuned by ROSCO, with its inputs and logs in a folder.
+
+    The wind is measured, not estimated: ROSCO's simulator is known to upset the estimators.
+    """
+    toolbox, path = rosco().toolbox, str(folder / "DISCON.IN")
+    with contextlib.redirect_stdout(io.StringIO()):
+        controller = toolbox.controller.Controller(
+            parameters()["controller_params"] | {"WE_Mode": 0, "LoggingLevel": 0}
+        )
+        controller.tune_controller(nrel5mw())
+        toolbox.utilities.write_DISCON(nrel5mw(), controller, param_file=path, txt_filename=nrel5mw().table)
+        return toolbox.control_interface.ControllerInterface(
+            rosco().discon_lib_path, param_filename=path, sim_name=str(folder / "rosco"), DT=STEP
+        )

@@ -1,0 +1,92 @@
+"""ROSCO's simulator of the same turbine: against our plant, as a real system, and under ROSCO's own controller."""
+
+import pytest
+import torch
+
+from rt_torchrl.envs.wind_turbine import rosco as adapter
+from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine, steps_of
+from rt_torchrl.real_episodes import RealEpisodes
+from rt_torchrl.real_system import episode_seed
+
+HORIZON = 60.0
+
+
+@pytest.fixture(scope="module")
+def rosco():
+    return pytest.importorskip("rosco")
+
+
+class Held(torch.nn.Module):
+    """One command whatever is seen."""
+
+    def forward(self, observation):
+        return observation.new_tensor([35e3, 2.0]).expand(*observation.shape[:-1], 2)
+
+
+def flown(plant, command, seed=0):
+    """An episode of ROSCO's simulator under a constant command."""
+    system = rosco_turbine(plant, seed=seed)
+    held = torch.tensor([command], dtype=torch.float64)
+    return system.rollout(plant.n_steps, lambda td: td.set("action", held))[0]
+
+
+@pytest.mark.parametrize("kind", [WindTurbine, InstrumentedTurbine])
+def test_our_plant_goes_where_rosco_goes(rosco, kind, monkeypatch):
+    """Two codes, one turbine: they part by the error of ROSCO's Euler steps, which is of first order."""
+    plant = kind(horizon=HORIZON, inertia=float(nrel5mw().J))
+    t, errors = torch.zeros(1, dtype=torch.float64), []
+    for step in (0.1, 0.05):
+        monkeypatch.setattr(adapter, "STEP", step)
+        real = flown(plant, [35e3, 4.0])
+        state = real["state"][:1]
+        for k in range(plant.n_steps):
+            command, wind = real["action"][k : k + 1], real["exogenous"][k : k + 1]
+            state = plant.step(t, state, command, wind, plant.closure).state
+        errors.append(state[0] - real["next", "state"][-1])
+    moved = (real["next", "state"][-1] - real["state"][0]).abs()
+    coarse, fine = errors
+    assert moved[0] > 0.2 and abs(fine[0]) < 1e-3
+    held = [0, 1, 3] if kind is WindTurbine else [0, 1, 3, 6]
+    assert torch.allclose(coarse[held] / fine[held], torch.tensor(2.0).double(), atol=0.1)
+    # What is left where the step is taken to zero.
+    assert ((2.0 * fine - coarse)[held].abs() < 0.02 * coarse[held].abs()).all()
+    assert fine[2].abs() < 1e-4 and (fine[4:6] == 0.0).all()
+
+
+def test_actuators_are_as_slow_as_the_plants(rosco):
+    plant = WindTurbine(horizon=5.0)
+    real = flown(plant, [43_000.0, 20.0])
+    pitch = real["next", "applied"][:, 1]
+    assert torch.allclose(pitch[:5], torch.tensor([4.0, 8.0, 12.0, 16.0, 20.0], dtype=torch.float64))
+
+
+def test_an_episode_is_known_by_its_seed_and_has_the_plants_wind(rosco):
+    plant = WindTurbine(horizon=5.0)
+    first, again, other = (flown(plant, [20e3, 0.0], seed) for seed in (1, 1, 2))
+    assert torch.equal(first["state"], again["state"]) and not torch.equal(first["state"], other["state"])
+    generator = torch.Generator().manual_seed(episode_seed(1, 0))
+    plant.draw_initial_state(1, generator)
+    assert torch.equal(first["exogenous"], plant.draw_exogenous(1, generator)[0])
+
+
+def test_roscos_controller_holds_the_speed_and_the_power(rosco):
+    """600 s of 11 m/s with 16 % turbulence: some 4.2 MW, as Jonkman's controller, with the speed held at rated."""
+    plant = WindTurbine()
+    unseen = RealEpisodes(rosco_turbine(plant), 2)
+    found = unseen.fly_baseline(RoscoController(plant))
+    power = plant.generator_power(found.states[:, :-1], found.actions)
+    assert found.states.shape == (2, plant.n_steps + 1, 6)
+    assert 3.8e6 < power.mean() < 4.6e6
+    speed = plant.gear_ratio * found.states[..., 0]
+    assert 100.0 < speed.mean() < 125.0 and speed.max() < 1.2 * plant.rated_generator_speed
+    # The same winds as a policy gets.
+    other = unseen.fly(Held())
+    assert torch.equal(other.exogenous, found.exogenous)
+    assert torch.equal(other.states[:, 0, 0], found.states[:, 0, 0])
+
+
+def test_an_interval_that_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="dt=0.25 s must be a multiple of the 0.1 s"):
+        steps_of(WindTurbine(dt=0.25))
