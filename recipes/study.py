@@ -22,7 +22,7 @@ from rt_torchrl.runner import main_of
 from rt_torchrl.study import page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.yardsticks import classical, oracle
+from rt_torchrl.study.yardsticks import classical, cost_along_gain, oracle
 
 ARMS = ("twinning", "model_free", "model_based")
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
@@ -36,8 +36,16 @@ POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
         "twinning, with bias": ("--policy", "bias"),
         "twinning, perceptron": ("--policy", "mlp"),
     },
+    "flapping_wing": {"twinning, perceptron": ("--policy", "mlp")},
 }
 """Policies beside a plant's own that twinning trains too, as options of its recipe."""
+
+EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
+"""Real episodes of a training, of every arm alike; more leave drone and tank where they are."""
+GAIN_LINES: dict[str, type[ClassicalController]] = {"cryogenic_tank": PIValve}
+"""Controllers whose cost over their first gain is drawn."""
+MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
+"""Of the default gain, for these."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +91,9 @@ class Config:
         """Where what is computed is kept; short trainings apart, or the whole study would take them for its own."""
         return self.folder / "quick" if self.quick else self.folder
 
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Options of every training."""
-        return ("--quick",) if self.quick else ("--unseen", str(self.unseen))
+    def options_of(self, plant: str) -> tuple[str, ...]:
+        """Options of every training of a plant."""
+        return ("--quick",) if self.quick else ("--unseen", str(self.unseen), "--episodes", str(EPISODES[plant]))
 
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Of a plant: those of every variant and arm, a list over the seeds."""
@@ -95,7 +102,7 @@ class Config:
 
         def every(arm: str, variant: str, count: int, *further: str, folder: str = "") -> list[Training]:
             place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
-            every_option = (*self.options, "--unseen-every", "1", *further)
+            every_option = (*self.options_of(plant), "--unseen-every", "1", *further)
             common = {"recipe": recipe_of(plant), "arm": arm, "variant": variant, "options": every_option}
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
@@ -112,11 +119,19 @@ class Config:
         starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
         best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
         tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
-        tuned |= {"recipe": recipe_of(plant), "options": self.options}
+        tuned |= {"recipe": recipe_of(plant), "options": self.options_of(plant)}
         found = {"oracle": partial(oracle, plant, place / "oracle.json", **best)}
         for name, kind in CONTROLLERS[plant].items():
             found[name] = partial(classical, plant, kind, place / f"{name}.json", **tuned)
         return found
+
+    def gain_line(self, plant: str) -> Callable[[], dict[str, Any]] | None:
+        """The cost of a classical controller over its first gain, where that explains something; kept too."""
+        if plant not in GAIN_LINES:
+            return None
+        path = self.kept / "yardsticks" / plant / "gain-line.json"
+        unseen = QUICK_UNSEEN if self.quick else self.unseen
+        return partial(cost_along_gain, plant, GAIN_LINES[plant], path, unseen=unseen, multiples=MULTIPLES)
 
 
 def recipe_of(plant: str) -> Path:
@@ -127,6 +142,7 @@ def recipe_of(plant: str) -> Path:
 def compute(config: Config) -> None:
     """Everything that is not done yet, side by side, with one progress bar."""
     tasks = [task for plant in config.chosen() for task in config.yardsticks(plant).values()]
+    tasks += [line for plant in config.chosen() if (line := config.gain_line(plant))]
     for plant in reversed(config.chosen()):  # the longest first
         tasks += [training.run for group in config.trainings(plant).values() for training in group]
     side_by_side(tasks, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
@@ -192,6 +208,11 @@ def draw(config: Config, results: Results) -> list[str]:
         figure.savefig(folder / f"{name}.png", dpi=110)
         found.append(page.figure(folder / f"{name}.png", config.folder, report.CAPTIONS[name]))
     for plant in config.chosen():
+        if line := config.gain_line(plant):
+            charts.gain_line(line(), results.entries[plant]).savefig(folder / f"{plant}_gain_line.png", dpi=110)
+            found.append(
+                page.figure(folder / f"{plant}_gain_line.png", config.folder, report.GAIN_LINE_CAPTIONS[plant])
+            )
         first = config.trainings(plant)["nominal", "twinning"][0].folder / "figures"
         for name, text in (report.RUN_CAPTIONS | report.PLANT_CAPTIONS[plant]).items():
             copy = folder / f"{plant}_{name}.png"

@@ -224,6 +224,10 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     assert [label.get_text() for label in harder.get_xticklabels()] == ["nominal", "noise 1 %", "model error"]
     points = [line for line in harder.lines if np.allclose(line.get_xdata(), 0.8)]
     assert np.allclose([line.get_ydata() for line in points], 1.5, rtol=0.05) and len(points) == 1
+    line = {"name": "K_P", "unit": "-", "values": [1.0, 10.0], "costs": [2.0, 1.0]}
+    (axes,) = charts.gain_line(line, found.entries["flapping_wing"]).axes
+    assert [drawn.get_label() for drawn in axes.lines[1:]] == ["twinning", "PD", "oracle"]
+    assert np.allclose(axes.lines[1].get_ydata(), found.entries["flapping_wing"][0].mean)
     following = charts.following(found.entries, found.variants).axes[0]
     assert [line.get_label() for line in following.lines] == ["nominal", "model error"]
     assert np.allclose(following.lines[1].get_ydata(), [0.05, 0.0105, 0.01])
@@ -276,13 +280,13 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     config = recipe("study").Config(seeds=3, variant_seeds=2, folder=tmp_path)
     groups = config.trainings("flapping_wing")
     assert {key: len(group) for key, group in groups.items() if key[0] == "nominal"} == {
-        ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based")
+        ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based", "twinning, perceptron")
     }
     arms = ("twinning", "model_free", "model_based")
     assert [key for key in groups if key[0] != "nominal"] == [(v, a) for v in VARIANTS if v != "nominal" for a in arms]
     assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
     folders = {t.folder for group in groups.values() for t in group}
-    assert len(folders) == 3 * 3 + 4 * 3 * 2
+    assert len(folders) == 3 * 4 + 4 * 3 * 2
     policies = [name for v, name in config.trainings("wind_turbine") if v == "nominal"][3:]
     assert policies == ["twinning, gain-scheduled", "twinning, with bias", "twinning, perceptron"]
     (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]

@@ -1,5 +1,7 @@
 """Figures of the study: how arms learn, and how they do on the unseen episodes."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,6 +15,7 @@ ARMS = {"twinning": REAL, **ROLES}
 ARM_SHIFT = {"twinning": -0.2, "model_based": 0.0, "model_free": 0.2}
 POLICIES = ("#7f3c8d", "#a0522d", "#e75480", "#6b8e23")
 """Colours of twinning with other policies, in their order."""
+DASHES = ("--", ":", "-.", (0, (1, 1)), (0, (8, 1)))
 YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
 WIDEST_LINEAR = 5.0
 """Ratio of the greatest to the least cost above which an axis is logarithmic."""
@@ -106,6 +109,27 @@ def following(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[
         ax.set_xlabel("real episodes")
         caption(ax, f"{shown(plant)}: $J_p$")
     legend_below(figure, list(axes.flat))
+    return figure
+
+
+def gain_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
+    """J_a of a classical controller over one of its gains, between the arms and yardsticks of the plant.
+
+    Args:
+        found: as :func:`rt_torchrl.study.yardsticks.cost_along_gain` returns it.
+        entries: of the plant; twinning, oracle and the classical controllers are drawn as levels.
+    """
+    figure, axes = panels(1, title=f"Cost over {found['name']}, all else as it is", size=(8.0, 4.0))
+    ax = axes[0, 0]
+    ax.plot(found["values"], found["costs"], "o-", color=REAL, markersize=4)
+    levels = [entry for entry in entries if entry.name in ("twinning", "oracle") or not entry.curves]
+    for k, entry in enumerate(levels):
+        line = {"linestyle": DASHES[k % len(DASHES)], "color": _colours(entries)[entry.name], "linewidth": 1.2}
+        ax.axhline(entry.mean, label=shown(entry.name), **line)
+    ax.set_xscale("log")
+    ax.set_xlabel(f"{found['name']} [{found['unit']}]")
+    caption(ax, "$J_a$")
+    legend_below(figure, [ax])
     return figure
 
 

@@ -53,6 +53,20 @@ PLANT_CAPTIONS = {
 }
 """What the figures of a plant's own show."""
 
+GAIN_LINE_CAPTIONS = {
+    "cryogenic_tank": "Cost of a proportional vent over its gain. Far on the right it only opens and shuts, as the "
+    "on-off valve does.",
+}
+CAUSES = {
+    "wind_turbine": "The paper's policy has no bias: without an error it asks for half of the greatest torque and of "
+    "the greatest pitch, whatever its weights. The other policies are trained in the same way and need not.",
+    "cryogenic_tank": "A vent that is either shut or fully open loses less gas for the same heat than one that is "
+    "half open. A law of the pressure error can do that only by chattering, at a gain some thousand times that of its "
+    "best smooth form, and costs more at the gains in between (see the figure over K_P): a descent from a smooth law, "
+    "twinning's or the oracle's, ends on the near side.",
+}
+"""Why a plant's policy falls short of a classical controller."""
+
 
 def merit_table(entries: list[Entry]) -> str:
     """Every arm and yardstick of a plant with J_a, its interval, the regret and the plant's own quantities."""
@@ -121,6 +135,7 @@ def sections(results: Results, *, figures: list[str], quick: bool, command: str)
         found.append("**Made with `--quick`, from short trainings: the report's form, but no result.**")
     for plant, entries in results.entries.items():
         found += [f"## {shown(plant).capitalize()}", merit_table(entries), verdicts(entries)]
+        found += [CAUSES[plant]] if plant in CAUSES else []
     found += ["## The paper's table of learning performance", PAPER_TEXT, paper_table(results.summaries)]
     if any(results.variants.values()):
         found += ["## Sensor noise and model error", variants.TEXT]

@@ -1,7 +1,8 @@
 """What trainings are measured against: the best that a class of policies can do, and tuned classical controllers."""
 
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,11 +98,42 @@ def classical(
         judged = UnseenEpisodes(system, unseen, compiled=compiled)
 
         def record(closure: nn.Module | None) -> dict[str, Any]:
-            found = judged.judge(controller.fly(judged.initial_state, judged.exogenous, closure))
+            judged.closure = system.closure if closure is None else closure
+            found = judged.judge(judged.fly_baseline(controller))
             return {"costs": found.control_costs.tolist()} | found.statistics()
 
         changed = record(changed_closure(system, recipe, options))
         return {"gains": controller.named_gains()} | record(None) | {"changed": changed}
+
+    return kept(path, compute)
+
+
+def cost_along_gain(
+    plant: str, kind: type[ClassicalController], path: Path, *, unseen: int, multiples: Sequence[float]
+) -> dict[str, Any]:
+    """J_a of a classical controller over its first gain, the others as by default: a line through the landscape.
+
+    Args:
+        plant: folder of the plant under envs.
+        kind: of the controller.
+        path: file to keep the result in.
+        unseen: number of unseen episodes.
+        multiples: of the default gain.
+
+    Returns:
+        ``name`` and ``unit`` of the gain, its ``values`` and mean ``costs``.
+    """
+
+    def compute() -> dict[str, Any]:
+        torch.set_num_threads(1)
+        system, compiled = plants()[plant](), missing_for_compilation() is None
+        judged, controller = UnseenEpisodes(system, unseen, compiled=compiled), kind(system, compiled=compiled)
+        values, costs = [kind.default_gains[0] * multiple for multiple in multiples], []
+        for value in values:
+            controller.log_gains[0] = math.log(value)
+            costs.append(judged.judge(judged.fly_baseline(controller)).control_costs.mean().item())
+        name, unit = next(iter(kind.gain_units.items()))
+        return {"name": name, "unit": unit, "values": values, "costs": costs}
 
     return kept(path, compute)
 
