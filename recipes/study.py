@@ -143,8 +143,10 @@ def compute(config: Config) -> None:
     """Everything that is not done yet, side by side, with one progress bar."""
     tasks = [task for plant in config.chosen() for task in config.yardsticks(plant).values()]
     tasks += [line for plant in config.chosen() if (line := config.gain_line(plant))]
-    for plant in reversed(config.chosen()):  # the longest first
-        tasks += [training.run for group in config.trainings(plant).values() for training in group]
+    groups = [item for plant in reversed(config.chosen()) for item in config.trainings(plant).items()]
+    # The plant that takes longest first, and what the other results are measured by before what is made harder.
+    for _, group in sorted(groups, key=lambda item: item[0][0] != "nominal"):
+        tasks += [training.run for training in group]
     side_by_side(tasks, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
 
 
