@@ -60,8 +60,8 @@ GAIN_LINE_CAPTIONS = {
 CAUSES = {
     "wind_turbine": "The paper's policy has no bias: without an error it asks for half of the greatest torque and of "
     "the greatest pitch, whatever its weights. The other policies are trained in the same way and need not.",
-    "flapping_wing": "The paper's policy and a PD law around trim are the same affine law, one planned on the few gusts "
-    "that a training has met, one searched on twenty. The perceptron is trained as the paper's policy is.",
+    "flapping_wing": "The paper's policy and a PD law around trim are the same affine law, one planned on the few "
+    "gusts that a training has met, one searched on twenty. The perceptron is trained as the paper's policy is.",
     "cryogenic_tank": "A vent that is either shut or fully open loses less gas for the same heat than one that is "
     "half open. A law of the pressure error can do that only by chattering, at a gain some thousand times that of its "
     "best smooth form, and costs more at the gains in between (see the figure over K_P): a descent from a smooth law, "
