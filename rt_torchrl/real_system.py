@@ -167,6 +167,11 @@ class RealSystem(EnvBase):
             self._input(imagined)
         if self._applied is not None:
             self._applied.vector(imagined["next"], self.plant.actions, "applied")
+        elif "applied" in self.env.full_observation_spec:
+            raise ValueError(
+                "the environment reports what it has applied, as a safety layer does, and nobody would read it: give "
+                'applied=Reading(keys=("applied",)), in the plant\'s units.'
+            )
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
             raise ValueError(
