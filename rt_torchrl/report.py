@@ -67,8 +67,7 @@ def summary(
     closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
-    flown = unseen.fly(algorithm.policies[live])
-    J_p, J_p_before = (unseen.identification_costs(c, flown) for c in (closure, initial_closure))
+    J_p, J_p_before = twin_costs(unseen, algorithm.policies[live], closure, initial_closure)
     after = {role: judged[role].control_costs.mean() for role in ROLES}
     better = min(ROLES, key=lambda role: after[role].item())
     means = {"J_p": J_p, "J_p_before": J_p_before, "J_a_untrained": untrained}
@@ -77,21 +76,26 @@ def summary(
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": (after[role] / before[role].mean()).item() for role in ROLES},
         **{f"J_a_over_untrained_{role}": (after[role] / untrained.mean()).item() for role in ROLES},
-        "unseen": {
-            "episodes": len(unseen.initial_state),
-            **{name: mean_with_confidence(values) for name, values in means.items()},
-            **results(unseen, judged),
-        },
+        "unseen": {"episodes": len(unseen.initial_state)}
+        | {name: mean_with_confidence(values) for name, values in means.items()}
+        | results(unseen, judged),
         "live": live,
         "better": better,
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None},
         "closure_error": closure_errors(algorithm, laws),
         "seconds": seconds_per_step(episodes),
     }
-    if optimum is not None:
-        found["reference"] = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs}
-        found["reference"]["better_over_reference"] = after[better].item() / optimum.cost
-    return found
+    if optimum is None:
+        return found
+    share = after[better].item() / optimum.cost
+    reference = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs, "better_over_reference": share}
+    return found | {"reference": reference}
+
+
+def twin_costs(unseen: UnseenEpisodes, policy: nn.Module, *closures: nn.Module) -> list[Float[Tensor, " count"]]:
+    """J_p of twins with these closures on the unseen episodes, as a policy flies them."""
+    flown = unseen.fly(policy)
+    return [unseen.identification_costs(closure, flown) for closure in closures]
 
 
 def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:

@@ -88,24 +88,31 @@ def classical(
 
     def compute() -> dict[str, Any]:
         torch.set_num_threads(1)
-        system, compiled = plants()[plant](), missing_for_compilation() is None
-        start = {"gains": kind.placed_gains} if kind.placed_gains else {}
-        controller = kind(system, **start, compiled=compiled)
-        generator = torch.Generator().manual_seed(TRAINING_SEED)
-        if kind.gain_units:
-            state = system.draw_initial_state(episodes, generator)
-            tune(controller, state, system.draw_exogenous(episodes, generator), evaluations=evaluations)
-        judged = UnseenEpisodes(system, unseen, compiled=compiled)
-
-        def record(closure: nn.Module | None) -> dict[str, Any]:
-            judged.closure = system.closure if closure is None else closure
-            found = judged.judge(judged.fly_baseline(controller))
-            return {"costs": found.control_costs.tolist()} | found.statistics()
-
-        changed = record(changed_closure(system, recipe, options))
-        return {"gains": controller.named_gains()} | record(None) | {"changed": changed}
+        controller = tuned(kind, plants()[plant](), episodes=episodes, evaluations=evaluations)
+        system = controller.plant
+        judged = UnseenEpisodes(system, unseen, compiled=missing_for_compilation() is None)
+        found = {"gains": controller.named_gains()} | record(judged, controller)
+        judged.closure = changed_closure(system, recipe, options) or system.closure
+        return found | {"changed": record(judged, controller)}
 
     return kept(path, compute)
+
+
+def tuned(kind: type[ClassicalController], plant: Plant, *, episodes: int, evaluations: int) -> ClassicalController:
+    """A controller with the best gains that a search finds on training episodes, if it has gains."""
+    start = {"gains": kind.placed_gains} if kind.placed_gains else {}
+    controller = kind(plant, **start, compiled=missing_for_compilation() is None)
+    generator = torch.Generator().manual_seed(TRAINING_SEED)
+    if kind.gain_units:
+        state = plant.draw_initial_state(episodes, generator)
+        tune(controller, state, plant.draw_exogenous(episodes, generator), evaluations=evaluations)
+    return controller
+
+
+def record(judged: UnseenEpisodes, controller: ClassicalController) -> dict[str, Any]:
+    """Per-episode ``costs`` and the statistics of :class:`Judged`."""
+    found = judged.judge(judged.fly_baseline(controller))
+    return {"costs": found.control_costs.tolist()} | found.statistics()
 
 
 def cost_along_gain(
