@@ -5,10 +5,11 @@ https://github.com/NREL/ROSCO; Apache License 2.0.
 """
 
 import contextlib
-import io
 import math
+import os
+import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -60,12 +61,27 @@ def parameters() -> dict[str, Any]:
 def nrel5mw() -> Any:
     """ROSCO's model of the turbine, read from its OpenFAST input."""
     case = examples() / "Test_Cases" / "NREL-5MW"
-    with contextlib.redirect_stdout(io.StringIO()):
+    with silenced():
         turbine = rosco().toolbox.turbine.Turbine(parameters()["turbine_params"])
         table = str(case / "Cp_Ct_Cq.NREL5MW.txt")
         turbine.load_from_fast("NREL-5MW.fst", str(case), rot_source="txt", txt_filename=table)
     turbine.table = table
     return turbine
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Nothing on the terminal, neither from Python nor from the compiled controller, which writes to it directly."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        try:
+            yield
+            sys.stdout.flush()
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
 
 
 class Instruments:
@@ -237,7 +253,7 @@ class RoscoController(RealController):
                 return applied[-1]
 
             simulate(self.plant, seed, lambda start, wind: Answer(self.plant, start, wind.repeat(every), decide, 1))
-            with contextlib.redirect_stdout(io.StringIO()):
+            with silenced():
                 interface.kill_discon()
         wind = torch.tensor(winds[::every][:-1], dtype=torch.float64)
         return torch.stack(states[::every]), torch.stack(applied[::every])[:-1], wind
@@ -249,7 +265,7 @@ def controller_interface(folder: Path) -> Any:
     The wind is measured, not estimated: ROSCO's simulator is known to upset the estimators.
     """
     toolbox, path = rosco().toolbox, str(folder / "DISCON.IN")
-    with contextlib.redirect_stdout(io.StringIO()):
+    with silenced():
         controller = toolbox.controller.Controller(
             parameters()["controller_params"] | {"WE_Mode": 0, "LoggingLevel": 0}
         )
