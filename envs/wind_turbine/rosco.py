@@ -77,8 +77,8 @@ def silenced() -> Iterator[None]:
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         try:
-            yield
-            sys.stdout.flush()
+            with contextlib.redirect_stdout(nowhere):
+                yield
         finally:
             os.dup2(kept, 1)
             os.close(kept)
@@ -252,8 +252,11 @@ class RoscoController(RealController):
                 winds.append(wind)
                 return applied[-1]
 
-            simulate(self.plant, seed, lambda start, wind: Answer(self.plant, start, wind.repeat(every), decide, 1))
             with silenced():
+                simulate(self.plant, seed, lambda start, wind: Answer(self.plant, start, wind.repeat(every), decide, 1))
+                # Its Fortran runtime would otherwise write what it holds when nobody keeps it off the terminal.
+                if hasattr(interface.discon, "_gfortran_flush_i4"):
+                    interface.discon._gfortran_flush_i4(None)
                 interface.kill_discon()
         wind = torch.tensor(winds[::every][:-1], dtype=torch.float64)
         return torch.stack(states[::every]), torch.stack(applied[::every])[:-1], wind
