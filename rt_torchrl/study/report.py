@@ -64,8 +64,8 @@ CAUSES = {
     "gusts that a training has met, one searched on twenty. The perceptron is trained as the paper's policy is.",
     "cryogenic_tank": "A vent that is either shut or fully open loses less gas for the same heat than one that is "
     "half open. A law of the pressure error can do that only by chattering, at a gain several hundred times that of "
-    "its best smooth form, and costs more at the gains in between (see the figure over K_P): a descent from a smooth law, "
-    "twinning's or the oracle's, ends on the near side.",
+    "its best smooth form, and costs more at the gains in between (see the figure over K_P): a descent from a smooth "
+    "law, twinning's or the oracle's, ends on the near side.",
 }
 """Why a plant's policy falls short of a classical controller."""
 
