@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -107,6 +107,7 @@ class Config:
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
+        found["nominal", "twinning"][0] = replace(found["nominal", "twinning"][0], figures=True)
         for name, policy in POLICIES.get(plant, {}).items():
             found["nominal", name] = every("twinning", "nominal", seeds, *policy, folder="-".join(policy).strip("-"))
         harder = [variant for variant in VARIANTS if variant != "nominal"] if others else []

@@ -45,6 +45,7 @@ class RunConfig:
         quick: a whole small run: 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end.
         reference: also compute what exact gradients on the true plant reach for this policy on the unseen episodes.
+        figures: draw the figures at all; a training among many is done sooner without.
         figures_every: draw the figures into the dashboard every so many episodes, and at the end; 0 only at the end.
         unseen_every: judge the live policy on the unseen episodes after every so many episodes; 0 only at the end.
         noise: standard deviation of the real system's sensors, as a share of what they read.
@@ -68,6 +69,7 @@ class RunConfig:
     quick: bool = False
     unseen: int = 20
     reference: bool = False
+    figures: bool = True
     figures_every: int = 5
     unseen_every: int = 0
     noise: float = 0.0

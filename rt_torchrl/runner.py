@@ -117,7 +117,8 @@ class Run:
         self._follow_wear()
         judged = report.judge(self.unseen, self.algorithm.policies, self.baselines)
         metrics = self._results(gap, judged)
-        self._draw(dashboard, judged)
+        if self.config.figures:
+            self._draw(dashboard, judged)
         dashboard.close()
         print(report.table(metrics))
         print(f"results in {self.folder}; look at them with: tensorboard --logdir {self.folder}")
@@ -135,7 +136,7 @@ class Run:
         self.episodes.append(record)
         checkpoint.save(self.folder / "checkpoint.pt", self.algorithm, self.episodes)
         dashboard.episode(record)
-        every = self.config.figures_every
+        every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
             dashboard.figures(self._figures(self._snapshot()), len(self.episodes) - 1)
 

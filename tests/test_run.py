@@ -56,6 +56,15 @@ def test_a_run_leaves_its_results_readable(tmp_path):
     assert logged == pytest.approx([record["J_p"] for record in metrics["episodes"]], rel=1e-6)
 
 
+def test_a_run_without_figures_has_the_same_results(tmp_path):
+    drawn = small_run(tmp_path / "drawn", episodes=1).train()
+    bare = small_run(tmp_path / "bare", episodes=1, figures=False).train()
+    assert not (tmp_path / "bare" / "figures").exists()
+    for metrics in (drawn, bare):
+        del metrics["summary"]["seconds"], metrics["episodes"][0]["seconds"]
+    assert bare == drawn
+
+
 def drawn_policies(plant, count):
     generator = torch.Generator().manual_seed(UNSEEN_SEED)
     return [plant.make_policy(generator) for _ in range(count)]

@@ -283,6 +283,9 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
         ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based", "twinning, perceptron")
     }
     arms = ("twinning", "model_free", "model_based")
+    drawn = [t for group in groups.values() for t in group if t.figures]
+    assert drawn == groups["nominal", "twinning"][:1] and "--no-figures" not in drawn[0].command()
+    assert "--no-figures" in groups["nominal", "twinning"][1].command()
     assert [key for key in groups if key[0] != "nominal"] == [(v, a) for v in VARIANTS if v != "nominal" for a in arms]
     assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
     folders = {t.folder for group in groups.values() for t in group}

@@ -36,6 +36,7 @@ class Training:
         variant: key of ``VARIANTS``.
         folder: run folder.
         options: further options of the recipe.
+        figures: draw its figures; the report shows those of one training of a plant, and drawing takes up to 25 s.
     """
 
     recipe: Path
@@ -44,6 +45,7 @@ class Training:
     variant: str
     folder: Path
     options: tuple[str, ...] = ()
+    figures: bool = False
 
     def __post_init__(self):
         if self.variant not in VARIANTS:
@@ -58,6 +60,7 @@ class Training:
         begun = (self.folder / "checkpoint.pt").exists()
         options = ["--seed", str(self.seed), "--twinning.arm", self.arm, "--log-dir", str(self.folder)]
         options += ["--figures-every", "0", "--threads", "1", "--resume" if begun else "--overwrite"]
+        options += [] if self.figures else ["--no-figures"]
         return [*options, *VARIANTS[self.variant], *self.options]
 
     def command(self) -> str:
@@ -65,8 +68,9 @@ class Training:
         return " ".join(["uv run", str(self.recipe), *self.arguments()])
 
     def done(self) -> bool:
-        """Whether its results are there."""
-        return (self.folder / "metrics.json").exists()
+        """Whether its results are there, with the figures if it draws them."""
+        drawn = not self.figures or (self.folder / "figures" / "unseen.png").exists()
+        return drawn and (self.folder / "metrics.json").exists()
 
     def run(self) -> None:
         """Train, unless that is done; what the recipe prints goes to ``training.log`` in the folder.
