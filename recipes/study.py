@@ -3,14 +3,10 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-from joblib import Parallel, delayed
-from tqdm import tqdm
+from typing import Literal
 
 from rt_torchrl.classical import ClassicalController
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
@@ -21,8 +17,9 @@ from rt_torchrl.run_config import QUICK_UNSEEN
 from rt_torchrl.runner import main_of
 from rt_torchrl.study import page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
+from rt_torchrl.study.scheduling import Task, side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.yardsticks import classical, cost_along_gain, oracle
+from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, oracle
 
 ARMS = ("twinning", "model_free", "model_based")
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
@@ -39,9 +36,14 @@ POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
     "flapping_wing": {"twinning, perceptron": ("--policy", "mlp")},
 }
 """Policies beside a plant's own that twinning trains too, as options of its recipe."""
+OTHER_PLANT = ("twinning, gain-scheduled",)
+"""Those that need a plant with more signals."""
 
 EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
 """Real episodes of a training, of every arm alike; more leave drone and tank where they are."""
+SHORT = {"wind_turbine": 600.0, "flapping_wing": 1.25, "cryogenic_tank": 1.08e5}
+"""Length of an episode with ``quick`` [s]: a turbine's whole one, a quarter of the others'."""
+QUICK_VARIANTS = ("noise 5 %", CHANGED)
 GAIN_LINES: dict[str, type[ClassicalController]] = {"cryogenic_tank": PIValve}
 """Controllers whose cost over their first gain is drawn."""
 MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
@@ -88,12 +90,14 @@ class Config:
 
     @property
     def kept(self) -> Path:
-        """Where what is computed is kept; short trainings apart, or the whole study would take them for its own."""
+        """The folder; short trainings and their report apart, or the whole study would take them for its own."""
         return self.folder / "quick" if self.quick else self.folder
 
     def options_of(self, plant: str) -> tuple[str, ...]:
         """Options of every training of a plant."""
-        return ("--quick",) if self.quick else ("--unseen", str(self.unseen), "--episodes", str(EPISODES[plant]))
+        if self.quick:
+            return "--quick", "--horizon", str(SHORT[plant])
+        return ("--unseen", str(self.unseen), "--episodes", str(EPISODES[plant]))
 
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Of a plant: those of every variant and arm, a list over the seeds."""
@@ -110,29 +114,31 @@ class Config:
         found["nominal", "twinning"][0] = replace(found["nominal", "twinning"][0], figures=True)
         for name, policy in POLICIES.get(plant, {}).items():
             found["nominal", name] = every("twinning", "nominal", seeds, *policy, folder="-".join(policy).strip("-"))
-        harder = [variant for variant in VARIANTS if variant != "nominal"] if others else []
+        harder = QUICK_VARIANTS if self.quick else [variant for variant in VARIANTS if variant != "nominal"]
+        harder = harder if others else []
         return found | {(variant, arm): every(arm, variant, others) for variant in harder for arm in ARMS}
 
-    def yardsticks(self, plant: str) -> dict[str, Callable[[], dict[str, Any]]]:
-        """The oracle and the classical controllers of a plant; each is computed once and kept."""
+    def yardsticks(self, plant: str) -> dict[str, Yardstick]:
+        """The oracle and the classical controllers of a plant."""
         place = self.kept / "yardsticks" / plant
         unseen = QUICK_UNSEEN if self.quick else self.unseen
         starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
         best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
         tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
-        tuned |= {"recipe": recipe_of(plant), "options": self.options_of(plant)}
-        found = {"oracle": partial(oracle, plant, place / "oracle.json", **best)}
-        for name, kind in CONTROLLERS[plant].items():
-            found[name] = partial(classical, plant, kind, place / f"{name}.json", **tuned)
-        return found
+        system = recipe_of(plant), self.options_of(plant)
+        found = {"oracle": partial(oracle, *system, **best)}
+        found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
+        return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
 
-    def gain_line(self, plant: str) -> Callable[[], dict[str, Any]] | None:
-        """The cost of a classical controller over its first gain, where that explains something; kept too."""
+    def gain_line(self, plant: str) -> Yardstick | None:
+        """The cost of a classical controller over its first gain, where that explains something."""
         if plant not in GAIN_LINES:
             return None
         path = self.kept / "yardsticks" / plant / "gain-line.json"
         unseen = QUICK_UNSEEN if self.quick else self.unseen
-        return partial(cost_along_gain, plant, GAIN_LINES[plant], path, unseen=unseen, multiples=MULTIPLES)
+        system = recipe_of(plant), self.options_of(plant)
+        line = partial(cost_along_gain, *system, GAIN_LINES[plant], unseen=unseen, multiples=MULTIPLES)
+        return Yardstick(path, line)
 
 
 def recipe_of(plant: str) -> Path:
@@ -142,38 +148,45 @@ def recipe_of(plant: str) -> Path:
 
 def compute(config: Config) -> None:
     """Everything that is not done yet, side by side, with one progress bar."""
-    tasks = [task for plant in config.chosen() for task in config.yardsticks(plant).values()]
-    tasks += [line for plant in config.chosen() if (line := config.gain_line(plant))]
+    batches = short_batches(config) if config.quick else [[task] for task in ordered_tasks(config)]
+    side_by_side(batches, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
+
+
+def ordered_tasks(config: Config) -> list[Task]:
+    """Yardsticks, then the nominal trainings that the other results are measured by, then what is made harder."""
+    tasks = [task for plant in config.chosen() for task in yardstick_tasks(config, plant)]
+    # The plant that takes longest first.
     groups = [item for plant in reversed(config.chosen()) for item in config.trainings(plant).items()]
-    # The plant that takes longest first, and what the other results are measured by before what is made harder.
     for _, group in sorted(groups, key=lambda item: item[0][0] != "nominal"):
-        tasks += [training.run for training in group]
-    side_by_side(tasks, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
+        tasks += group
+    return tasks
 
 
-def side_by_side(tasks: list[Callable[[], Any]], *, backend: str, jobs: int) -> None:
-    """Run tasks through joblib with a progress bar.
+def short_batches(config: Config) -> list[list[Task]]:
+    """What one worker does in a row: tracing a plant takes longer than a short training, so a plant has one worker.
 
-    Raises:
-        ValueError: if the backend is Ray and there is none.
+    A policy on another plant, with graphs of its own, goes wherever there is time.
     """
-    if backend == "ray":
-        try:
-            from ray.util.joblib import register_ray
-        except ImportError as error:
-            raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
-        register_ray()
-    ordered = "list" if backend == "ray" else "generator_unordered"
-    running = Parallel(n_jobs=jobs, backend=backend, return_as=ordered)(delayed(task)() for task in tasks)
-    for _ in tqdm(running, total=len(tasks), unit="task", desc="study"):
-        pass
+    batches, alone = [], []
+    for plant in sorted(config.chosen(), key=list(SHORT).index):
+        groups = config.trainings(plant)
+        together = [training for key, group in groups.items() if key[1] not in OTHER_PLANT for training in group]
+        batches.append([*yardstick_tasks(config, plant), *together])
+        alone += [[training] for key, group in groups.items() if key[1] in OTHER_PLANT for training in group]
+    return batches + alone
+
+
+def yardstick_tasks(config: Config, plant: str) -> list[Task]:
+    """What trainings of a plant are measured against."""
+    line = config.gain_line(plant)
+    return [*config.yardsticks(plant).values(), *([line] if line else [])]
 
 
 def entries_of(config: Config, plant: str) -> list[Entry]:
     """Arms, then classical controllers, then the oracle."""
     trainings = config.trainings(plant)
     found = [arm_entry(name, trainings["nominal", name]) for name in (*ARMS, *POLICIES.get(plant, {}))]
-    yardsticks = [yardstick_entry(name, task()) for name, task in config.yardsticks(plant).items()]
+    yardsticks = [yardstick_entry(name, task.run()) for name, task in config.yardsticks(plant).items()]
     return found + yardsticks[1:] + yardsticks[:1]
 
 
@@ -184,7 +197,7 @@ def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
     found = {variant: [arm_entry(arm, trainings[variant, arm]) for arm in ARMS] for variant in variants}
     if found:
         tasks = {name: config.yardsticks(plant)[name] for name in CONTROLLERS[plant]}
-        found[CHANGED] += [yardstick_entry(name, task()["changed"]) for name, task in tasks.items()]
+        found[CHANGED] += [yardstick_entry(name, task.run()["changed"]) for name, task in tasks.items()]
     return found
 
 
@@ -200,27 +213,28 @@ def gather(config: Config) -> Results:
 
 def draw(config: Config, results: Results) -> list[str]:
     """Figures of the study and of the first twinning run of each plant, as Markdown with captions."""
-    folder = config.folder / "figures"
+    folder = config.kept / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
     if config.variant_seeds:
         drawn["variants"] = charts.variants(results.entries, results.variants)
         drawn["following"] = charts.following(results.entries, results.variants)
+    captions = dict(report.CAPTIONS)
+    for plant in config.chosen():
+        if line := config.gain_line(plant):
+            name = f"{plant}_gain_line"
+            drawn[name] = charts.gain_line(line.run(), results.entries[plant])
+            captions[name] = report.GAIN_LINE_CAPTIONS[plant]
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
-        found.append(page.figure(folder / f"{name}.png", config.folder, report.CAPTIONS[name]))
+        found.append(page.figure(folder / f"{name}.png", config.kept, captions[name]))
     for plant in config.chosen():
-        if line := config.gain_line(plant):
-            charts.gain_line(line(), results.entries[plant]).savefig(folder / f"{plant}_gain_line.png", dpi=110)
-            found.append(
-                page.figure(folder / f"{plant}_gain_line.png", config.folder, report.GAIN_LINE_CAPTIONS[plant])
-            )
         first = config.trainings(plant)["nominal", "twinning"][0].folder / "figures"
         for name, text in (report.RUN_CAPTIONS | report.PLANT_CAPTIONS[plant]).items():
             copy = folder / f"{plant}_{name}.png"
             shutil.copy(first / f"{name}.png", copy)
-            found.append(page.figure(copy, config.folder, f"{charts.shown(plant).capitalize()}, seed 0. {text}"))
+            found.append(page.figure(copy, config.kept, f"{charts.shown(plant).capitalize()}, seed 0. {text}"))
     return found
 
 
@@ -228,8 +242,8 @@ def write(config: Config) -> Path:
     """The report: Markdown, HTML, figures and ``study.json``; returns the page."""
     results = gather(config)
     sections = report.sections(results, figures=draw(config, results), quick=config.quick, command=command(config))
-    (config.folder / "study.json").write_text(json.dumps(report.numbers(results), indent=2) + "\n")
-    return page.write(config.folder, "What reinforcement twinning is worth", sections)[1]
+    (config.kept / "study.json").write_text(json.dumps(report.numbers(results), indent=2) + "\n")
+    return page.write(config.kept, "What reinforcement twinning is worth", sections)[1]
 
 
 def command(config: Config) -> str:

@@ -16,8 +16,9 @@ from rt_torchrl.catalogue import plants
 from rt_torchrl.figures import study as charts
 from rt_torchrl.study import page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
+from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.yardsticks import changed_closure, kept
+from rt_torchrl.study.yardsticks import Yardstick, changed_closure, configured
 
 EPISODES = 30
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -144,8 +145,10 @@ def test_a_closure_of_another_kind_has_no_weight_error():
 
 def test_what_is_kept_is_not_computed_again(tmp_path):
     calls = []
+    yardstick = Yardstick(tmp_path / "deep" / "x.json", lambda: calls.append(1) or {"costs": [1.0]})
     for _ in range(2):
-        assert kept(tmp_path / "deep" / "x.json", lambda: calls.append(1) or {"costs": [1.0]}) == {"costs": [1.0]}
+        assert yardstick.done() == bool(calls)
+        assert yardstick.run() == {"costs": [1.0]}
     assert len(calls) == 1
 
 
@@ -189,16 +192,39 @@ def test_the_report_says_what_was_found(tmp_path):
 
 def computed(tmp_path, backend, jobs=2):
     """What the study computes side by side from two trainings of a recipe that only writes its process."""
-    study = recipe("study")
     main = "(config.log_dir / 'metrics.json').write_text(json.dumps({'process': os.getpid()}))"
     script = written(tmp_path / "tiny.py", main)
     trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
-    study.side_by_side([t.run for t in trainings], backend=backend, jobs=jobs)
+    side_by_side([[task] for task in trainings], backend=backend, jobs=jobs)
     return [t.metrics()["process"] for t in trainings]
 
 
 def test_trainings_run_side_by_side(tmp_path):
     assert os.getpid() not in computed(tmp_path, "loky")
+
+
+class Counted:
+    """A task that writes a file when it is run."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def run(self):
+        with self.path.open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+    def done(self):
+        return self.path.exists()
+
+
+def test_a_batch_runs_in_one_process_and_the_bar_counts_tasks(tmp_path, capsys):
+    batches = [[Counted(tmp_path / f"{batch}-{task}") for task in range(3)] for batch in range(2)]
+    batches[0][0].run()
+    side_by_side(batches, backend="loky", jobs=2)
+    workers = [[task.path.read_text().split()[-1] for task in batch] for batch in batches]
+    assert all(len(set(found)) == 1 for found in workers)
+    shown = capsys.readouterr().err
+    assert "1/6" in shown and "6/6" in shown
 
 
 def test_trainings_spread_over_ray(tmp_path):
@@ -276,6 +302,25 @@ def test_a_plant_that_does_not_exist_is_refused():
     assert config(plants=("all",)).chosen() == ["wind_turbine", "flapping_wing", "cryogenic_tank"]
 
 
+def test_short_trainings_of_a_plant_share_a_worker(tmp_path):
+    study = recipe("study")
+    batches = study.short_batches(study.Config(quick=True, folder=tmp_path))
+    plants_of = [{task.plant for task in batch if isinstance(task, Training)} for batch in batches]
+    assert all(len(found) == 1 for found in plants_of) and len(batches) == 4
+    (alone,) = [batch for batch in batches if len(batch) == 1]
+    assert alone[0].options[-2:] == ("--policy", "scheduled")
+    planned = [task for batch in batches for task in batch]
+    assert len(planned) == len(study.ordered_tasks(study.Config(quick=True, folder=tmp_path)))
+
+
+def test_yardsticks_are_measured_on_the_plant_of_the_trainings():
+    short = configured(RECIPES / "flapping_wing.py", ("--quick", "--horizon", "1.25"))
+    assert short.plant().horizon == pytest.approx(1.25) and short.episodes == 3
+    for name, default in plants().items():
+        if (RECIPES / f"{name}.py").exists():
+            assert configured(RECIPES / f"{name}.py", ()).plant().extra_repr() == default().extra_repr()
+
+
 def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     config = recipe("study").Config(seeds=3, variant_seeds=2, folder=tmp_path)
     groups = config.trainings("flapping_wing")
@@ -295,5 +340,6 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]
     assert first.arm == "twinning" and first.command().endswith("--policy scheduled")
     short = recipe("study").Config(quick=True, folder=tmp_path).trainings("flapping_wing")
+    assert list(dict.fromkeys(variant for variant, _ in short)) == ["nominal", "noise 5 %", "model error"]
     # What is kept of a quick study is never taken for a result of the whole one.
     assert folders.isdisjoint(t.folder for group in short.values() for t in group)

@@ -1,5 +1,7 @@
 """What the study found, in sentences and tables."""
 
+import os
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -90,7 +92,7 @@ def verdicts(entries: list[Entry]) -> str:
     twinning, oracle = named["twinning"], named["oracle"]
     share = twinning.mean / oracle.mean
     lines = [f"- Within 5 % of the oracle: **{'yes' if share <= CLOSE else 'no'}** ({share:.3f})."]
-    for half in ("model_based", "model_free"):
+    for half in variants.HALVES:
         if half in named:
             lines.append(f"- Against {shown(half)} alone: {compared(twinning, named[half])}.")
     contenders = [entry for entry in entries if entry.name.startswith("twinning")]
@@ -132,9 +134,14 @@ def sections(results: Results, *, figures: list[str], quick: bool, command: str)
         quick: mark the report as made from short trainings.
         command: that makes the report.
     """
-    found = [f"Made by `{command}`. Every cost is a mean over unseen episodes on the real plant, the same for all."]
+    found = [
+        f"Made by `{command}`, rt_torchrl {version('rt_torchrl')}, {os.cpu_count()} cores. Every cost is a mean over "
+        "unseen episodes on the real plant, the same for all."
+    ]
     if quick:
-        found.append("**Made with `--quick`, from short trainings: the report's form, but no result.**")
+        found.append(
+            "**Made with `--quick`, from short trainings and short episodes: the report's form, but no result.**"
+        )
     for plant, entries in results.entries.items():
         found += [f"## {shown(plant).capitalize()}", merit_table(entries), verdicts(entries)]
         found += [CAUSES[plant]] if plant in CAUSES else []
@@ -151,9 +158,9 @@ def numbers(results: Results) -> dict[str, Any]:
     """What ``study.json`` holds."""
     return {
         plant: {
-            "entries": {entry.name: figures_of(entry) for entry in entries},
+            "entries": {entry.name: numbers_of(entry) for entry in entries},
             "variants": {
-                variant: {entry.name: figures_of(entry) for entry in harder}
+                variant: {entry.name: numbers_of(entry) for entry in harder}
                 for variant, harder in results.variants[plant].items()
             },
         }
@@ -161,7 +168,7 @@ def numbers(results: Results) -> dict[str, Any]:
     }
 
 
-def figures_of(entry: Entry) -> dict[str, Any]:
+def numbers_of(entry: Entry) -> dict[str, Any]:
     """What ``study.json`` holds of a row."""
     return {
         "J_a": entry.mean,

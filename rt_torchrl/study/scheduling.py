@@ -1,0 +1,72 @@
+"""What the study computes, side by side, with one progress bar."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol, runtime_checkable
+
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+GLANCE = 1.0
+"""Between two looks at what is done [s]."""
+
+
+@runtime_checkable
+class Task(Protocol):
+    """Something whose result is kept in a file."""
+
+    def run(self) -> Any:
+        """Compute it, unless that is done."""
+
+    def done(self) -> bool:
+        """Whether its result is there."""
+
+
+def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) -> None:
+    """Run batches of tasks through joblib, the tasks of a batch one after another in one process.
+
+    Raises:
+        ValueError: if the backend is Ray and there is none.
+    """
+    if backend == "ray":
+        try:
+            from ray.util.joblib import register_ray
+        except ImportError as error:
+            raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
+        register_ray()
+    with progress([task for batch in batches for task in batch]):
+        Parallel(n_jobs=jobs, backend=backend, batch_size=1)(delayed(in_a_row)(batch) for batch in batches)
+
+
+def in_a_row(tasks: Sequence[Task]) -> None:
+    """One after another."""
+    for task in tasks:
+        task.run()
+
+
+@contextmanager
+def progress(tasks: Sequence[Task]) -> Iterator[None]:
+    """A bar of the tasks that are done, for as long as the context lasts.
+
+    It looks at the results rather than hears of them, and so follows workers on other machines too.
+    """
+    stopped = threading.Event()
+    before = sum(task.done() for task in tasks)
+    with tqdm(total=len(tasks), initial=before, unit="task", desc="study", dynamic_ncols=True) as bar:
+
+        def look() -> None:
+            bar.update(sum(task.done() for task in tasks) - bar.n)
+
+        def watch() -> None:
+            while not stopped.wait(GLANCE):
+                look()
+
+        watching = threading.Thread(target=watch, daemon=True)
+        watching.start()
+        try:
+            yield
+        finally:
+            stopped.set()
+            watching.join()
+            look()
