@@ -15,7 +15,7 @@ from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.figures import study as charts
 from rt_torchrl.run_config import QUICK_UNSEEN
 from rt_torchrl.runner import main_of
-from rt_torchrl.study import page, report
+from rt_torchrl.study import captions, page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import Task, side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
@@ -219,21 +219,21 @@ def draw(config: Config, results: Results) -> list[str]:
     if config.variant_seeds:
         drawn["variants"] = charts.variants(results.entries, results.variants)
         drawn["following"] = charts.following(results.entries, results.variants)
-    captions = dict(report.CAPTIONS)
+    texts = {name: captions.STUDY[name](results) for name in drawn}
     for plant in config.chosen():
         if line := config.gain_line(plant):
             name = f"{plant}_gain_line"
             drawn[name] = charts.gain_line(line.run(), results.entries[plant])
-            captions[name] = report.GAIN_LINE_CAPTIONS[plant]
+            texts[name] = captions.gain_line(line.run())
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
-        found.append(page.figure(folder / f"{name}.png", config.kept, captions[name]))
+        found.append(page.figure(folder / f"{name}.png", config.kept, texts[name]))
     for plant in config.chosen():
-        first = config.trainings(plant)["nominal", "twinning"][0].folder / "figures"
-        for name, text in (report.RUN_CAPTIONS | report.PLANT_CAPTIONS[plant]).items():
+        first = config.trainings(plant)["nominal", "twinning"][0]
+        for name, text in captions.of_run(plant, first.metrics()).items():
             copy = folder / f"{plant}_{name}.png"
-            shutil.copy(first / f"{name}.png", copy)
+            shutil.copy(first.folder / "figures" / f"{name}.png", copy)
             found.append(page.figure(copy, config.kept, f"{charts.shown(plant).capitalize()}, seed 0. {text}"))
     return found
 

@@ -14,7 +14,7 @@ import tyro
 
 from rt_torchrl.catalogue import plants
 from rt_torchrl.figures import study as charts
-from rt_torchrl.study import page, report
+from rt_torchrl.study import captions, page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
@@ -43,6 +43,7 @@ def summary(costs, live="model_based"):
     return {
         "live": live,
         "J_p_ratio": 1e-3,
+        "closure_error": {"found": [0.1, 0.02], "start": [1.0, 0.2]},
         "closure": {"found": {"a": 1.1, "b": 2.0}, "true": {"a": 1.0, "b": 2.0}},
         "unseen": {
             "costs": {"model_based": costs, "model_free": [2.0 * c for c in costs]},
@@ -61,7 +62,10 @@ def finished(tmp_path, seed, shift, **options):
     costs = (1.0 + shift + 0.1 * np.random.default_rng(7).standard_normal(EPISODES)).tolist()
     found = training(tmp_path, seed, **options)
     found.folder.mkdir()
-    episodes = [{"J_a_unseen": cost, "J_p": cost / 100} for cost in (5.0, 1.05, 1.0)]
+    episodes = [
+        {"episode": k, "J_a_unseen": cost, "J_p": cost / 100, "event": event}
+        for k, (cost, event) in enumerate(((5.0, "keep"), (1.05, "swap"), (1.0, "keep")))
+    ]
     (found.folder / "metrics.json").write_text(json.dumps({"summary": summary(costs), "episodes": episodes}))
     return found
 
@@ -257,6 +261,30 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     following = charts.following(found.entries, found.variants).axes[0]
     assert [line.get_label() for line in following.lines] == ["nominal", "model error"]
     assert np.allclose(following.lines[1].get_ydata(), [0.05, 0.0105, 0.01])
+
+
+def test_captions_say_what_is_seen(tmp_path):
+    found = results(tmp_path)
+    curves = captions.learning(found)
+    assert "twinning 3, 3; model based 3, 3; model free never, never." in curves
+    worst = max(e.costs.max() for e in found.entries["flapping_wing"] if e.name == "PD")
+    assert f"PD {worst:.3g}" in captions.robustness(found)
+    assert "twinning suffers most from noise 1 %, 1.5 times its nominal cost" in captions.variants(found)
+    assert "J_p ends at 0.01, with model error at 0.01" in captions.following(found)
+    line = {"name": "K_P", "values": [1.0, 10.0, 1e3, 1e4], "costs": [2.5, 2.3, 2.4, 2.2]}
+    said = captions.gain_line(line)
+    assert "K_P = 10 with 2.3, 2.4 at K_P = 1e+03, and 2.2 at K_P = 1e+04" in said
+    assert "falls all the way" in captions.gain_line(line | {"costs": [4.0, 3.0, 2.0, 1.0]})
+
+
+def test_captions_of_a_training_come_from_its_metrics(tmp_path):
+    metrics = finished(tmp_path, 0, 0.0).metrics()
+    found = captions.of_run("flapping_wing", metrics)
+    assert found["learning_curves"].endswith("Swap after episode 2; no clone. J_a of the live policy went from 5 to 1.")
+    # The model-free costs are twice the live ones.
+    assert "The live policy (model based) costs less than model free on 30 of 30." in found["unseen"]
+    assert "RMS error where the last episode went: 0.1, 0.02; of the initial twin 1, 0.2." in found["polars"]
+    assert "RMS error" not in found["flight"]
 
 
 def test_the_page_holds_its_figures(tmp_path):

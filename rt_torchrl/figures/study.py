@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, TWIN, caption, legend_below, panels
-from rt_torchrl.study.findings import Entry
+from rt_torchrl.study.findings import Entry, named
 from rt_torchrl.study.training import CHANGED
 
 ARMS = {"twinning": REAL, **ROLES}
@@ -77,7 +77,7 @@ def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[E
     figure, axes = panels(1, len(entries), title=title, size=size, sharey=True)
     for ax, (plant, nominal) in zip(axes.flat, entries.items(), strict=True):
         columns = {"nominal": nominal} | harder[plant]
-        unit = next(entry.mean for entry in nominal if entry.name == "twinning")
+        unit = named(nominal)["twinning"].mean
         for column, found in enumerate(columns.values()):
             for arm in (entry for entry in found if entry.name in ARMS):
                 means, place = arm.costs.mean(1) / unit, column + ARM_SHIFT[arm.name]
@@ -102,8 +102,7 @@ def following(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[
     figure, axes = panels(1, len(entries), title="The twin's error after each real episode", size=size)
     for ax, (plant, nominal) in zip(axes.flat, entries.items(), strict=True):
         for label, found, colour in (("nominal", nominal, REAL), (CHANGED, harder[plant][CHANGED], TWIN)):
-            arm = next(entry for entry in found if entry.name == "twinning")
-            _spread(ax, arm.twin_errors, color=colour, label=label)
+            _spread(ax, named(found)["twinning"].twin_errors, color=colour, label=label)
         ax.set_yscale("log")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_xlabel("real episodes")

@@ -76,6 +76,11 @@ def difference(first: Entry, second: Entry) -> tuple[float, float]:
     return spread(first.costs - second.costs)
 
 
+def named(entries: list[Entry]) -> dict[str, Entry]:
+    """Entries by name."""
+    return {entry.name: entry for entry in entries}
+
+
 def arm_entry(name: str, trainings: list[Training]) -> Entry:
     """An arm, or an arm with another policy, from its trainings; it is judged by the policy that acts at the end."""
     found = [training.metrics() for training in trainings]

@@ -8,7 +8,7 @@ import numpy as np
 
 from rt_torchrl.figures.study import shown
 from rt_torchrl.study import variants
-from rt_torchrl.study.findings import Entry, Results
+from rt_torchrl.study.findings import Entry, Results, named
 from rt_torchrl.study.page import table
 from rt_torchrl.study.rows import COST_HEADER, TWIN_HEADER, compared, cost_cells, merit_cells, twin_cells
 
@@ -21,44 +21,6 @@ PAPER = {
 }
 """The paper's table of learning performance: ratios of J_p, of J_a model-based and of J_a model-free."""
 PAPER_TEXT = "Cost after training over the mean cost before, over the seeds of twinning; the paper has five."
-CAPTIONS = {
-    "learning": "Mean cost of the live policy on unseen episodes after each real episode, with the range of the seeds.",
-    "robustness": "Distribution of the cost over the unseen episodes, all seeds together.",
-    "variants": "Every arm under sensor noise and model error, over twinning's nominal cost; a point for each seed.",
-    "following": "The twin's error after each real episode, as the twin knows the system and with model error; "
-    "band: range of the seeds.",
-}
-RUN_CAPTIONS = {
-    "learning_curves": "Costs, the twin's error and who was live; vertical lines are swaps and clones.",
-    "states": "The last real episode and the twin's replay of it.",
-    "actions": "Actions of the last real episode.",
-    "policy_contours": "Both policies after training.",
-    "unseen": "Every unseen episode under both policies and the classical controllers.",
-}
-PLANT_CAPTIONS = {
-    "wind_turbine": {
-        "power_and_speed": "Wind, generator speed, power, torque and pitch of the last episode, with their references.",
-        "power_coefficient": "Power coefficient of the twin against the true one; ticks mark what was visited.",
-        "scatter": "Generator speed of the twin against the real one; a perfect twin lies on the line.",
-    },
-    "flapping_wing": {
-        "flight_path": "The last flight in the plane with its target, and the gust.",
-        "flight": "Positions and speeds of real drone and twin, amplitude and stroke-plane angle.",
-        "polars": "Lift and drag of the twin against the true ones.",
-        "control_surfaces": "Both policies over the position and speed errors, as the paper draws them.",
-    },
-    "cryogenic_tank": {
-        "tank": "Pressure, masses, vent and load of the last episode.",
-        "heat_exchanger": "Heat taken by the exchanger over the pressure drop at the valve, twin against true.",
-        "vent_path": "Path of the vented fluid in the temperature-entropy plane.",
-    },
-}
-"""What the figures of a plant's own show."""
-
-GAIN_LINE_CAPTIONS = {
-    "cryogenic_tank": "Cost of a proportional vent over its gain. Far on the right it only opens and shuts, as the "
-    "on-off valve does.",
-}
 CAUSES = {
     "wind_turbine": "The paper's policy has no bias: without an error it asks for half of the greatest torque and of "
     "the greatest pitch, whatever its weights. The other policies are trained in the same way and need not.",
@@ -74,7 +36,7 @@ CAUSES = {
 
 def merit_table(entries: list[Entry]) -> str:
     """Every arm and yardstick of a plant with J_a, its interval, the regret and the plant's own quantities."""
-    oracle = next(entry for entry in entries if entry.name == "oracle")
+    oracle = named(entries)["oracle"]
     header = ["", *COST_HEADER, "over oracle", *oracle.merit, *TWIN_HEADER, "episodes to 110 %"]
     rows = []
     for entry in entries:
@@ -88,13 +50,13 @@ def merit_table(entries: list[Entry]) -> str:
 
 def verdicts(entries: list[Entry]) -> str:
     """The study's targets, each with what was found."""
-    named = {entry.name: entry for entry in entries}
-    twinning, oracle = named["twinning"], named["oracle"]
+    found = named(entries)
+    twinning, oracle = found["twinning"], found["oracle"]
     share = twinning.mean / oracle.mean
     lines = [f"- Within 5 % of the oracle: **{'yes' if share <= CLOSE else 'no'}** ({share:.3f})."]
     for half in variants.HALVES:
-        if half in named:
-            lines.append(f"- Against {shown(half)} alone: {compared(twinning, named[half])}.")
+        if half in found:
+            lines.append(f"- Against {shown(half)} alone: {compared(twinning, found[half])}.")
     contenders = [entry for entry in entries if entry.name.startswith("twinning")]
     classical = [entry for entry in entries if not entry.curves and entry.name != "oracle"]
     for contender in contenders:

@@ -1,7 +1,7 @@
 """What noise of the sensors and errors of the model do to every arm, in a table and in sentences."""
 
 from rt_torchrl.figures.study import shown
-from rt_torchrl.study.findings import Entry
+from rt_torchrl.study.findings import Entry, named
 from rt_torchrl.study.page import table
 from rt_torchrl.study.rows import COST_HEADER, TWIN_HEADER, compared, cost_cells, merit_cells, twin_cells
 
@@ -35,7 +35,7 @@ def verdicts(variants: dict[str, list[Entry]]) -> str:
     """Whether twinning is worth more than its halves under each variant."""
     lines = []
     for variant, entries in variants.items():
-        named = {entry.name: entry for entry in entries}
-        halves = [f"against {shown(half)} alone {compared(named['twinning'], named[half])}" for half in HALVES]
+        found = named(entries)
+        halves = [f"against {shown(half)} alone {compared(found['twinning'], found[half])}" for half in HALVES]
         lines.append(f"- Twinning, {variant}: {'; '.join(halves)}.")
     return "\n".join(lines)

@@ -1,0 +1,159 @@
+"""Captions of the report's figures: what is drawn, and what is seen there in numbers."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rt_torchrl.figures.study import shown
+from rt_torchrl.study.findings import NEAR, Entry, Results, named
+from rt_torchrl.study.training import CHANGED
+
+ARMS = ("twinning", "model_based", "model_free")
+RUN = {
+    "learning_curves": "Costs, the twin's error and who was live; vertical lines are swaps and clones.",
+    "states": "The last real episode and the twin's replay of it.",
+    "actions": "Actions of the last real episode.",
+    "policy_contours": "Both policies after training.",
+    "unseen": "Every unseen episode under both policies and the classical controllers.",
+}
+"""Figures that every training draws."""
+PLANT = {
+    "wind_turbine": {
+        "power_and_speed": "Wind, generator speed, power, torque and pitch of the last episode, with their references.",
+        "power_coefficient": "Power coefficient of the twin against the true one; ticks mark what was visited.",
+        "scatter": "Generator speed of the twin against the real one; a perfect twin lies on the line.",
+    },
+    "flapping_wing": {
+        "flight_path": "The last flight in the plane with its target, and the gust.",
+        "flight": "Positions and speeds of real drone and twin, amplitude and stroke-plane angle.",
+        "polars": "Lift and drag of the twin against the true ones.",
+        "control_surfaces": "Both policies over the position and speed errors, as the paper draws them.",
+    },
+    "cryogenic_tank": {
+        "tank": "Pressure, masses, vent and load of the last episode.",
+        "heat_exchanger": "Heat taken by the exchanger over the pressure drop at the valve, twin against true.",
+        "vent_path": "Path of the vented fluid in the temperature-entropy plane.",
+    },
+}
+"""What the figures of a plant's own show."""
+CLOSURES = ("power_coefficient", "polars", "heat_exchanger")
+"""Those of them that show the twin's closure."""
+
+
+def learning(results: Results) -> str:
+    """Of the learning curves: when each arm comes near the oracle."""
+    lines = ["Mean cost of the live policy on unseen episodes after each real episode, with the range of the seeds."]
+    for plant, found in entries_by_name(results):
+        arms = [f"{shown(arm)} {episodes_to(found[arm], found['oracle'])}" for arm in ARMS if arm in found]
+        near = f"within {100 * (NEAR - 1):.0f} % of the oracle"
+        lines.append(f"{title(plant)}, real episodes until {near}, seed by seed: {'; '.join(arms)}.")
+    return " ".join(lines)
+
+
+def robustness(results: Results) -> str:
+    """Of the violins: how bad the worst unseen episode is."""
+    lines = ["Distribution of the cost over the unseen episodes, all seeds together."]
+    for plant, found in entries_by_name(results):
+        worst = [f"{shown(name)} {entry.costs.max():.3g}" for name, entry in found.items()]
+        lines.append(f"{title(plant)}, the worst episode: {', '.join(worst)}.")
+    return " ".join(lines)
+
+
+def variants(results: Results) -> str:
+    """Of what noise and model error do: where twinning suffers most."""
+    lines = ["Every arm under sensor noise and model error, over twinning's nominal cost; a point for each seed."]
+    for plant, found in entries_by_name(results):
+        harder = {variant: named(entries)["twinning"].mean for variant, entries in results.variants[plant].items()}
+        ratios = {variant: mean / found["twinning"].mean for variant, mean in harder.items()}
+        worst = max(ratios, key=ratios.__getitem__)
+        lines.append(f"{title(plant)}: twinning suffers most from {worst}, {ratios[worst]:.3g} times its nominal cost.")
+    return " ".join(lines)
+
+
+def following(results: Results) -> str:
+    """Of the twin's errors: where they end with model error, and where without."""
+    lines = ["The twin's error after each real episode, as the twin knows the system and with model error."]
+    for plant, found in entries_by_name(results):
+        arms = found["twinning"], named(results.variants[plant][CHANGED])["twinning"]
+        nominal, other = (np.mean([errors[-1] for errors in arm.twin_errors]) for arm in arms)
+        lines.append(f"{title(plant)}: J_p ends at {nominal:.2g}, with model error at {other:.2g}.")
+    return " ".join(lines)
+
+
+def gain_line(found: dict[str, Any]) -> str:
+    """Of a cost over a gain: its first minimum, what lies behind it, and the far end."""
+    costs, name = found["costs"], found["name"]
+    first = next((k for k, (here, after) in enumerate(zip(costs, costs[1:], strict=False)) if after > here), None)
+    if first is None:
+        return f"Cost over {name}; it falls all the way."
+    values = [f"{name} = {value:.3g}" for value in found["values"]]
+    top = first + int(np.argmax(costs[first:]))
+    return (
+        f"Cost of a proportional vent over its gain: least on the smooth side at {values[first]} with "
+        f"{costs[first]:.4g}, {costs[top]:.4g} at {values[top]}, and {costs[-1]:.4g} at {values[-1]}, where the vent "
+        "only opens and shuts, as the on-off valve does."
+    )
+
+
+STUDY: dict[str, Callable[[Results], str]] = {
+    function.__name__: function for function in (learning, robustness, variants, following)
+}
+
+
+def of_run(plant: str, metrics: dict[str, Any]) -> dict[str, str]:
+    """Captions of a training's figures, by name.
+
+    Args:
+        plant: folder of the plant.
+        metrics: content of ``metrics.json``.
+    """
+    found = RUN | PLANT[plant]
+    found["learning_curves"] += " " + events(metrics)
+    found["states"] += f" J_p is {metrics['episodes'][-1]['J_p']:.2g} over the records in memory."
+    found["unseen"] += " " + cheaper(metrics)
+    for name in CLOSURES:
+        if name in found:
+            found[name] += " " + closure_error(metrics)
+    return found
+
+
+def events(metrics: dict[str, Any]) -> str:
+    """When policies swapped and were cloned, and what the live one came to."""
+    episodes = metrics["episodes"]
+    parts = []
+    for event in ("swap", "clone"):
+        numbers = [str(e["episode"] + 1) for e in episodes if e["event"] == event]
+        parts.append(f"{event} after episode {', '.join(numbers)}" if numbers else f"no {event}")
+    costs = [e["J_a_unseen"] for e in episodes]
+    return f"{'; '.join(parts).capitalize()}. J_a of the live policy went from {costs[0]:.3g} to {costs[-1]:.4g}."
+
+
+def cheaper(metrics: dict[str, Any]) -> str:
+    """On how many unseen episodes the live policy costs less than the others."""
+    live = metrics["summary"]["live"]
+    costs = {name: np.array(values) for name, values in metrics["summary"]["unseen"]["costs"].items()}
+    against = [f"{shown(name)} on {int((costs[live] < costs[name]).sum())}" for name in costs if name != live]
+    return f"The live policy ({shown(live)}) costs less than {', '.join(against)} of {len(costs[live])}."
+
+
+def closure_error(metrics: dict[str, Any]) -> str:
+    """RMS error of the twin's closure where the last episode went."""
+    errors = metrics["summary"]["closure_error"]
+    found, start = (", ".join(f"{error:.2g}" for error in errors[when]) for when in ("found", "start"))
+    return f"RMS error where the last episode went: {found}; of the initial twin {start}."
+
+
+def title(plant: str) -> str:
+    """A plant at the start of a sentence."""
+    return shown(plant).capitalize()
+
+
+def episodes_to(entry: Entry, oracle: Entry) -> str:
+    """Real episodes until an arm comes near the oracle, seed by seed."""
+    return ", ".join("never" if count is None else str(count) for count in entry.episodes_to(oracle.mean))
+
+
+def entries_by_name(results: Results) -> list[tuple[str, dict[str, Entry]]]:
+    """Every plant, by folder, with its entries by name."""
+    return [(plant, named(found)) for plant, found in results.entries.items()]
