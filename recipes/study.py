@@ -19,7 +19,7 @@ from rt_torchrl.study import captions, page, report
 from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import Task, side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, oracle
+from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, cost_over_episodes, oracle
 
 ARMS = ("twinning", "model_free", "model_based")
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
@@ -44,10 +44,10 @@ EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
 SHORT = {"wind_turbine": 600.0, "flapping_wing": 1.25, "cryogenic_tank": 1.08e5}
 """Length of an episode with ``quick`` [s]: a turbine's whole one, a quarter of the others'."""
 QUICK_VARIANTS = ("noise 5 %", CHANGED)
-GAIN_LINES: dict[str, type[ClassicalController]] = {"cryogenic_tank": PIValve}
-"""Controllers whose cost over their first gain is drawn."""
 MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
-"""Of the default gain, for these."""
+"""Of the default gain, at which the cost of a controller is drawn."""
+COUNTS = (2, 5, 10, 20)
+"""Of training episodes that exact gradients plan on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,15 +130,21 @@ class Config:
         found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
         return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
 
-    def gain_line(self, plant: str) -> Yardstick | None:
-        """The cost of a classical controller over its first gain, where that explains something."""
-        if plant not in GAIN_LINES:
+    def line(self, plant: str) -> Yardstick | None:
+        """A line through the costs of a plant, where that explains what a table cannot."""
+        lines = {
+            "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=PIValve, multiples=MULTIPLES)),
+            "flapping_wing": (
+                "episode-line",
+                partial(cost_over_episodes, counts=COUNTS, iterations=5 if self.quick else 40),
+            ),
+        }
+        if plant not in lines:
             return None
-        path = self.kept / "yardsticks" / plant / "gain-line.json"
+        name, compute = lines[plant]
         unseen = QUICK_UNSEEN if self.quick else self.unseen
-        system = recipe_of(plant), self.options_of(plant)
-        line = partial(cost_along_gain, *system, GAIN_LINES[plant], unseen=unseen, multiples=MULTIPLES)
-        return Yardstick(path, line)
+        compute = partial(compute, recipe_of(plant), self.options_of(plant), unseen=unseen)
+        return Yardstick(self.kept / "yardsticks" / plant / f"{name}.json", compute)
 
 
 def recipe_of(plant: str) -> Path:
@@ -178,7 +184,7 @@ def short_batches(config: Config) -> list[list[Task]]:
 
 def yardstick_tasks(config: Config, plant: str) -> list[Task]:
     """What trainings of a plant are measured against."""
-    line = config.gain_line(plant)
+    line = config.line(plant)
     return [*config.yardsticks(plant).values(), *([line] if line else [])]
 
 
@@ -221,10 +227,10 @@ def draw(config: Config, results: Results) -> list[str]:
         drawn["following"] = charts.following(results.entries, results.variants)
     texts = {name: captions.STUDY[name](results) for name in drawn}
     for plant in config.chosen():
-        if line := config.gain_line(plant):
-            name = f"{plant}_gain_line"
-            drawn[name] = charts.gain_line(line.run(), results.entries[plant])
-            texts[name] = captions.gain_line(line.run())
+        if line := config.line(plant):
+            name = f"{plant}_{line.path.stem}"
+            drawn[name] = charts.cost_line(line.run(), results.entries[plant])
+            texts[name] = captions.LINES[line.path.stem](line.run())
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)

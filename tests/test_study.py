@@ -13,12 +13,13 @@ import torch
 import tyro
 
 from rt_torchrl.catalogue import plants
+from rt_torchrl.evaluation import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.figures import study as charts
-from rt_torchrl.study import captions, page, report
+from rt_torchrl.study import captions, page, report, yardsticks
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.yardsticks import Yardstick, changed_closure, configured
+from rt_torchrl.study.yardsticks import Yardstick, changed_closure, configured, cost_over_episodes
 
 EPISODES = 30
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -255,7 +256,7 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     points = [line for line in harder.lines if np.allclose(line.get_xdata(), 0.8)]
     assert np.allclose([line.get_ydata() for line in points], 1.5, rtol=0.05) and len(points) == 1
     line = {"name": "K_P", "unit": "-", "values": [1.0, 10.0], "costs": [2.0, 1.0]}
-    (axes,) = charts.gain_line(line, found.entries["flapping_wing"]).axes
+    (axes,) = charts.cost_line(line, found.entries["flapping_wing"]).axes
     assert [drawn.get_label() for drawn in axes.lines[1:]] == ["twinning", "PD", "oracle"]
     assert np.allclose(axes.lines[1].get_ydata(), found.entries["flapping_wing"][0].mean)
     following = charts.following(found.entries, found.variants).axes[0]
@@ -274,6 +275,7 @@ def test_captions_say_what_is_seen(tmp_path):
     line = {"name": "K_P", "values": [1.0, 10.0, 1e3, 1e4], "costs": [2.5, 2.3, 2.4, 2.2]}
     said = captions.gain_line(line)
     assert "K_P = 10 with 2.3, 2.4 at K_P = 1e+03, and 2.2 at K_P = 1e+04" in said
+    assert "2.5 on 1, 2.3 on 10" in captions.episode_line(line | {"values": [1, 10, 100, 1000]})
     assert "falls all the way" in captions.gain_line(line | {"costs": [4.0, 3.0, 2.0, 1.0]})
 
 
@@ -339,6 +341,16 @@ def test_short_trainings_of_a_plant_share_a_worker(tmp_path):
     assert alone[0].options[-2:] == ("--policy", "scheduled")
     planned = [task for batch in batches for task in batch]
     assert len(planned) == len(study.ordered_tasks(study.Config(quick=True, folder=tmp_path)))
+
+
+def test_a_plan_on_training_episodes_is_judged_on_unseen_ones(monkeypatch):
+    monkeypatch.setattr(yardsticks, "missing_for_compilation", lambda: "a compiler")
+    system = RECIPES / "wind_turbine.py", ("--horizon", "5")
+    planned = {n: cost_over_episodes(*system, unseen=4, counts=(2, 3), iterations=n) for n in (0, 8)}
+    plant = configured(*system).plant()
+    start = plant.make_policy(torch.Generator().manual_seed(UNSEEN_SEED))
+    assert planned[0]["costs"] == pytest.approx([UnseenEpisodes(plant, 4).control_costs(start).mean().item()] * 2)
+    assert planned[8]["values"] == [2, 3] and max(planned[8]["costs"]) < planned[0]["costs"][0]
 
 
 def test_yardsticks_are_measured_on_the_plant_of_the_trainings():

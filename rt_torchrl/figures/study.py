@@ -111,11 +111,11 @@ def following(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[
     return figure
 
 
-def gain_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
-    """J_a of a classical controller over one of its gains, between the arms and yardsticks of the plant.
+def cost_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
+    """J_a over one quantity, between the arms and yardsticks of the plant.
 
     Args:
-        found: as :func:`rt_torchrl.study.yardsticks.cost_along_gain` returns it.
+        found: as :func:`rt_torchrl.study.yardsticks.cost_along_gain` and ``cost_over_episodes`` return it.
         entries: of the plant; twinning, oracle and the classical controllers are drawn as levels.
     """
     figure, axes = panels(1, title=f"Cost over {found['name']}, all else as it is", size=(8.0, 4.0))

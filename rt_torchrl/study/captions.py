@@ -96,6 +96,17 @@ def gain_line(found: dict[str, Any]) -> str:
     )
 
 
+def episode_line(found: dict[str, Any]) -> str:
+    """Of a cost over the number of episodes planned on: its ends."""
+    counts, costs = found["values"], found["costs"]
+    parts = ", ".join(f"{cost:.4g} on {count}" for count, cost in zip(counts, costs, strict=True))
+    return (
+        "Cost on the unseen episodes of the plant's own policy, planned with exact gradients on the true plant, over "
+        f"the number of training episodes that it is planned on: {parts}."
+    )
+
+
+LINES: dict[str, Callable[[dict[str, Any]], str]] = {"gain-line": gain_line, "episode-line": episode_line}
 STUDY: dict[str, Callable[[Results], str]] = {
     function.__name__: function for function in (learning, robustness, variants, following)
 }

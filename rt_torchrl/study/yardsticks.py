@@ -144,10 +144,35 @@ def cost_along_gain(
     return {"name": name, "unit": unit, "values": values, "costs": costs}
 
 
-def unseen_episodes(plant: Plant, count: int) -> UnseenEpisodes:
-    """What everything is judged on; with one thread, because others work beside this process."""
+def cost_over_episodes(
+    recipe: Path, options: Options, *, unseen: int, counts: Sequence[int], iterations: int
+) -> dict[str, Any]:
+    """J_a of the plant's own policy over the number of training episodes that it is planned on, by exact gradients.
+
+    A training that has met no more of them cannot be expected to do better.
+
+    Args:
+        recipe: of the plant.
+        options: of its trainings.
+        unseen: number of unseen episodes to judge on.
+        counts: numbers of training episodes, the true disturbances of each known.
+        iterations: gradients of each plan, from the same initial weights.
+
+    Returns:
+        ``name`` and ``unit`` of the abscissa, its ``values`` and mean ``costs`` on the unseen episodes.
+    """
+    plant, costs = configured(recipe, options).plant(), []
+    judged, met = unseen_episodes(plant, unseen), unseen_episodes(plant, max(counts), seed=TRAINING_SEED)
+    for count in counts:
+        best = exact_optimum(met, plant.make_policy, starts=1, iterations=iterations, few=count, polish=0)
+        costs.append(judged.control_costs(best.policy).mean().item())
+    return {"name": "episodes planned on", "unit": "-", "values": list(counts), "costs": costs}
+
+
+def unseen_episodes(plant: Plant, count: int, **seed: int) -> UnseenEpisodes:
+    """What everything is judged on, or with another seed others; with one thread, because others work beside it."""
     torch.set_num_threads(1)
-    return UnseenEpisodes(plant, count, compiled=missing_for_compilation() is None)
+    return UnseenEpisodes(plant, count, compiled=missing_for_compilation() is None, **seed)
 
 
 def changed_closure(system: Plant, recipe: Path, options: Options) -> nn.Module | None:
