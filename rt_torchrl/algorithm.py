@@ -4,10 +4,12 @@ Two policies of the same observation live side by side, π_mf (model-free) and �
 on the real system. The other is idle, learns beside it and can take over.
 """
 
+import copy
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
@@ -24,6 +26,7 @@ from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, Record, Shor
 from rt_torchrl.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
 from rt_torchrl.model_free import ModelFree, ModelFreeConfig
 from rt_torchrl.switching import PolicySwitch, Role, SwitchConfig
+from rt_torchrl.trajectory import DivergenceError
 from rt_torchrl.twin import DigitalTwin
 
 Arm = Literal["twinning", "model_free", "model_based"]
@@ -105,6 +108,7 @@ class ReinforcementTwinning:
             FlightCollector(env, self.actor) if simulated else EpisodeCollector(env, self.actor, twin.plant.n_steps)
         )
         self.episodes_done = 0
+        self._earlier_closure: dict[str, Any] | None = None
 
     def episode(self) -> TensorDict:
         """One real episode and all that is learned from it: the six steps of the paper, in order.
@@ -119,7 +123,7 @@ class ReinforcementTwinning:
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
             start = time.perf_counter()
-            report.update(step())
+            report.update(self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
         return report.update({"seconds": findings(**seconds)})
@@ -153,8 +157,33 @@ class ReinforcementTwinning:
     def assimilate(self) -> TensorDict:
         """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
         processes = list(self.processes)[-len(self.short_term) :]
+        self._earlier_closure = copy.deepcopy(self.twin.closure.state_dict())
         found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
-        return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient)
+        return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
+
+    def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
+        """Step 5 or 6; if the twin diverges in it, the closure of the episode before takes the place of w_p*.
+
+        A closure that replays the records best may still be one that no other flight can be made with: where noise of
+        the sensors is large beside what the closure does. The real system runs on meanwhile, and cannot wait.
+
+        Raises:
+            DivergenceError: if the twin diverges with the earlier closure too.
+        """
+        state, policy = self.generator.get_state(), copy.deepcopy(self.policies["model_based"].state_dict())
+        try:
+            return step()
+        except DivergenceError as error:
+            if self._earlier_closure is None:
+                raise
+            refused = f"closure refused: {error}"
+        self.twin.closure.load_state_dict(self._earlier_closure)
+        self._earlier_closure = None
+        self.generator.set_state(state)
+        self.policies["model_based"].load_state_dict(policy)
+        self.model_based.restart()
+        report = step()
+        return report.update(findings(closure_refused=1.0)).set_non_tensor("reason", refused)
 
     def plan(self) -> TensorDict:
         """Step 5: n_mb gradient steps on J_a over N_z virtual trajectories under π_mb, on the twin with w_p*."""

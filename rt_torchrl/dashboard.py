@@ -17,6 +17,7 @@ TAGS = {
     "plan_accepted": "switch/plan accepted",
     "J_p_before": "twin/J_p before assimilation",
     "J_p": "twin/J_p after assimilation",
+    "closure_refused": "twin/closure refused",
     "closure_gradient": "gradient norm/closure (J_p)",
     "policy_gradient": "gradient norm/model-based policy (J_a)",
     "actor_gradient": "gradient norm/model-free policy",

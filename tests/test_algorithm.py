@@ -1,11 +1,13 @@
 """The six steps together, on the linear-quadratic plant, where the right closure and the right gain are known."""
 
+import dataclasses
 import functools
 
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from tensordict import TensorDict
 from test_model_free import optimal_gain
 
 from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
@@ -17,6 +19,7 @@ from rt_torchrl.exploration import ExplorationConfig
 from rt_torchrl.model_based import ModelBasedConfig
 from rt_torchrl.model_free import ModelFreeConfig
 from rt_torchrl.switching import SwitchConfig
+from rt_torchrl.trajectory import DivergenceError
 from rt_torchrl.twin import DigitalTwin
 
 STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "plan", "switch_policies"]
@@ -142,6 +145,50 @@ def test_live_starts_model_free_and_explores_less_and_less():
     assert found.switch.live == "model_free" and found.actor.policy is found.policies["model_free"]
     strengths = [found.episode()["exploration"] for _ in range(6)]
     assert strengths == pytest.approx([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
+
+
+def unsound(found, monkeypatch, episodes):
+    """Let step 4 find, in these episodes, a closure under which no flight stays finite."""
+    update = found.assimilation.update
+
+    def updated(*arguments):
+        descended = update(*arguments)
+        if found.episodes_done in episodes:
+            for weight in found.twin.closure.parameters():
+                weight.data.fill_(1e300)
+        return descended
+
+    monkeypatch.setattr(found.assimilation, "update", updated)
+
+
+@pytest.mark.parametrize("step", ["plan", "switch_policies"])
+def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step):
+    found, sound = twinning(), twinning()
+    for algorithm in (found, sound):
+        algorithm.episode()
+    earlier = weights(found.twin.closure)
+    unsound(found, monkeypatch, {1})
+    # Compared with an algorithm whose step 4 finds nothing new, and whose planning begins afresh.
+    sound.model_based.restart()
+    sound.assimilation.config = dataclasses.replace(sound.assimilation.config, iterations=0)
+    if step == "switch_policies":
+        for algorithm in (found, sound):
+            monkeypatch.setattr(algorithm, "plan", functools.wraps(algorithm.plan)(lambda: TensorDict({})))
+    report, expected = found.episode(), sound.episode()
+    assert report["closure_refused"] == 1.0 and expected["closure_refused"] == 0.0
+    assert report["reason"].startswith("closure refused: plant") and "diverged" in report["reason"]
+    assert torch.equal(weights(found.twin.closure), earlier)
+    for role in found.policies:
+        assert torch.equal(weights(found.policies[role]), weights(sound.policies[role]))
+    assert report["J_a_model_based"] == expected["J_a_model_based"]
+
+
+def test_a_twin_that_diverges_with_the_earlier_closure_too_ends_the_training(monkeypatch):
+    found = twinning()
+    unsound(found, monkeypatch, {0})
+    monkeypatch.setattr(found.twin.closure, "load_state_dict", lambda state: None)
+    with pytest.raises(DivergenceError, match="diverged"):
+        found.episode()
 
 
 def test_swap_changes_who_acts_and_copies_nothing():
