@@ -232,6 +232,14 @@ def test_a_batch_runs_in_one_process_and_the_bar_counts_tasks(tmp_path, capsys):
     assert "1/6" in shown and "6/6" in shown
 
 
+def test_a_task_that_fails_stops_no_other(tmp_path):
+    failing = training(tmp_path, 7, recipe=written(tmp_path / "fails.py", "raise ValueError('no rotor')"))
+    others = [Counted(tmp_path / "first"), Counted(tmp_path / "second")]
+    with pytest.raises(RuntimeError, match=r"1 failed, the others are kept:\nRuntimeError: .*fails.py .* no rotor"):
+        side_by_side([[failing, others[0]], [others[1]]], backend="loky", jobs=1)
+    assert all(task.done() for task in others)
+
+
 def test_trainings_spread_over_ray(tmp_path):
     ray = pytest.importorskip("ray")
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)

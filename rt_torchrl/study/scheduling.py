@@ -26,8 +26,11 @@ class Task(Protocol):
 def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) -> None:
     """Run batches of tasks through joblib, the tasks of a batch one after another in one process.
 
+    A task that fails stops no other: what they compute is kept.
+
     Raises:
         ValueError: if the backend is Ray and there is none.
+        RuntimeError: after all tasks, if some failed; with what they said.
     """
     if backend == "ray":
         try:
@@ -36,13 +39,21 @@ def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) 
             raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
         register_ray()
     with progress([task for batch in batches for task in batch]):
-        Parallel(n_jobs=jobs, backend=backend, batch_size=1)(delayed(in_a_row)(batch) for batch in batches)
+        said = Parallel(n_jobs=jobs, backend=backend, batch_size=1)(delayed(in_a_row)(batch) for batch in batches)
+    failures = [failure for batch in said for failure in batch]
+    if failures:
+        raise RuntimeError(f"{len(failures)} failed, the others are kept:\n" + "\n".join(failures))
 
 
-def in_a_row(tasks: Sequence[Task]) -> None:
-    """One after another."""
+def in_a_row(tasks: Sequence[Task]) -> list[str]:
+    """One after another; returns what those that failed said."""
+    failures = []
     for task in tasks:
-        task.run()
+        try:
+            task.run()
+        except Exception as error:
+            failures.append(f"{type(error).__name__}: {error}")
+    return failures
 
 
 @contextmanager
