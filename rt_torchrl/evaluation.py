@@ -82,9 +82,15 @@ class UnseenEpisodes:
         return self.plant.categories(self.exogenous)
 
     @torch.no_grad()
-    def identification_costs(self, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
-        """J_p of each episode: a twin with this closure replays what was flown, under the true disturbances."""
-        rollout = Rollout(self.plant, closure, compiled=self._compiled)
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
+        """J_p of each episode: a twin replays what was flown, under the true disturbances.
+
+        Args:
+            physics: the twin's, which need not be those of the real system.
+            closure: the twin's.
+            flown: the episodes on the real system.
+        """
+        rollout = Rollout(physics, closure, compiled=self._compiled)
         replayed = rollout(flown.states[:, 0], self.exogenous_of(flown), flown.actions)
         return identification_cost(self.plant, replayed, flown.states)
 

@@ -67,7 +67,7 @@ def summary(
     closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
-    J_p, J_p_before = twin_costs(unseen, algorithm.policies[live], closure, initial_closure)
+    J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure)
     after = {role: judged[role].control_costs.mean() for role in ROLES}
     better = min(ROLES, key=lambda role: after[role].item())
     means = {"J_p": J_p, "J_p_before": J_p_before, "J_a_untrained": untrained}
@@ -92,10 +92,12 @@ def summary(
     return found | {"reference": reference}
 
 
-def twin_costs(unseen: UnseenEpisodes, policy: nn.Module, *closures: nn.Module) -> list[Float[Tensor, " count"]]:
-    """J_p of twins with these closures on the unseen episodes, as a policy flies them."""
-    flown = unseen.fly(policy)
-    return [unseen.identification_costs(closure, flown) for closure in closures]
+def twin_costs(
+    unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module
+) -> list[Float[Tensor, " count"]]:
+    """J_p of the twin as it is and as it was, on the unseen episodes as the live policy flies them."""
+    twin, flown = algorithm.twin, unseen.fly(algorithm.policies[algorithm.switch.live])
+    return [unseen.identification_costs(twin.plant, closure, flown) for closure in (twin.closure, initial_closure)]
 
 
 def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from rt_torchrl.model_free import ModelFreeConfig
 from rt_torchrl.run_config import RunConfig
 from rt_torchrl.runner import Run
 from rt_torchrl.switching import SwitchConfig
+from rt_torchrl.trajectory import Rollout, identification_cost
 
 SMALL = TwinningConfig(
     realisations=2,
@@ -150,9 +151,14 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
 
     config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures_every=0, twinning=SMALL, episodes=1)
     run = Run(config, Heavier(horizon=2.0), believed=LinearQuadratic(horizon=2.0))
-    run.train()
+    found = run.train()["summary"]
     assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
     assert isinstance(run.unseen.plant, Heavier)
+    # The twin is judged with the physics it believes in.
+    twin, flown = run.algorithm.twin, run.unseen.fly(run.algorithm.policies[found["live"]])
+    replayed = Rollout(twin.plant, twin.closure)(run.unseen.initial_state, run.unseen.exogenous, flown.actions)
+    expected = identification_cost(twin.plant, replayed, flown.states).mean().item()
+    assert found["unseen"]["J_p"]["mean"] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("options", [{}, {"model_free_policy": "mlp", "hidden": (4,)}], ids=["same", "two kinds"])
