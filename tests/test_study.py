@@ -256,6 +256,10 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     assert texts == {"twinning", "model free", "model based", "twinning, other", "oracle", "classical"}
     (line,) = [line for line in curves.axes[0].lines if line.get_label() == "twinning"]
     assert np.allclose(line.get_ydata(), [5.0, 1.05, 1.0])
+    other = {"a": [found.entries["flapping_wing"][3]], "b": found.entries["flapping_wing"][::-1]}
+    drawn = [ax.lines for ax in charts.learning(other).axes]
+    colours = [{line.get_color() for line in lines if line.get_label() == "twinning, other"} for lines in drawn]
+    assert colours[0] == colours[1] and len(colours[0]) == 1
     violins = charts.robustness(found.entries)
     labels = [label.get_text() for label in violins.axes[0].get_xticklabels()]
     assert labels == ["twinning", "model free", "model based", "twinning,\nother", "PD", "oracle"]

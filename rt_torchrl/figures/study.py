@@ -19,6 +19,8 @@ DASHES = ("--", ":", "-.", (0, (1, 1)), (0, (8, 1)))
 YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
 WIDEST_LINEAR = 5.0
 """Ratio of the greatest to the least cost above which an axis is logarithmic."""
+WIDEST_LINEAR_SPAN = 50.0
+"""The same of an abscissa."""
 
 
 def learning(entries: dict[str, list[Entry]]) -> Figure:
@@ -31,10 +33,11 @@ def learning(entries: dict[str, list[Entry]]) -> Figure:
     """
     title = "Cost on unseen episodes while training; band: range of the seeds"
     figure, axes = panels(1, len(entries), title=title, size=(max(7.5, 4.6 * len(entries)), 4.0))
+    colours = _colours([entry for found in entries.values() for entry in found])
     for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
         for entry in found:
             if entry.curves and entry.curves[0]:
-                _spread(ax, entry.curves, color=_colours(found)[entry.name], label=shown(entry.name))
+                _spread(ax, entry.curves, color=colours[entry.name], label=shown(entry.name))
             elif entry.name == "oracle":
                 ax.axhline(entry.mean, label="oracle", **REFERENCE_LINE)
             else:
@@ -51,11 +54,12 @@ def robustness(entries: dict[str, list[Entry]]) -> Figure:
     """Distribution of J_a over the unseen episodes (all seeds together), a violin for every arm and yardstick."""
     title = "Cost over the unseen episodes; bar: mean"
     figure, axes = panels(len(entries), title=title, size=(9.0, 2.9 * len(entries)))
+    colours = _colours([entry for found in entries.values() for entry in found])
     for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
         costs = [entry.costs.ravel() for entry in found]
         violins = ax.violinplot(costs, showmeans=False, showextrema=True, widths=0.8)
         for body, entry in zip(violins["bodies"], found, strict=True):
-            body.set_facecolor(_colours(found)[entry.name])
+            body.set_facecolor(colours[entry.name])
         _bars(ax, [values.mean() for values in costs])
         together = np.concatenate(costs)
         if together.min() > 0 and together.max() > WIDEST_LINEAR * together.min():
@@ -125,7 +129,8 @@ def cost_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
     for k, entry in enumerate(levels):
         line = {"linestyle": DASHES[k % len(DASHES)], "color": _colours(entries)[entry.name], "linewidth": 1.2}
         ax.axhline(entry.mean, label=shown(entry.name), **line)
-    ax.set_xscale("log")
+    if max(found["values"]) > WIDEST_LINEAR_SPAN * min(found["values"]):
+        ax.set_xscale("log")
     ax.set_xlabel(f"{found['name']} [{found['unit']}]")
     caption(ax, "$J_a$")
     legend_below(figure, [ax])
@@ -148,7 +153,7 @@ def _bars(ax: Axes, means: list[float]) -> None:
 
 def _colours(entries: list[Entry]) -> dict[str, str]:
     """Of each arm, policy and yardstick."""
-    others = [entry.name for entry in entries if entry.curves and entry.name not in ARMS]
+    others = list(dict.fromkeys(entry.name for entry in entries if entry.curves and entry.name not in ARMS))
     policies = {name: POLICIES[k % len(POLICIES)] for k, name in enumerate(others)}
     return {entry.name: (ARMS | policies).get(entry.name, REFERENCE) for entry in entries}
 

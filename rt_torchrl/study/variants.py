@@ -10,7 +10,8 @@ TEXT = (
     "Training with sensors that err by a share of what they read, and with what the twin does not know: a rotor that "
     "is worn from the middle of the training on, a body a third heavier than the twin believes, a heat exchanger that "
     "fouls. Policies are judged with exact sensors, on the real system as it is at the end; the classical controllers "
-    "keep the gains they were tuned to before."
+    "keep the gains they were tuned to before. Where there is one training of each, an interval is of that training's "
+    "episodes alone."
 )
 
 
