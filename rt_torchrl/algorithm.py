@@ -164,8 +164,8 @@ class ReinforcementTwinning:
     def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
         """Step 5 or 6; if the twin diverges in it, the closure of the episode before takes the place of w_p*.
 
-        Note: the paper keeps every closure. One that replays the records best may still be one that no other flight can be made with: where noise of
-        the sensors is large beside what the closure does. The real system runs on meanwhile, and cannot wait.
+        Note: the paper keeps every closure. One that replays the records best may still be one that no other flight can
+        be made with, where noise of the sensors is large beside what the closure does; the real system cannot wait.
 
         Raises:
             DivergenceError: if the twin diverges with the earlier closure too.
