@@ -132,12 +132,10 @@ class Config:
 
     def line(self, plant: str) -> Yardstick | None:
         """A line through the costs of a plant, where that explains what a table cannot."""
+        counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
         lines = {
             "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=PIValve, multiples=MULTIPLES)),
-            "flapping_wing": (
-                "episode-line",
-                partial(cost_over_episodes, counts=COUNTS, iterations=5 if self.quick else 40),
-            ),
+            "flapping_wing": ("episode-line", partial(cost_over_episodes, counts=counts, iterations=iterations)),
         }
         if plant not in lines:
             return None
