@@ -44,6 +44,7 @@ EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
 SHORT = {"wind_turbine": 600.0, "flapping_wing": 1.25, "cryogenic_tank": 1.08e5}
 """Length of an episode with ``quick`` [s]: a turbine's whole one, a quarter of the others'."""
 QUICK_VARIANTS = ("noise 5 %", CHANGED)
+"""Of the variants, those that short trainings have."""
 MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
 """Of the default gain, at which the cost of a controller is drawn."""
 COUNTS = (2, 5, 10, 20)
@@ -114,8 +115,9 @@ class Config:
         found["nominal", "twinning"][0] = replace(found["nominal", "twinning"][0], figures=True)
         for name, policy in POLICIES.get(plant, {}).items():
             found["nominal", name] = every("twinning", "nominal", seeds, *policy, folder="-".join(policy).strip("-"))
+        if not others:
+            return found
         harder = QUICK_VARIANTS if self.quick else [variant for variant in VARIANTS if variant != "nominal"]
-        harder = harder if others else []
         return found | {(variant, arm): every(arm, variant, others) for variant in harder for arm in ARMS}
 
     def yardsticks(self, plant: str) -> dict[str, Yardstick]:
@@ -172,7 +174,7 @@ def short_batches(config: Config) -> list[list[Task]]:
     A policy on another plant, with graphs of its own, goes wherever there is time.
     """
     batches, alone = [], []
-    for plant in sorted(config.chosen(), key=list(SHORT).index):
+    for plant in config.chosen():
         groups = config.trainings(plant)
         together = [training for key, group in groups.items() if key[1] not in OTHER_PLANT for training in group]
         batches.append([*yardstick_tasks(config, plant), *together])
@@ -226,9 +228,9 @@ def draw(config: Config, results: Results) -> list[str]:
     texts = {name: captions.STUDY[name](results) for name in drawn}
     for plant in config.chosen():
         if line := config.line(plant):
-            name = f"{plant}_{line.path.stem}"
-            drawn[name] = charts.cost_line(line.run(), results.entries[plant])
-            texts[name] = captions.LINES[line.path.stem](line.run())
+            name, costs = f"{plant}_{line.path.stem}", line.run()
+            drawn[name] = charts.cost_line(costs, results.entries[plant])
+            texts[name] = captions.LINES[line.path.stem](costs)
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
@@ -238,7 +240,7 @@ def draw(config: Config, results: Results) -> list[str]:
         for name, text in captions.of_run(plant, first.metrics()).items():
             copy = folder / f"{plant}_{name}.png"
             shutil.copy(first.folder / "figures" / f"{name}.png", copy)
-            found.append(page.figure(copy, config.kept, f"{charts.shown(plant).capitalize()}, seed 0. {text}"))
+            found.append(page.figure(copy, config.kept, f"{captions.title(plant)}, seed 0. {text}"))
     return found
 
 

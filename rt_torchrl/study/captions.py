@@ -8,8 +8,9 @@ import numpy as np
 from rt_torchrl.figures.study import shown
 from rt_torchrl.study.findings import NEAR, Entry, Results, named
 from rt_torchrl.study.training import CHANGED
+from rt_torchrl.study.variants import HALVES
 
-ARMS = ("twinning", "model_based", "model_free")
+ARMS = ("twinning", *HALVES)
 RUN = {
     "learning_curves": "Costs, the twin's error and who was live; vertical lines are swaps and clones.",
     "states": "The last real episode and the twin's replay of it.",

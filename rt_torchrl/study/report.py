@@ -8,6 +8,7 @@ import numpy as np
 
 from rt_torchrl.figures.study import shown
 from rt_torchrl.study import variants
+from rt_torchrl.study.captions import title
 from rt_torchrl.study.findings import Entry, Results, named
 from rt_torchrl.study.page import table
 from rt_torchrl.study.rows import COST_HEADER, TWIN_HEADER, compared, cost_cells, merit_cells, twin_cells
@@ -107,13 +108,13 @@ def sections(results: Results, *, figures: list[str], quick: bool, command: str)
             "**Made with `--quick`, from short trainings and short episodes: the report's form, but no result.**"
         )
     for plant, entries in results.entries.items():
-        found += [f"## {shown(plant).capitalize()}", merit_table(entries), verdicts(entries)]
+        found += [f"## {title(plant)}", merit_table(entries), verdicts(entries)]
         found += [CAUSES[plant]] if plant in CAUSES else []
     found += ["## The paper's table of learning performance", PAPER_TEXT, paper_table(results.summaries)]
     if any(results.variants.values()):
         found += ["## Sensor noise and model error", variants.TEXT]
         for plant, harder in results.variants.items():
-            found += [f"### {shown(plant).capitalize()}", variants.merit_table(harder, results.entries[plant])]
+            found += [f"### {title(plant)}", variants.merit_table(harder, results.entries[plant])]
             found += [variants.verdicts(harder)]
     return [*found, "## Figures", *figures]
 
