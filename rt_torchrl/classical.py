@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.compilation import compiled_if
+from rt_torchrl.compilation import compiled_if, marked_dynamic
 from rt_torchrl.engines.recurrence import march, march_by_scan
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
@@ -71,7 +71,7 @@ class ClassicalController(nn.Module, ABC):
         """Real episodes under this controller, of a system with this closure; None for the plant's own."""
         closure = self.plant.closure if closure is None else closure
         loop, n_s = ControlledInterval(self, closure), len(self.plant.states)
-        start = torch.cat([initial_state, self.first_memory(initial_state)], -1)
+        start = marked_dynamic(torch.cat([initial_state, self.first_memory(initial_state)], -1), 0)
         drive = drive_of(self.plant, exogenous, None)
         carries = torch.cat([start.unsqueeze(0), self._march(loop, start, drive)])
         states = carries[..., :n_s].transpose(0, 1)

@@ -2,13 +2,15 @@
 
 import shutil
 import sysconfig
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import cache
 from pathlib import Path
 
 import torch
 from hoptorch.scan import ensure_scan_backward
+from torch import Tensor
+from torch._dynamo.types import GuardFilterEntry
 from torch._inductor import config as inductor_config
 
 LIMITS = {
@@ -43,6 +45,21 @@ def compiled_if(compiled: bool, function: Callable, eager: Callable | None = Non
     return _compile(function)
 
 
+def marked_dynamic(tensor: Tensor, dim: int) -> Tensor:
+    """The tensor, of which the compiler is told that the size of a dimension changes: one graph for all sizes."""
+    torch._dynamo.maybe_mark_dynamic(tensor, dim)
+    return tensor
+
+
+def plain(tensor: Tensor) -> Tensor:
+    """A copy with the strides of its shape.
+
+    A tensor with a dimension of one counts as contiguous whatever its stride there is, but the compiler traces again
+    for another, and a scan refuses it.
+    """
+    return tensor.clone(memory_format=torch.contiguous_format)
+
+
 def missing_for_compilation() -> str | None:
     """What torch.compile lacks on this machine's CPU, in words; None if nothing."""
     candidates = [c for c in inductor_config.cpp.cxx if c] if isinstance(inductor_config.cpp.cxx, tuple) else ["g++"]
@@ -57,7 +74,16 @@ def missing_for_compilation() -> str | None:
 def _compile(function: Callable) -> Callable:
     # Cached, so that every user of a function shares its graphs.
     _prepare()
-    return torch.compile(function, fullgraph=True)
+    return torch.compile(function, fullgraph=True, options={"guard_filter_fn": _lasting})
+
+
+def _lasting(guards: Sequence[GuardFilterEntry]) -> list[bool]:
+    """Leave out the one guard that fails again and again although nothing has changed.
+
+    TensorDict takes part in every vmap and remembers there which classes are its own. That memory grows as a program
+    goes on, and each time every graph with a vmap in it would be traced once more.
+    """
+    return ["_TENSORCLASS_MEMO" not in guard.name for guard in guards]
 
 
 @cache

@@ -9,13 +9,15 @@ give the gradient, the Gauss-Newton matrix and the Fisher information of an iden
 number of weights, that of an adjoint does not: they are for closures of up to some hundred weights.
 """
 
+from functools import partial
+
 import torch
 from hoptorch.scan import scan
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.compilation import compiled_if
-from rt_torchrl.engines.parallel_adjoint import linearise, piecewise
+from rt_torchrl.compilation import compiled_if, marked_dynamic, plain
+from rt_torchrl.engines.parallel_adjoint import over_all
 from rt_torchrl.engines.recurrence import march, march_by_scan, march_by_step
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
@@ -38,11 +40,9 @@ class Sensitivities:
     def __init__(self, plant: Plant, closure: nn.Module, *, compiled: bool = False, compiled_step: bool = False):
         self.interval = Interval(plant, closure, None)
         self._march = march_by_step if compiled_step else compiled_if(compiled, march_by_scan, march)
-        self._linearise = compiled_if(compiled, linearise)
         wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
-        # By rows uncompiled: the compiler fails on them for a batch of unknown size, and gains little on large batches.
-        columns = compiled_if(compiled, weight_jacobians)
-        self._weight_jacobians = weight_jacobians_by_rows if wide else columns
+        # By rows uncompiled: the compiler gains little there.
+        self._jacobians = jacobians_by_rows if wide else compiled_if(compiled, jacobians_by_columns)
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
 
     @torch.no_grad()
@@ -65,48 +65,46 @@ class Sensitivities:
             initial: append n_s columns, ds_k/ds_0.
         """
         drive = drive_of(self.interval.plant, exogenous, actions, start=start)
-        initial_state = initial_state.clone(memory_format=torch.contiguous_format)
+        initial_state = marked_dynamic(plain(initial_state), 0)
         ends = self._march(self.interval, initial_state, drive)
         starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])
         names = tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
-        A = piecewise(self._linearise, self.interval, starts, drive)
-        B = self._weight_jacobians(self.interval, names, starts, drive) if names else A[..., :0]
+        n_s = initial_state.shape[-1]
+        A, B = over_all(partial(self._jacobians, self.interval, names), starts, drive).tensor_split([n_s], -1)
         if initial:
             # s_0 acts like weights that are used in the first interval alone.
             B = torch.cat([B, torch.cat([A[:1], torch.zeros_like(A[1:])])], -1)
         return ends.transpose(0, 1), self._propagate(A, B).transpose(0, 1)
 
 
-def weight_jacobians(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """∂Φ/∂w at every interval, ``n batch n_s n_w``, by n_w forward-mode products."""
+def jacobians_by_columns(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column."""
     weights = tuple(interval.closure.get_parameter(name) for name in names)
-    sizes = [w.numel() for w in weights]
+    sizes = [starts.shape[-1], *(w.numel() for w in weights)]
     basis = torch.eye(sum(sizes), dtype=starts.dtype, device=starts.device)
 
-    def end(*values: Tensor) -> Tensor:
+    def end(state: Tensor, *values: Tensor) -> Tensor:
         replaced = {f"closure.{name}": value for name, value in zip(names, values, strict=True)}
-        return torch.func.functional_call(interval, replaced, (starts, drive))
+        return torch.func.functional_call(interval, replaced, (state, drive))
 
     def column(direction: Tensor) -> Tensor:
-        parts = direction.split(sizes)
-        tangents = tuple(part.reshape(w.shape) for part, w in zip(parts, weights, strict=True))
-        return torch.func.jvp(end, weights, tangents)[1]
+        by_state, *by_weights = direction.split(sizes)
+        tangents = (part.reshape(w.shape) for part, w in zip(by_weights, weights, strict=True))
+        return torch.func.jvp(end, (starts, *weights), (by_state.expand_as(starts), *tangents))[1]
 
     return torch.func.vmap(column, out_dims=-1)(basis)
 
 
-def weight_jacobians_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """The same by n_s reverse-mode products at every interval, which is less work where n_w is far above n_s."""
+def jacobians_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """The same by a reverse-mode product for each row, which is less work where n_w is far above n_s."""
     weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
 
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
         return torch.func.functional_call(interval, values, (state, Drive(*drive)))
 
-    rows = torch.func.jacrev(end)
-    for _ in range(2):  # over the realisations, then over time
-        rows = torch.func.vmap(rows, in_dims=(None, 0, 0, 0, 0))
-    found = rows(weights, starts, drive.t.expand(starts.shape[:2]), drive.exogenous, drive.command)
-    return torch.cat([jacobian.flatten(3) for jacobian in found.values()], -1)
+    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
+    by_state, by_weights = rows(weights, starts, *drive)
+    return torch.cat([by_state, *(jacobian.flatten(2) for jacobian in by_weights.values())], -1)
 
 
 def propagate(A: Tensor, B: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.compilation import marked_dynamic, plain
 from rt_torchrl.engines import Backpropagation, ContinuousAdjoint, ParallelAdjoint
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
@@ -100,8 +101,7 @@ class Rollout:
                 "use parallel or autograd, or whole records (segment=0)."
             )
         drive = drive_of(self.plant, exogenous, command, start=start)
-        torch._dynamo.maybe_mark_dynamic(initial_state, 0)
-        ends = self._engine.end_states(self.interval, initial_state.contiguous(), drive)
+        ends = self._engine.end_states(self.interval, marked_dynamic(plain(initial_state), 0), drive)
         require_finite(self.plant, ends, initial_state, [self.interval.closure, self.interval.policy], start=start)
         states = torch.cat([initial_state.unsqueeze(0), ends])
         # A function of the states, so that every engine differentiates the actions the same way.
@@ -172,10 +172,10 @@ def drive_of(
     """The drive, time first, of inputs and commands that come batch first; ``start`` as in :class:`Rollout`."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
-    commands = exogenous.new_empty(n, batch, 0) if command is None else command.transpose(0, 1).contiguous()
-    drive = Drive(t, exogenous.transpose(0, 1).contiguous(), commands)
+    commands = exogenous.new_empty(n, batch, 0) if command is None else plain(command.transpose(0, 1))
+    drive = Drive(t, plain(exogenous.transpose(0, 1)), commands)
     for tensor in drive if isinstance(start, Tensor) else drive[1:]:
-        torch._dynamo.maybe_mark_dynamic(tensor, 1)  # one compiled graph for all batch sizes
+        marked_dynamic(tensor, 1)  # one compiled graph for all batch sizes
     return drive
 
 

@@ -1,5 +1,7 @@
 """The digital twin: a plant's vector field and step under a learned closure."""
 
+import copy
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -23,11 +25,11 @@ class DigitalTwin:
     def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "parallel", compiled: bool = False):
         self.plant, self.closure = plant, closure
         self._engine, self._compiled = engine, compiled
-        self._replay = self._rollout(None)
+        self._replay = self._rollout(closure, None)
         self.sensitivities = Sensitivities(plant, closure, compiled=compiled)
 
-    def _rollout(self, policy: nn.Module | None) -> Rollout:
-        return Rollout(self.plant, self.closure, policy, engine=self._engine, compiled=self._compiled)
+    def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
+        return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
 
     def replay(
         self,
@@ -48,11 +50,21 @@ class DigitalTwin:
         *,
         start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
-        """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`."""
-        return self._rollout(policy)(initial_state, exogenous, start=start)
+        """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
+
+        Differentiable by the policy's weights and the initial state; the closure is held constant.
+        """
+        return self._rollout(constant(self.closure), policy)(initial_state, exogenous, start=start)
 
     def cost(
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
         return control_cost(self.plant, self.control(policy, initial_state, exogenous), exogenous).mean()
+
+
+def constant(module: nn.Module) -> nn.Module:
+    """The same module, sharing its weights, of which no gradient is asked."""
+    shared = {id(w): nn.Parameter(w.detach(), requires_grad=False) for w in module.parameters()}
+    shared |= {id(buffer): buffer for buffer in module.buffers()}
+    return copy.deepcopy(module, shared)

@@ -13,18 +13,20 @@ trajectories are one batched call, and so is the sum over k.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from hoptorch.scan import scan
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rt_torchrl.compilation import compiled_if
+from rt_torchrl.compilation import compiled_if, marked_dynamic, plain
 from rt_torchrl.engines.recurrence import march, march_by_scan
 from rt_torchrl.interval import Drive, Interval
 
-PIECE = 40_000
-"""Intervals that are linearised at once: the products of many more fall out of the cache, and take twice the time."""
+PIECE = 2048
+"""Intervals that are linearised at once. Forward mode ties a compiled graph to one number; with pieces of this there is
+one for all trajectories that are not shorter."""
 
 
 class ParallelAdjoint:
@@ -62,16 +64,40 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def backward(ctx, cost_gradient):
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
-        jacobians = piecewise(ctx.engine.linearise, ctx.interval, starts, drive)
-        costates = ctx.engine.costates(jacobians[1:], cost_gradient)  # λ_1 ... λ_n
+        jacobians = over_all(partial(ctx.engine.linearise, ctx.interval), starts, drive)
+        sources = marked_dynamic(plain(cost_gradient), 1)
+        costates = ctx.engine.costates(marked_dynamic(jacobians[1:], 1), sources)  # λ_1 ... λ_n
         wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
         with torch.enable_grad():
             inputs = [x.detach().requires_grad_(need) for x, need in zip(drive, wanted, strict=False)] + weights
-            out = ctx.engine.intervals(ctx.interval, starts, Drive(*inputs[:3]))
+            out = ctx.engine.intervals(ctx.interval, *as_one_batch(starts, Drive(*inputs[:3])))
         leaves = [x for x, need in zip(inputs, wanted, strict=True) if need]
-        found = iter(torch.autograd.grad(out, leaves, costates, allow_unused=True) if leaves else ())
+        found = iter(torch.autograd.grad(out, leaves, costates.flatten(0, 1), allow_unused=True) if leaves else ())
         first = torch.einsum("bji,bj->bi", jacobians[0], costates[0]) if ctx.needs_input_grad[2] else None
         return None, None, first, *(next(found) if need else None for need in wanted)
+
+
+def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
+    """The intervals of all realisations as rows, ``n·batch`` of them.
+
+    What is asked of every interval at once does not care which trajectory it is of. One graph then serves every length
+    and every number of realisations, and its loops are over one dimension: those over time and realisations, of which t
+    has only the former, take the compiler of a drone's step a minute.
+    """
+    t = drive.t.expand(starts.shape[:2]).flatten()
+    rows = Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
+    return marked_dynamic(starts.flatten(0, 1), 0), Drive(*(marked_dynamic(x, 0) for x in rows))
+
+
+def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
+    """``function`` of every interval, ``n batch ...``, in pieces of :data:`PIECE`, of which the last may overlap."""
+    rows, driven = as_one_batch(starts, drive)
+    length = min(PIECE, len(rows))
+    firsts = [*range(0, len(rows) - length, length), len(rows) - length]
+    found = [function(rows[k : k + length], Drive(*(x[k : k + length] for x in driven))) for k in firsts]
+    if len(firsts) > 1:
+        found[-1] = found[-1][firsts[-2] + length - firsts[-1] :]
+    return torch.cat(found).unflatten(0, starts.shape[:2])
 
 
 def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
@@ -80,7 +106,7 @@ def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
 
 
 def linearise(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
-    """∂Φ/∂s at every interval, ``n batch n_s n_s``, rows Φ and columns s, by n_s forward-mode products."""
+    """∂Φ/∂s at every interval, ``... n_s n_s``, rows Φ and columns s, by n_s forward-mode products."""
     basis = torch.eye(starts.shape[-1], dtype=starts.dtype, device=starts.device)
 
     def column(direction: Tensor) -> Tensor:
@@ -88,17 +114,6 @@ def linearise(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
         return torch.func.jvp(lambda s: interval(s, drive), (starts,), (tangent,))[1]
 
     return torch.func.vmap(column, out_dims=-1)(basis)
-
-
-def piecewise(linearise: Callable, interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
-    """``linearise`` in pieces of equal length, of which the last overlaps the one before: one shape is compiled."""
-    n, length = len(starts), max(1, PIECE // starts.shape[1])
-    if n <= length:
-        return linearise(interval, starts, drive)
-    firsts = [*range(0, n - length, length), n - length]
-    found = [linearise(interval, starts[k : k + length], Drive(*(x[k : k + length] for x in drive))) for k in firsts]
-    found[-1] = found[-1][length - (n - firsts[-2] - length) :]
-    return torch.cat(found)
 
 
 def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
@@ -119,7 +134,6 @@ def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
         costate = ((transition * costate.unsqueeze(-1)).sum(-2) + source).contiguous()
         return costate, costate.clone()
 
-    # A slice with a batch of one counts as contiguous whatever its strides are; a copy has the ones scan wants.
-    last = cost_gradient[-1].clone(memory_format=torch.contiguous_format)
+    last = plain(cost_gradient[-1])
     earlier = scan(body, last, (jacobians.flip(0), cost_gradient[:-1].flip(0)))[1]
     return torch.cat([earlier.flip(0), last.unsqueeze(0)])

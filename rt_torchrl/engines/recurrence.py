@@ -4,7 +4,7 @@ import torch
 from hoptorch.scan import scan
 from torch import Tensor
 
-from rt_torchrl.compilation import compiled_if
+from rt_torchrl.compilation import compiled_if, plain
 from rt_torchrl.interval import Drive, Interval
 
 
@@ -25,9 +25,7 @@ def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Te
         state = interval(state, Drive(*x)).contiguous()
         return state, state.clone()
 
-    # A slice with a batch of one counts as contiguous whatever its strides are; a copy has the ones scan wants.
-    start = initial_state.clone(memory_format=torch.contiguous_format)
-    return scan(body, start, tuple(drive))[1]
+    return scan(body, plain(initial_state), tuple(drive))[1]
 
 
 def march_by_step(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
