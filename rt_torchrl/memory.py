@@ -111,7 +111,8 @@ class PriorityReader(PrioritizedSampler):
 
     def priorities(self, count: int) -> Float[Tensor, " {count}"]:
         """(|δ_i| + tol)^α* of the first ``count`` transitions."""
-        return torch.as_tensor(self._sum_tree[torch.arange(count)])
+        # The tree answers for a single one with a scalar.
+        return torch.as_tensor(self._sum_tree[torch.arange(count)]).reshape(count)
 
 
 class LeastPriorityWriter(Writer):

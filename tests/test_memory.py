@@ -91,6 +91,14 @@ def test_filling_up_in_the_middle_of_an_episode():
     assert labels(found) == [0.0, 3.0, 4.0, 5.0, 6.0]
 
 
+def test_filling_up_one_by_one():
+    """An episode as long as its returns has one transition."""
+    found = memory(capacity=2)
+    for label in (0.0, 1.0, 2.0):
+        found.store(transitions([label]), torch.tensor([3.0 - label]))
+    assert labels(found) == [0.0, 2.0]
+
+
 def test_state_round_trip_samples_the_same():
     first, second = memory(seed=1), memory(seed=1)
     first.store(transitions(list(range(8))), ERRORS)
