@@ -98,6 +98,16 @@ def test_hover_amplitude(plant):
     assert brentq(lambda A: mean_force(plant, A)[1] - 1.0, 60.0, 88.0) == pytest.approx(77.2, abs=0.2)
 
 
+def test_a_heavier_body_is_moved_by_the_same_forces(plant):
+    state, action, wind = double(0.0, 0.0, 0.3, -0.2), double(77.0, -5.0), double(1.0)
+    heavier = FlappingWing(mass=1.25 * MASS)
+    one, other = (
+        p.vector_field(double(0.01).squeeze(), state, action, wind, plant.closure)[2:] for p in (plant, heavier)
+    )
+    gravity = double(0.0, -GRAVITY)
+    torch.testing.assert_close(1.25 * (other - gravity), one - gravity)
+
+
 def test_trim_in_a_headwind_of_one_metre_per_second(plant):
     amplitude, angle = fsolve(lambda a: mean_force(plant, a[0], a[1], 1.0) - [0.0, 1.0], [77.0, -10.0])
     assert amplitude == pytest.approx(76.7, abs=0.3)
@@ -266,6 +276,8 @@ def test_episodes_start_at_rest_in_the_origin(plant):
         ({"velocity_weight": math.nan}, "velocity_weight"),
         ({"target": (5.0, math.nan)}, "target"),
         ({"peak": "sharp"}, "peak"),
+        ({"mass": 0.0}, "mass"),
+        ({"mass": math.inf}, "mass"),
         ({"closure": QuasiSteadyPolar(double(1.71, 43.0, 1595.0))}, "unstable"),
     ],
 )

@@ -55,15 +55,15 @@ class FlappingWing(Plant):
         target: x_f and z_f [m].
         velocity_weight: α1 of J_a.
         peak: height of the Gaussian window h of J_a: 1, or the printed x_f²/2.
+        mass: of the body m_b [kg].
 
     Raises:
-        ValueError: for a negative weight, an unknown peak, a target that is not finite, or a step that is unstable or
-            does not resolve the wing beat.
+        ValueError: for a mass that is not positive, a negative weight, an unknown peak, a target that is not finite, or
+            a step that is unstable or does not resolve the wing beat.
     """
 
     name = "flapping_wing"
 
-    mass = 3e-3  # m_b [kg]
     gravity = 9.81  # g [m/s²]
     air_density = 1.225  # ρ [kg/m³]
     frequency = 20.0  # f [Hz]
@@ -108,6 +108,7 @@ class FlappingWing(Plant):
         target: tuple[float, float] = (5.0, 5.0),
         velocity_weight: float = 1.0,
         peak: Peak = "unit",
+        mass: float = 3e-3,
     ):
         super().__init__(dt=dt, horizon=horizon, closure=QuasiSteadyPolar.true() if closure is None else closure)
         if not all(math.isfinite(coordinate) for coordinate in target):
@@ -116,13 +117,16 @@ class FlappingWing(Plant):
             raise ValueError(f"velocity_weight={velocity_weight} must not be negative.")
         if peak not in get_args(Peak):
             raise ValueError(f"peak={peak!r} does not exist; choose one of {', '.join(get_args(Peak))}.")
+        if not (math.isfinite(mass) and mass > 0):
+            raise ValueError(f"mass={mass} kg of plant {self.name!r} must be positive and finite.")
         self.wind = GaussianGust() if wind is None else wind
         self.velocity_weight = velocity_weight
         x_f = torch.tensor(target, dtype=torch.float64)
         self.register_buffer("target", x_f)
         self.register_buffer("window_peak", torch.ones_like(x_f) if peak == "unit" else 0.5 * x_f**2)
         self.register_buffer("error_scale", torch.tensor(self.observation_scale, dtype=torch.float64))
-        self.register_buffer("weight", torch.tensor([0.0, -self.mass * self.gravity], dtype=torch.float64))
+        self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
+        self.register_buffer("weight", torch.tensor([0.0, -mass * self.gravity], dtype=torch.float64))
         self._place_blade_elements()
         self._require_resolved_step()
 
