@@ -42,7 +42,7 @@ class RunConfig:
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: go on from the checkpoint in log_dir.
         overwrite: replace what an earlier run left in log_dir.
-        quick: a whole small run: 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
+        quick: a whole small run: at most 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end.
         reference: also compute what exact gradients on the true plant reach for this policy on the unseen episodes.
         figures: draw the figures at all; a training among many is done sooner without.
@@ -138,5 +138,10 @@ class RunConfig:
         )
         twinning = dataclasses.replace(self.twinning, model_free=model_free)
         return dataclasses.replace(
-            self, quick=False, episodes=QUICK_EPISODES, unseen=QUICK_UNSEEN, figures_every=0, twinning=twinning
+            self,
+            quick=False,
+            episodes=min(self.episodes, QUICK_EPISODES),
+            unseen=QUICK_UNSEEN,
+            figures_every=0,
+            twinning=twinning,
         )

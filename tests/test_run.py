@@ -194,6 +194,7 @@ def test_an_interrupt_keeps_the_episodes_done(tmp_path, monkeypatch):
 def test_quick_is_a_small_run(tmp_path):
     effective = RunConfig(quick=True, log_dir=tmp_path).effective()
     assert (effective.episodes, effective.unseen, effective.twinning.model_free.critic_iterations) == (3, 5, 200)
+    assert RunConfig(quick=True, episodes=2).effective().episodes == 2
 
 
 def test_a_taken_folder_is_refused(tmp_path):

@@ -348,9 +348,11 @@ def test_short_trainings_of_a_plant_share_a_worker(tmp_path):
     study = recipe("study")
     batches = study.short_batches(study.Config(quick=True, folder=tmp_path))
     plants_of = [{task.plant for task in batch if isinstance(task, Training)} for batch in batches]
-    assert all(len(found) == 1 for found in plants_of) and len(batches) == 4
-    (alone,) = [batch for batch in batches if len(batch) == 1]
-    assert alone[0].options[-2:] == ("--policy", "scheduled")
+    # The turbine's oracle shares no graph with its trainings, the gain-scheduled policy none with the other ones.
+    assert plants_of == [{"cryogenic_tank"}, {"flapping_wing"}, {"wind_turbine"}, {"wind_turbine"}, set()]
+    (alone,) = batches[3]
+    assert alone.options[-2:] == ("--policy", "scheduled")
+    assert [task.path.stem for task in batches[4]] == ["oracle", "Jonkman"]
     planned = [task for batch in batches for task in batch]
     assert len(planned) == len(study.ordered_tasks(study.Config(quick=True, folder=tmp_path)))
 

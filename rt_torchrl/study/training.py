@@ -81,14 +81,15 @@ class Training:
         if self.done():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        log = self.folder / "training.log"
+        # As it is begun: a training that fails in its second episode has left a checkpoint, and would be another one.
+        log, command, arguments = self.folder / "training.log", self.command(), self.arguments()
         with log.open("w") as output, contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-            print(self.command(), flush=True)
+            print(command, flush=True)
             try:
                 recipe = load_recipe(self.recipe)
-                recipe.main(tyro.cli(recipe.Config, args=self.arguments()))
+                recipe.main(tyro.cli(recipe.Config, args=arguments))
             except (Exception, SystemExit) as error:
-                raise RuntimeError(f"{self.command()} failed; see {log}: {error}") from error
+                raise RuntimeError(f"{command} failed; see {log}: {error}") from error
 
     def metrics(self) -> dict[str, Any]:
         """Its ``metrics.json``."""
