@@ -1,7 +1,13 @@
 """Fixtures that more than one file uses."""
 
+import os
+
 import jaxtyping
 import pytest
+import torch
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    torch.set_num_threads(1)  # the workers share the cores
 
 
 @pytest.fixture
