@@ -5,6 +5,7 @@ import torch
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.engines import parallel_adjoint
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
 from rt_torchrl.trajectory import Rollout, identification_cost
@@ -23,8 +24,10 @@ def recorded(plant, batch=3, seed=0):
     return DigitalTwin(plant, plant.make_closure(generator)), flown, exogenous
 
 
+@pytest.mark.parametrize("piece", [parallel_adjoint.PIECE, 7], ids=["at once", "in pieces"])
 @pytest.mark.parametrize("plant", [LinearQuadratic(), WindTurbine(horizon=30.0)], ids=lambda plant: plant.name)
-def test_gradient_and_states_are_those_of_backpropagation(plant):
+def test_gradient_and_states_are_those_of_backpropagation(plant, piece, monkeypatch):
+    monkeypatch.setattr(parallel_adjoint, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
     twin, flown, exogenous = recorded(plant)
     found = Assimilation(twin, AssimilationConfig()).normal_equations(exogenous, flown.states, flown.actions)
     rollout = Rollout(plant, twin.closure, engine="autograd")

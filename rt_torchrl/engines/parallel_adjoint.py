@@ -95,8 +95,7 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
     length = min(PIECE, len(rows))
     firsts = [*range(0, len(rows) - length, length), len(rows) - length]
     found = [function(rows[k : k + length], Drive(*(x[k : k + length] for x in driven))) for k in firsts]
-    if len(firsts) > 1:
-        found[-1] = found[-1][firsts[-2] + length - firsts[-1] :]
+    found[-1] = found[-1][len(found) * length - len(rows) :]
     return torch.cat(found).unflatten(0, starts.shape[:2])
 
 
