@@ -58,7 +58,7 @@ class AssimilationConfig:
             raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
 
 
-class Replayed(NamedTuple):
+class Replay(NamedTuple):
     """What the twin replays: inputs, measured states and actions, and the times of the first states [s]."""
 
     exogenous: Float[Tensor, "batch n n_z"]
@@ -66,14 +66,14 @@ class Replayed(NamedTuple):
     actions: Float[Tensor, "batch n n_a"]
     start: float | Float[Tensor, " batch"] = 0.0
 
-    def cut(self, segment: int, dt: float) -> "Replayed":
+    def cut(self, segment: int, dt: float) -> "Replay":
         """In segments of that many intervals of length ``dt``, in the order of time; what is left over is dropped."""
         exogenous, measured, actions, _ = self
         batch, whole = len(exogenous), exogenous.shape[1] // segment
         n = whole * segment
         starts = torch.stack([measured[:, k * segment : (k + 1) * segment + 1] for k in range(whole)], 1)
         time = dt * segment * torch.arange(whole, dtype=torch.float64, device=exogenous.device)
-        return Replayed(
+        return Replay(
             exogenous[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
             starts.flatten(0, 1),
             actions[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
@@ -121,14 +121,14 @@ class Assimilation:
             exogenous = torch.cat([process.sample(count, generator) for process in processes])
         measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
         actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
-        whole = Replayed(exogenous, measured, actions)
+        whole = Replay(exogenous, measured, actions)
         if not self.config.segment:
             return self._descend(whole)
         before = self._cost_of(whole)
         found = self._descend(whole.cut(self.config.segment, self.twin.plant.dt))
         return found._replace(start=before, best=self._cost_of(whole))
 
-    def _descend(self, replayed: "Replayed") -> Descended:
+    def _descend(self, replayed: Replay) -> Descended:
         def equations() -> NormalEquations:
             return self._with_prior(self.normal_equations(*replayed))
 
@@ -142,13 +142,13 @@ class Assimilation:
         found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
         return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
 
-    def _identification_cost(self, replayed: "Replayed") -> Tensor:
+    def _identification_cost(self, replayed: Replay) -> Tensor:
         exogenous, measured, actions, start = replayed
         flown = self.twin.replay(measured[:, 0], exogenous, actions, start=start)
         return identification_cost(self.twin.plant, flown, measured).mean()
 
     @torch.no_grad()
-    def _cost_of(self, whole: "Replayed") -> float:
+    def _cost_of(self, whole: Replay) -> float:
         """J_p of whole records; infinite where a closure that was found on their segments diverges."""
         try:
             return self._identification_cost(whole).item()

@@ -10,6 +10,7 @@ from rt_torchrl.compilation import compiled_if, marked_dynamic
 from rt_torchrl.engines.recurrence import march, march_by_scan
 from rt_torchrl.interval import Drive, Interval
 from rt_torchrl.plant import Plant
+from rt_torchrl.signal import bounds
 from rt_torchrl.trajectory import Trajectory, drive_of
 
 
@@ -42,9 +43,9 @@ class ClassicalController(nn.Module, ABC):
             raise ValueError(f"gains={gains} of {type(self).__name__} must be positive and finite: {wanted}.")
         self.plant = plant
         self.log_gains = nn.Parameter(values.log(), requires_grad=False)
-        for bound in ("low", "high"):
-            limits = torch.tensor([getattr(a, bound) for a in plant.actions], dtype=torch.float64)
-            self.register_buffer(f"{bound}_action", limits)
+        low, high = bounds(plant.actions)
+        self.register_buffer("low_action", low)
+        self.register_buffer("high_action", high)
         self._march = compiled_if(compiled, march_by_scan, march)
 
     def named_gains(self) -> dict[str, float]:

@@ -22,6 +22,7 @@ from torchrl.objectives import BCLoss
 from rt_torchrl.descent import Descent, DescentConfig
 from rt_torchrl.model_based import VirtualEpisodes
 from rt_torchrl.plant import Plant
+from rt_torchrl.signal import bounds
 from rt_torchrl.twin import DigitalTwin
 
 
@@ -151,7 +152,7 @@ class ShareOfRange(nn.Module):
 
     def __init__(self, plant: Plant, policy: nn.Module):
         super().__init__()
-        low, high = (torch.tensor([getattr(a, bound) for a in plant.actions]).double() for bound in ("low", "high"))
+        low, high = bounds(plant.actions)
         self.policy = policy
         self.register_buffer("low", low)
         self.register_buffer("range", high - low)

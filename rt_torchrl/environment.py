@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.compilation import compiled_if
 from rt_torchrl.plant import Plant, Transition
+from rt_torchrl.signal import bounds
 from rt_torchrl.trajectory import DivergenceError
 
 
@@ -193,10 +194,7 @@ def declare_specs(env: EnvBase, plant: Plant) -> None:
         shape=batch,
         device=device,
     )
-    low, high = (
-        torch.tensor([getattr(a, bound) for a in plant.actions], dtype=torch.float64, device=device)
-        for bound in ("low", "high")
-    )
+    low, high = bounds(plant.actions, device=device)
     env.action_spec = Bounded(
         low=low.expand(*batch, n_a), high=high.expand(*batch, n_a), shape=(*batch, n_a), dtype=torch.float64
     ).to(device)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from sklearn.svm import SVR
 from torch import Tensor
 
-from rt_torchrl.signal import Signal
+from rt_torchrl.signal import Signal, bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +70,7 @@ class ExogenousProcess:
             raise ValueError(f"record has {len(record)} samples; at least 8 are needed to separate its scales.")
         config = config or ExogenousConfig()
         like = {"dtype": record.dtype, "device": record.device}
-        self._low = torch.tensor([signal.low for signal in signals], **like)
-        self._high = torch.tensor([signal.high for signal in signals], **like)
+        self._low, self._high = bounds(signals, **like)
         # Columns are written in place: a plant without inputs has none to stack.
         values = record.cpu().numpy()
         large, covariance = np.empty_like(values), np.empty_like(values)

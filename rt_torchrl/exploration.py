@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plant import Plant
+from rt_torchrl.signal import bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +52,7 @@ class LivePolicy(nn.Module):
 
     def __init__(self, plant: Plant, policy: nn.Module, config: ExplorationConfig, *, generator: torch.Generator):
         super().__init__()
-        low, high = (
-            torch.tensor([getattr(a, b) for a in plant.actions], dtype=torch.float64, device=generator.device)
-            for b in ("low", "high")
-        )
+        low, high = bounds(plant.actions, device=generator.device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.policy, self.strength, self._noise = policy, 0.0, None

@@ -15,6 +15,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 from rt_torchrl.memory import LongTermMemory
 from rt_torchrl.plant import Plant
 from rt_torchrl.policies import mlp
+from rt_torchrl.signal import bounds
 
 TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
 
@@ -76,7 +77,7 @@ class Critic(nn.Module):
 
     def __init__(self, plant: Plant, hidden: Sequence[int], *, generator: torch.Generator):
         super().__init__()
-        low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
+        low, high = bounds(plant.actions)
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("half_range", 0.5 * (high - low))
         self.network = mlp(

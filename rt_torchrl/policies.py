@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.signal import Signal
+from rt_torchrl.signal import Signal, bounds
 
 
 class SmoothClip(nn.Module):
@@ -33,8 +33,9 @@ class SmoothClip(nn.Module):
                     f"action {action.name!r} has range [{action.low}, {action.high}] {action.unit}; "
                     "a saturated policy needs finite bounds: give the Signal a low and a high."
                 )
-        self.register_buffer("low", torch.tensor([action.low for action in actions], dtype=torch.float64))
-        self.register_buffer("high", torch.tensor([action.high for action in actions], dtype=torch.float64))
+        low, high = bounds(actions)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
 
     def forward(self, x: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
         return 0.5 * (torch.tanh(x) + 1.0) * (self.high - self.low) + self.low

@@ -17,9 +17,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.compilation import compiled_if, marked_dynamic, plain
-from rt_torchrl.engines.parallel_adjoint import over_all
+from rt_torchrl.engines.linearisation import linearise, linearise_by_rows, over_all
 from rt_torchrl.engines.recurrence import march, march_by_scan, march_by_step
-from rt_torchrl.interval import Drive, Interval
+from rt_torchrl.interval import Interval
 from rt_torchrl.plant import Plant
 from rt_torchrl.trajectory import drive_of
 
@@ -42,7 +42,7 @@ class Sensitivities:
         self._march = march_by_step if compiled_step else compiled_if(compiled, march_by_scan, march)
         wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
         # By rows uncompiled: the compiler gains little there.
-        self._jacobians = jacobians_by_rows if wide else compiled_if(compiled, jacobians_by_columns)
+        self._jacobians = linearise_by_rows if wide else compiled_if(compiled, linearise)
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
 
     @torch.no_grad()
@@ -75,36 +75,6 @@ class Sensitivities:
             # s_0 acts like weights that are used in the first interval alone.
             B = torch.cat([B, torch.cat([A[:1], torch.zeros_like(A[1:])])], -1)
         return ends.transpose(0, 1), self._propagate(A, B).transpose(0, 1)
-
-
-def jacobians_by_columns(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column."""
-    weights = tuple(interval.closure.get_parameter(name) for name in names)
-    sizes = [starts.shape[-1], *(w.numel() for w in weights)]
-    basis = torch.eye(sum(sizes), dtype=starts.dtype, device=starts.device)
-
-    def end(state: Tensor, *values: Tensor) -> Tensor:
-        replaced = {f"closure.{name}": value for name, value in zip(names, values, strict=True)}
-        return torch.func.functional_call(interval, replaced, (state, drive))
-
-    def column(direction: Tensor) -> Tensor:
-        by_state, *by_weights = direction.split(sizes)
-        tangents = (part.reshape(w.shape) for part, w in zip(by_weights, weights, strict=True))
-        return torch.func.jvp(end, (starts, *weights), (by_state.expand_as(starts), *tangents))[1]
-
-    return torch.func.vmap(column, out_dims=-1)(basis)
-
-
-def jacobians_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """The same by a reverse-mode product for each row, which is less work where n_w is far above n_s."""
-    weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
-
-    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
-        return torch.func.functional_call(interval, values, (state, Drive(*drive)))
-
-    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
-    by_state, by_weights = rows(weights, starts, *drive)
-    return torch.cat([by_state, *(jacobian.flatten(2) for jacobian in by_weights.values())], -1)
 
 
 def propagate(A: Tensor, B: Tensor) -> Tensor:

@@ -1,7 +1,12 @@
 """One scalar of a plant: its symbol, unit and range."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,3 +39,14 @@ class Signal:
     def label(self) -> str:
         """Axis label, such as ``rotor speed $\\omega_r$ [rad/s]``."""
         return f"{self.name.replace('_', ' ')} ${self.symbol}$ [{self.unit}]"
+
+
+def bounds(
+    signals: Sequence[Signal], *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Least and greatest admissible values of the signals, in their units."""
+    low, high = (
+        torch.tensor([getattr(signal, end) for signal in signals], dtype=dtype, device=device)
+        for end in ("low", "high")
+    )
+    return low, high

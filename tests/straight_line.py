@@ -7,7 +7,7 @@ from torch import nn
 from rt_torchrl.memory import Record
 from rt_torchrl.plant import Plant
 from rt_torchrl.resampling import Segment
-from rt_torchrl.signal import Signal
+from rt_torchrl.signal import Signal, bounds
 from rt_torchrl.trajectory import Rollout
 
 
@@ -60,7 +60,7 @@ def noise_of(n, seed, *, smooth=False):
 def flown(plant, generator, lengths):
     """Segments of one true episode, cut at these steps, with their starts on its clock."""
     start, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
+    low, high = bounds(plant.actions)
     share = 0.3 + 0.4 * torch.rand(1, plant.n_steps, len(plant.actions), generator=generator, dtype=torch.float64)
     with torch.no_grad():
         found = Rollout(plant, plant.closure)(start, exogenous, low + share * (high - low))

@@ -15,7 +15,7 @@ from rt_torchrl.catalogue import plants
 from rt_torchrl.export import c_file, export_c
 from rt_torchrl.export.c_operators import literal
 from rt_torchrl.policies import SaturatedAffine, SaturatedMLP, SmoothClip
-from rt_torchrl.signal import Signal
+from rt_torchrl.signal import Signal, bounds
 
 COMPILER = next(filter(None, map(shutil.which, c_file.COMPILERS)), None)
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
@@ -69,9 +69,9 @@ def test_policies_of_the_plants(plant, policy, tmp_path):
             weight.add_(0.5 * torch.randn(weight.shape, generator=generator(), dtype=torch.float64))
     assert export_c(policy, tmp_path / "policy.c", plant, function="act") < ROUNDING
     function = build(tmp_path / "policy.c", "act")
-    ranges = torch.tensor([action.high - action.low for action in plant.actions], dtype=torch.float64)
+    low, high = bounds(plant.actions)
     for observation in 2.0 * torch.randn(50, len(plant.observations), generator=generator(), dtype=torch.float64):
-        error = (called(function, observation.tolist(), len(plant.actions)) - policy(observation)).abs() / ranges
+        error = (called(function, observation.tolist(), len(plant.actions)) - policy(observation)).abs() / (high - low)
         assert error.max() < ROUNDING
 
 

@@ -7,6 +7,7 @@ from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.signal import bounds
 from rt_torchrl.trajectory import Rollout, control_cost
 
 
@@ -63,7 +64,7 @@ def test_commands_stay_in_their_ranges_and_gains_start_detuned():
 def test_instruments_change_nothing_of_the_turbine():
     rich, plain = InstrumentedTurbine(horizon=50.0), WindTurbine(horizon=50.0)
     state, wind = rich.draw_initial_state(3, generator()), rich.draw_exogenous(3, generator())
-    low, high = (tensor(*[getattr(a, bound) for a in plain.actions]) for bound in ("low", "high"))
+    low, high = bounds(plain.actions)
     command = low + (high - low) * torch.rand(3, rich.n_steps, 2, generator=generator(1), dtype=torch.float64)
     found = Rollout(rich, rich.closure)(state, wind, command).states
     expected = Rollout(plain, plain.closure)(state[:, :6], wind, command).states

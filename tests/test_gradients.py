@@ -15,6 +15,7 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.policies import SaturatedMLP, mlp
+from rt_torchrl.signal import bounds
 from rt_torchrl.trajectory import Rollout, control_cost
 
 PLANTS = {
@@ -63,7 +64,7 @@ class Case:
         }[driver]()
         self.initial_state = plant.draw_initial_state(batch, generator)
         self.exogenous = plant.draw_exogenous(batch, generator)
-        low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
+        low, high = bounds(plant.actions)
         # Off the ends of the ranges: the tank's valve is laminar within 100 Pa of shut, which the step of a central
         # difference does not resolve.
         share = 0.1 + 0.8 * torch.rand(batch, plant.n_steps, len(plant.actions), generator=generator).double()

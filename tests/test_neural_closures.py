@@ -13,14 +13,13 @@ from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.closures import BoundedPerceptron
-from rt_torchrl.engines.parallel_adjoint import as_one_batch
+from rt_torchrl.engines.linearisation import as_one_batch, linearise, linearise_by_rows
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.interval import Interval
 from rt_torchrl.memory import Record
 from rt_torchrl.runner import main_of
-from rt_torchrl.sensitivity import jacobians_by_columns, jacobians_by_rows
 from rt_torchrl.trajectory import drive_of
 from rt_torchrl.twin import DigitalTwin
 from rt_torchrl.visited import rms_error, visited_features
@@ -105,7 +104,7 @@ def test_jacobians_by_rows_are_those_by_columns(plant):
     interval, drive = Interval(plant, closure, None), drive_of(plant, exogenous, flown.actions)
     starts, drive = as_one_batch(flown.states[:, :-1].transpose(0, 1), drive)
     with torch.no_grad():
-        columns, rows = (f(interval, names, starts, drive) for f in (jacobians_by_columns, jacobians_by_rows))
+        columns, rows = (f(interval, names, starts, drive) for f in (linearise, linearise_by_rows))
     # The same derivatives in another order: rounding, relative to the largest of each state.
     assert ((columns - rows).abs().amax((0, 2)) <= 1e-10 * columns.abs().amax((0, 2)).clamp(min=1e-300)).all()
 

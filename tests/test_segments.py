@@ -4,7 +4,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.assimilation import Assimilation, AssimilationConfig, Replayed
+from rt_torchrl.assimilation import Assimilation, AssimilationConfig, Replay
 from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.memory import Record
 from rt_torchrl.sensitivity import Sensitivities
@@ -34,7 +34,7 @@ def assimilation(plant, closure, **options):
 
 
 def replayed(*records):
-    return Replayed(*(torch.stack(x) for x in zip(*((r.exogenous, r.states, r.actions) for r in records), strict=True)))
+    return Replay(*(torch.stack(x) for x in zip(*((r.exogenous, r.states, r.actions) for r in records), strict=True)))
 
 
 def test_segments_start_at_their_own_time_and_state():

@@ -5,7 +5,8 @@ import torch
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.engines import parallel_adjoint
+from rt_torchrl.contract.calls import random_commands
+from rt_torchrl.engines import linearisation
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
 from rt_torchrl.trajectory import Rollout, identification_cost
@@ -15,19 +16,18 @@ from rt_torchrl.twin import DigitalTwin
 def recorded(plant, batch=3, seed=0):
     """A true trajectory under random commands, and a twin that starts from the wrong closure."""
     generator = torch.Generator().manual_seed(seed)
-    low, high = (torch.tensor([getattr(a, b) for a in plant.actions]).double() for b in ("low", "high"))
-    share = torch.rand(batch, plant.n_steps, len(plant.actions), generator=generator, dtype=torch.float64)
+    command = random_commands(plant, (batch, plant.n_steps), generator)
     exogenous = plant.draw_exogenous(batch, generator)
     start = plant.draw_initial_state(batch, generator)
     with torch.no_grad():
-        flown = Rollout(plant, plant.closure)(start, exogenous, low + share * (high - low))
+        flown = Rollout(plant, plant.closure)(start, exogenous, command)
     return DigitalTwin(plant, plant.make_closure(generator)), flown, exogenous
 
 
-@pytest.mark.parametrize("piece", [parallel_adjoint.PIECE, 7], ids=["at once", "in pieces"])
+@pytest.mark.parametrize("piece", [linearisation.PIECE, 7], ids=["at once", "in pieces"])
 @pytest.mark.parametrize("plant", [LinearQuadratic(), WindTurbine(horizon=30.0)], ids=lambda plant: plant.name)
 def test_gradient_and_states_are_those_of_backpropagation(plant, piece, monkeypatch):
-    monkeypatch.setattr(parallel_adjoint, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
+    monkeypatch.setattr(linearisation, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
     twin, flown, exogenous = recorded(plant)
     found = Assimilation(twin, AssimilationConfig()).normal_equations(exogenous, flown.states, flown.actions)
     rollout = Rollout(plant, twin.closure, engine="autograd")

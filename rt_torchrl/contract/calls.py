@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.contract.draws import seeded
 from rt_torchrl.plant import Plant
+from rt_torchrl.signal import bounds
 from rt_torchrl.trajectory import Rollout
 
 Arguments = dict[str, Tensor]
@@ -97,7 +98,7 @@ class Calls:
 
 def random_commands(plant: Plant, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
     """Uniform within the ranges of the actions."""
-    low, high = (torch.tensor([getattr(a, b) for a in plant.actions], dtype=torch.float64) for b in ("low", "high"))
+    low, high = bounds(plant.actions)
     share = torch.rand(*shape, len(plant.actions), generator=generator, dtype=torch.float64)
     return low + share * (high - low)
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from rt_torchrl.compilation import raised_limits
 from rt_torchrl.contract.calls import Arguments, Calls
-from rt_torchrl.engines.parallel_adjoint import linearise
+from rt_torchrl.engines.linearisation import linearise
 from rt_torchrl.interval import Drive, Interval
 
 REMEDY = (
@@ -26,7 +26,7 @@ def forward_mode(calls: Calls) -> Iterator[str]:
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
     interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
     try:
-        jacobians = linearise(interval, state.detach(), drive)
+        jacobians = linearise(interval, (), state.detach(), drive)
     except Exception as error:
         yield f"step: torch.func.jvp under vmap fails: {_first_line(error)} {_where(error)}Expected {REMEDY}."
         return

@@ -12,7 +12,6 @@ Only the recurrence of the states and the (linear) one of λ are sequential. The
 trajectories are one batched call, and so is the sum over k.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -21,12 +20,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rt_torchrl.compilation import compiled_if, marked_dynamic, plain
+from rt_torchrl.engines.linearisation import as_one_batch, linearise, over_all
 from rt_torchrl.engines.recurrence import march, march_by_scan
 from rt_torchrl.interval import Drive, Interval
-
-PIECE = 2048
-"""Intervals that are linearised at once. Forward mode ties a compiled graph to one number; with pieces of this there is
-one for all trajectories that are not shorter."""
 
 
 class ParallelAdjoint:
@@ -64,7 +60,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def backward(ctx, cost_gradient):
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
-        jacobians = over_all(partial(ctx.engine.linearise, ctx.interval), starts, drive)
+        jacobians = over_all(partial(ctx.engine.linearise, ctx.interval, ()), starts, drive)
         sources = marked_dynamic(plain(cost_gradient), 1)
         costates = ctx.engine.costates(marked_dynamic(jacobians[1:], 1), sources)  # λ_1 ... λ_n
         wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
@@ -77,42 +73,9 @@ class _DiscreteAdjoint(torch.autograd.Function):
         return None, None, first, *(next(found) if need else None for need in wanted)
 
 
-def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
-    """The intervals of all realisations as rows, ``n·batch`` of them.
-
-    What is asked of every interval at once does not care which trajectory it is of. One graph then serves every length
-    and every number of realisations, and its loops are over one dimension: those over time and realisations, of which t
-    has only the former, take the compiler of a drone's step a minute.
-    """
-    t = drive.t.expand(starts.shape[:2]).flatten()
-    rows = Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
-    return marked_dynamic(starts.flatten(0, 1), 0), Drive(*(marked_dynamic(x, 0) for x in rows))
-
-
-def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
-    """``function`` of every interval, ``n batch ...``, in pieces of :data:`PIECE`, of which the last may overlap."""
-    rows, driven = as_one_batch(starts, drive)
-    length = min(PIECE, len(rows))
-    firsts = [*range(0, len(rows) - length, length), len(rows) - length]
-    found = [function(rows[k : k + length], Drive(*(x[k : k + length] for x in driven))) for k in firsts]
-    found[-1] = found[-1][len(found) * length - len(rows) :]
-    return torch.cat(found).unflatten(0, starts.shape[:2])
-
-
 def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
     """Φ at every interval at once."""
     return interval(starts, drive)
-
-
-def linearise(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
-    """∂Φ/∂s at every interval, ``... n_s n_s``, rows Φ and columns s, by n_s forward-mode products."""
-    basis = torch.eye(starts.shape[-1], dtype=starts.dtype, device=starts.device)
-
-    def column(direction: Tensor) -> Tensor:
-        tangent = direction.expand_as(starts)
-        return torch.func.jvp(lambda s: interval(s, drive), (starts,), (tangent,))[1]
-
-    return torch.func.vmap(column, out_dims=-1)(basis)
 
 
 def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:

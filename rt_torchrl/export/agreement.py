@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
+from rt_torchrl.signal import Signal, bounds
 
 TOLERANCE = 1e-6
 """Greatest difference allowed, as a share of the action's range; what is computed in double precision needs 1e-12."""
@@ -95,7 +95,8 @@ def require_agreement(
     if not expected.isfinite().all():
         worst = observations[(~expected.isfinite()).any(-1)][0].tolist()
         raise ValueError(f"policy {type(policy).__name__} gives actions that are not finite at observation {worst}.")
-    ranges = torch.tensor([action.high - action.low for action in plant.actions], dtype=torch.float64)
+    low, high = bounds(plant.actions)
+    ranges = high - low
     size = torch.where(ranges.isfinite(), ranges, expected.abs().amax(0).clamp(min=torch.finfo(torch.float64).tiny))
     errors = ((found - expected).abs() / size).nan_to_num(nan=math.inf)
     if errors.max() > TOLERANCE:
