@@ -79,9 +79,8 @@ class Config(RunConfig):
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
-    @classmethod
-    def defaults_for(cls, closure: str) -> "Config":
-        return cls(closure=closure, twinning=NEURAL if closure == "mlp" else PAPER)
+    def defaults(self) -> "Config":
+        return Config(twinning=NEURAL if self.closure == "mlp" else PAPER)
 
     def plant(self, mass: float = MASS) -> FlappingWing:
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)

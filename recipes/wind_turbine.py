@@ -71,9 +71,8 @@ class Config(RunConfig):
     real: Literal["simulation", "rosco"] = "simulation"
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
-    @classmethod
-    def defaults_for(cls, closure: str) -> "Config":
-        return cls(closure=closure, twinning=NEURAL if closure == "mlp" else PAPER)
+    def defaults(self) -> "Config":
+        return Config(twinning=NEURAL if self.closure == "mlp" else PAPER)
 
     def plant(self) -> WindTurbine:
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)

@@ -2,18 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from rt_torchrl.closures import BoundedPerceptron
 from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
-from rt_torchrl.memory import Record
-from rt_torchrl.plant import Plant
+from rt_torchrl.memory import Record, Segment
+from rt_torchrl.misfit import NOISE_TOLERANCE, InitialStates, Misfit, discrepancy_derivatives
 from rt_torchrl.trajectory import identification_cost
 from rt_torchrl.twin import DigitalTwin
 
@@ -36,6 +38,10 @@ class AssimilationConfig:
         segment: control intervals after which the replay starts again from the measured state (multiple shooting); 0
             replays whole records, as in the paper. Over short segments the states are nearly linear in the weights,
             which takes a closure of many of them to the record in a few steps; J_p of each is that of its mean segment.
+        initial: ``measured`` starts a replay from what the sensors read first, as in the paper; ``estimated`` takes the
+            components of that state that J_p compares as unknowns beside the weights, measured as the first sample
+            says. A plant that forgets slowly carries the error of a first sample through the whole record, and the
+            weights make up for it; needs ``levenberg_marquardt`` and the inputs of the ``record``.
         descent: how the closure's weights descend J_p.
     """
 
@@ -45,6 +51,7 @@ class AssimilationConfig:
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
     prior: float = 0.0
     segment: int = 0
+    initial: Literal["measured", "estimated"] = "measured"
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self):
@@ -56,6 +63,11 @@ class AssimilationConfig:
             raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
         if self.segment < 0:
             raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
+        if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
+            raise ValueError(
+                f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
+                f"are {self.method!r} and {self.inputs!r}."
+            )
 
 
 class Replay(NamedTuple):
@@ -86,6 +98,8 @@ class Assimilation:
 
     The expectation is over the records in D_S and, for each, realisations of its exogenous process; all are driven by
     the *stored* actions.
+
+    Note: the paper replays from what the sensors read first; ``initial="estimated"`` finds that state too.
 
     Args:
         twin: its closure is updated in place, and holds the best weights seen, w_p*, afterwards.
@@ -137,7 +151,11 @@ class Assimilation:
 
         before = self._prior_cost().item()
         method, function = self.descent, cost
-        if self.config.method == "levenberg_marquardt":
+        if self.config.initial == "estimated":
+            misfit = self._misfit(replayed)
+            method = LevenbergMarquardt(misfit.unknowns, tolerance=NOISE_TOLERANCE)
+            function = partial(self._mean_equations, misfit)
+        elif self.config.method == "levenberg_marquardt":
             method, function = self.second_order, equations
         found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
         return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
@@ -151,9 +169,29 @@ class Assimilation:
     def _cost_of(self, whole: Replay) -> float:
         """J_p of whole records; infinite where a closure that was found on their segments diverges."""
         try:
-            return self._identification_cost(whole).item()
+            if self.config.initial == "measured":
+                return self._identification_cost(whole).item()
+            misfit = self._misfit(whole, weights=False)
+            misfit.fit_initial_states()
+            return misfit.normal_equations().cost.item() / len(whole.measured)
         except FloatingPointError:
             return float("inf")
+
+    def _misfit(self, replayed: Replay, *, weights: bool = True) -> Misfit:
+        """J_p with unknown first states."""
+        exogenous, measured, actions, start = replayed
+        starts = torch.as_tensor(start, dtype=torch.float64).expand(len(measured)).tolist()
+        records = map(Record, measured, exogenous, actions)
+        segments = [Segment(*pair) for pair in zip(starts, records, strict=True)]
+        twin = self.twin
+        curvature = discrepancy_derivatives(twin.plant, measured, measured)[1]
+        compared = (curvature != 0.0).flatten(0, 2).any(0).nonzero().flatten().tolist()
+        initial = InitialStates.estimated(twin, segments, compared, twin.sensitivities)
+        return Misfit(twin, segments, initial, weights=weights)
+
+    def _mean_equations(self, misfit: Misfit) -> NormalEquations:
+        found = misfit.normal_equations()
+        return self._with_prior(NormalEquations(*(part / len(misfit.segments) for part in found)))
 
     def _weights(self) -> Tensor:
         trained = [w.flatten() for w in self.twin.closure.parameters() if w.requires_grad]
@@ -173,8 +211,9 @@ class Assimilation:
     def _with_prior(self, found: NormalEquations) -> NormalEquations:
         if not self.config.prior:
             return found
-        pull = self._stiffness * (self._weights() - self._start)
-        matrix = found.matrix + torch.diag(self._stiffness)
+        n = len(found.gradient) - len(self._start)  # further unknowns, the last ones: initial states
+        pull = pad(self._stiffness * (self._weights() - self._start), (0, n))
+        matrix = found.matrix + torch.diag(pad(self._stiffness, (0, n)))
         return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
 
     def normal_equations(
@@ -197,12 +236,3 @@ class Assimilation:
             share * torch.einsum("bki,bkiw->w", g, S),
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
-
-
-def discrepancy_derivatives(
-    plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
-) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
-    """Gradient and Hessian of L_p with respect to every state."""
-    pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
-    curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
-    return pointwise(states, measured), curvature(states, measured)

@@ -80,6 +80,8 @@ class LevenbergMarquardt:
         return Descended(start, current.cost.item(), gradient, count)
 
     def _arrived(self, current: NormalEquations) -> bool:
+        if not current.gradient.any():
+            return True  # nor may there be a matrix to solve with, where no weight shows
         newton = self._step(current, self.least_damping)
         little = promised(current, newton) <= self.tolerance * current.cost
         return bool(little or newton.abs().max() < self.least_step)

@@ -1,5 +1,6 @@
 """Identification from a recorded log: the closure is trained without control, and judged on what was held out."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
@@ -12,17 +13,13 @@ from rt_torchrl.covariance import named_values, standard_errors
 from rt_torchrl.descent import Descent, DescentConfig
 from rt_torchrl.gauss_newton import LevenbergMarquardt
 from rt_torchrl.log import Log, logged_states
-from rt_torchrl.misfit import InitialStates, Misfit
+from rt_torchrl.memory import Segment
+from rt_torchrl.misfit import NOISE_TOLERANCE, InitialStates, Misfit
 from rt_torchrl.plant import Plant
-from rt_torchrl.resampling import Segment
+from rt_torchrl.sensitivity import Sensitivities
 from rt_torchrl.twin import DigitalTwin
 
 Optimiser = Literal["levenberg_marquardt", "adam", "lbfgs"]
-NOISE_TOLERANCE = 1e-8
-"""Levenberg-Marquardt ends where a step promises less than this share of J_p. One standard error of a weight changes
-J_p by one part in the number of samples, so that the default for noise-free records would end too early here."""
-INITIAL_ITERATIONS = 10
-"""Trial steps for initial states alone: J_p is nearly quadratic in them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +27,7 @@ class IdentificationConfig:
     """How the closure's weights are found.
 
     Args:
-        iterations: trial steps, first of the weights alone, then as many of weights and initial states together.
+        iterations: trial steps of each descent, see :class:`Identification`.
         optimiser: levenberg_marquardt, for closures of some ten weights; adam or lbfgs for more.
         rate: learning rate of adam, first step length of lbfgs.
         initial: estimated takes the initial state of each segment as unknown, measured as its first sample says.
@@ -73,8 +70,10 @@ class Identification:
     """Trains a closure on segments of a log.
 
     The twin is driven by the actions and the exogenous input that were logged; what it is compared in is the plant's
-    own J_p. Training goes in two stages, because initial states that are set free under weights far from the right ones
-    would be drawn away to make up for them.
+    own J_p. Where initial states are unknown there are two ways, and the weights with the lower J_p stay: weights and
+    initial states together, and the weights alone before both. On the first, initial states can be drawn away to make
+    up for weights far from the right ones; on the second, weights can be driven by the error of a first sample to where
+    the states no longer depend on them.
 
     Args:
         plant: the twin's physics.
@@ -93,8 +92,9 @@ class Identification:
         config: IdentificationConfig,
         compiled: bool = False,
     ):
-        self.twin, self.config, self._compiled = DigitalTwin(plant, closure), config, compiled
+        self.twin, self.config = DigitalTwin(plant, closure), config
         self.free = tuple(free) if config.initial == "estimated" else ()
+        self._sensitivities = Sensitivities(plant, closure, compiled_step=compiled)
 
     def run(self, training: Sequence[Segment], held_out: Sequence[Segment]) -> Identified:
         """Train on some segments and judge on others; the initial states of both are treated the same way.
@@ -105,12 +105,7 @@ class Identification:
         closure, both = self.twin.closure, (training, held_out)
         before = [self.judge(segments) for segments in both]
         start = coefficients(closure)
-        first = Misfit(self.twin, training, self._initial(training, ()), compiled=self._compiled)
-        done = self._descend(first, self.config.iterations)
-        misfit = first
-        if self.free:
-            misfit = Misfit(self.twin, training, self._initial(training, self.free), compiled=self._compiled)
-            done += self._descend(misfit, self.config.iterations)
+        misfit, done = self._train(training)
         errors = standard_errors(misfit)
         after = [self.judge(segments) for segments in both]
         weights = {
@@ -123,11 +118,9 @@ class Identification:
     def judge(self, segments: Sequence[Segment]) -> Judgement:
         """The twin with its present weights, from the initial states that suit it best, or from the measured ones."""
         plant = self.twin.plant
-        misfit = Misfit(self.twin, segments, self._initial(segments, self.free), weights=False, compiled=self._compiled)
+        misfit = self._misfit(segments, self.free, weights=False)
         if self.free:
-            LevenbergMarquardt(misfit.initial, tolerance=NOISE_TOLERANCE).run(
-                misfit.normal_equations, INITIAL_ITERATIONS
-            )
+            misfit.fit_initial_states()
         states = [replayed.states for replayed in misfit.replays()]
         measured = [segment.record.states for segment in segments]
         J_p = sum(plant.dt * plant.discrepancy(s, m).sum().item() for s, m in zip(states, measured, strict=True))
@@ -135,18 +128,30 @@ class Identification:
         seconds = plant.dt * sum(len(m) for m in measured)
         return Judgement(J_p, seconds, (error**2).mean(0).sqrt(), states)
 
-    def _initial(self, segments: Sequence[Segment], free: Sequence[int]) -> InitialStates:
-        """Offsets in units of the present residual, so that no step leaves what the sensors allow by much."""
-        fixed = InitialStates(segments, (), torch.ones(len(self.twin.plant.states), dtype=torch.float64))
-        if not free:
-            return fixed
-        replays = Misfit(self.twin, segments, fixed, weights=False, compiled=self._compiled).replays()
-        measured = torch.cat([segment.record.states for segment in segments])
-        residual = (torch.cat([replayed.states for replayed in replays]) - measured).square().mean(0).sqrt()
-        # A residual of zero would leave no unit to measure an offset in.
-        return InitialStates(segments, free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
+    def _misfit(self, segments: Sequence[Segment], free: Sequence[int], *, weights: bool = True) -> Misfit:
+        initial = InitialStates.estimated(self.twin, segments, free, self._sensitivities)
+        return Misfit(self.twin, segments, initial, weights=weights, sensitivities=self._sensitivities)
 
-    def _descend(self, misfit: Misfit, iterations: int) -> int:
+    def _train(self, segments: Sequence[Segment]) -> tuple[Misfit, int]:
+        """The misfit at its minimum, and the trial steps taken; both ways where initial states are unknown."""
+        closure = self.twin.closure
+        start = copy.deepcopy(closure.state_dict())
+        together = self._misfit(segments, self.free)
+        done = self._descend(together)
+        if not self.free:
+            return together, done
+        found, J_p = copy.deepcopy(closure.state_dict()), together.normal_equations().cost
+        closure.load_state_dict(start)
+        done += self._descend(self._misfit(segments, ()))
+        staged = self._misfit(segments, self.free)
+        done += self._descend(staged)
+        if staged.normal_equations().cost < J_p:
+            return staged, done
+        closure.load_state_dict(found)
+        return together, done
+
+    def _descend(self, misfit: Misfit) -> int:
+        iterations = self.config.iterations
         if self.config.optimiser == "levenberg_marquardt":
             optimiser = LevenbergMarquardt(misfit.unknowns, tolerance=NOISE_TOLERANCE)
             return optimiser.run(misfit.normal_equations, iterations).iterations

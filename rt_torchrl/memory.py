@@ -19,6 +19,13 @@ class Record(NamedTuple):
     actions: Float[Tensor, "n n_a"]
 
 
+class Segment(NamedTuple):
+    """A record without a gap, and the time of its first state on the plant's clock [s]."""
+
+    start: float
+    record: Record
+
+
 class ShortTermMemory(deque):
     """D_S: the records of the last ``capacity`` real episodes, oldest first."""
 

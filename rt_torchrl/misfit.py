@@ -13,14 +13,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from rt_torchrl.assimilation import discrepancy_derivatives
-from rt_torchrl.gauss_newton import NormalEquations
+from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
+from rt_torchrl.memory import Segment
 from rt_torchrl.plant import Plant
-from rt_torchrl.resampling import Segment
 from rt_torchrl.sensitivity import Sensitivities
 from rt_torchrl.trajectory import require_finite
 from rt_torchrl.twin import DigitalTwin
 
+NOISE_TOLERANCE = 1e-8
+"""Levenberg-Marquardt ends where a step promises less than this share of J_p. One standard error of a weight changes
+J_p by one part in the number of samples, so that the default for noise-free records would end too early here."""
+INITIAL_ITERATIONS = 10
+"""Trial steps for initial states alone: J_p is nearly quadratic in them."""
 REMEDY = "Check the units of the log's columns, use a smaller dt, or start from a closure nearer to the system."
 
 
@@ -42,6 +46,24 @@ class InitialStates(nn.Module):
 
     def forward(self) -> Float[Tensor, "segments n_s"]:
         return self.measured + self.offsets @ self.unit
+
+    @classmethod
+    def as_measured(cls, segments: Sequence[Segment]) -> "InitialStates":
+        """Without offsets."""
+        return cls(segments, (), torch.ones_like(segments[0].record.states[0]))
+
+    @classmethod
+    def estimated(
+        cls, twin: DigitalTwin, segments: Sequence[Segment], free: Sequence[int], sensitivities: Sensitivities
+    ) -> "InitialStates":
+        """Offsets in units of the twin's present residual, so that no step leaves what the sensors allow by much."""
+        if not free:
+            return cls.as_measured(segments)
+        fixed = Misfit(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
+        measured = torch.cat([segment.record.states for segment in segments])
+        residual = (torch.cat([replayed.states for replayed in fixed.replays()]) - measured).square().mean(0).sqrt()
+        # A residual of zero would leave no unit to measure an offset in.
+        return cls(segments, free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
 
 
 class Replayed(NamedTuple):
@@ -66,7 +88,7 @@ class Misfit:
         segments: of any lengths.
         initial: the initial states; their offsets come last.
         weights: whether the closure's weights are unknowns.
-        compiled: compile the interval.
+        sensitivities: of the twin; its own by default.
     """
 
     def __init__(
@@ -76,10 +98,10 @@ class Misfit:
         initial: InitialStates,
         *,
         weights: bool = True,
-        compiled: bool = False,
+        sensitivities: Sensitivities | None = None,
     ):
         self.twin, self.segments, self.initial = twin, list(segments), initial
-        self._sensitivities = Sensitivities(twin.plant, twin.closure, compiled_step=compiled)
+        self._sensitivities = sensitivities or twin.sensitivities
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
         self._shown = self.weight_count if weights else 0
         self.unknowns = nn.ModuleList([twin.closure, initial] if weights else [initial])
@@ -131,7 +153,20 @@ class Misfit:
             matrix[i[:, None], i] += dt * torch.einsum("kiv,kiw->vw", S, replayed.curvature @ S)
         return NormalEquations(cost, gradient, matrix)
 
+    def fit_initial_states(self) -> None:
+        """Estimate the initial states under the present weights, of a misfit whose only unknowns they are."""
+        LevenbergMarquardt(self.initial, tolerance=NOISE_TOLERANCE).run(self.normal_equations, INITIAL_ITERATIONS)
+
     def _index(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)
         own = self._shown + number * free + torch.arange(free)
         return torch.cat([torch.arange(self._shown), own])
+
+
+def discrepancy_derivatives(
+    plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
+) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
+    """Gradient and Hessian of L_p with respect to every state."""
+    pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
+    curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
+    return pointwise(states, measured), curvature(states, measured)

@@ -2,11 +2,29 @@
 
 import importlib.util
 import sys
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar
+
+import tyro
 
 from rt_torchrl.run_config import RunConfig
+
+Configuration = TypeVar("Configuration")
+
+
+def from_command_line(config_class: type[Configuration], arguments: Sequence[str] | None = None) -> Configuration:
+    """The configuration of a command line, by default of this process.
+
+    That of a recipe is read twice: some of its options have other defaults for others, see :meth:`RunConfig.defaults`;
+    what is given stays.
+    """
+    config = tyro.cli(config_class, args=arguments)
+    if isinstance(config, RunConfig):
+        config = tyro.cli(config_class, args=arguments, default=config.defaults())
+    return config
 
 
 @cache

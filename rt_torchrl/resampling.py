@@ -13,20 +13,13 @@ import torch
 from jaxtyping import Float
 
 from rt_torchrl.log import Log, logged_states
-from rt_torchrl.memory import Record
+from rt_torchrl.memory import Record, Segment
 from rt_torchrl.plant import Plant
 
 GAP_INTERVALS = 3.0
 """Sampling intervals after which a pause counts as a gap, unless a limit is stated."""
 ROUNDING = 1e-6
 """Share of an interval by which an instant may miss the grid."""
-
-
-class Segment(NamedTuple):
-    """A record without a gap, and the time of its first state on the plant's clock [s]."""
-
-    start: float
-    record: Record
 
 
 class Resampled(NamedTuple):

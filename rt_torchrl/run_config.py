@@ -120,10 +120,12 @@ class RunConfig:
         other = dataclasses.replace(self, policy=self.model_free_policy)
         return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
 
-    @classmethod
-    def defaults_for(cls, closure: str) -> "RunConfig":
-        """The defaults that go with a closure; override it where one closure is not trained like another."""
-        return cls(closure=closure)
+    def defaults(self) -> "RunConfig":
+        """The defaults that go with the closure and the sensors asked for; override it where one is not like another.
+
+        See :func:`rt_torchrl.recipe.from_command_line`.
+        """
+        return type(self)()
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Closure of the real system in each episode, if it wears; override it for a system that does."""

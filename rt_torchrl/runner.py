@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -26,6 +25,7 @@ from rt_torchrl.gradient_check import engine_gap
 from rt_torchrl.plant import Plant
 from rt_torchrl.real_episodes import Baseline, RealController, RealEpisodes
 from rt_torchrl.real_system import RealSystem
+from rt_torchrl.recipe import from_command_line
 from rt_torchrl.run_config import RunConfig
 from rt_torchrl.snapshot import Snapshot
 from rt_torchrl.twin import DigitalTwin
@@ -183,11 +183,7 @@ class Run:
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     """Run a recipe's main on its command line; what the user can mend is told in one line, without a traceback."""
     try:
-        config = tyro.cli(config_class)
-        if isinstance(config, RunConfig):
-            # Read again on top of the defaults that go with the closure; what is given on the command line stays.
-            config = tyro.cli(config_class, default=config.defaults_for(config.closure))
-        main(config)
+        main(from_command_line(config_class))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error
 

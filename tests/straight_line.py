@@ -4,9 +4,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from rt_torchrl.memory import Record
+from rt_torchrl.memory import Record, Segment
 from rt_torchrl.plant import Plant
-from rt_torchrl.resampling import Segment
 from rt_torchrl.signal import Signal, bounds
 from rt_torchrl.trajectory import Rollout
 

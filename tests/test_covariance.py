@@ -12,8 +12,8 @@ from rt_torchrl.covariance import covariance, named_values, newey_west, standard
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.identification import Identification, IdentificationConfig
+from rt_torchrl.memory import Segment
 from rt_torchrl.misfit import InitialStates, Misfit
-from rt_torchrl.resampling import Segment
 from rt_torchrl.twin import DigitalTwin
 
 
@@ -62,7 +62,7 @@ def test_scatter_over_logs_is_the_standard_error():
         segment = Segment(0.0, clean.record._replace(states=clean.record.states + noise))
         closure = LinearClosure(plant.true_closure)
         task = Identification(plant, closure, free=(0, 1), config=config)
-        task._descend(misfit := Misfit(task.twin, [segment], task._initial([segment], (0, 1))), config.iterations)
+        task._descend(misfit := task._misfit([segment], (0, 1)))
         estimates.append(closure.matrix.detach().flatten().clone())
         errors.append(torch.tensor(list(standard_errors(misfit).values())))
     z = (torch.stack(estimates) - torch.tensor(plant.true_closure).double().flatten()) / torch.stack(errors)

@@ -23,10 +23,10 @@ from rt_torchrl.identification import (
     lag_one,
     measured_states,
 )
-from rt_torchrl.memory import Record
+from rt_torchrl.memory import Record, Segment
 from rt_torchrl.misfit import InitialStates, Misfit
 from rt_torchrl.recorder import policy_law, recorded
-from rt_torchrl.resampling import Segment, hold_out, resample
+from rt_torchrl.resampling import hold_out, resample
 from rt_torchrl.trajectory import DivergenceError
 from rt_torchrl.twin import DigitalTwin
 
@@ -195,7 +195,8 @@ plant = LinearQuadratic(horizon=5.0)
 segments = flown(plant, torch.Generator().manual_seed(0), (30, 20))
 twin = DigitalTwin(plant, plant.make_closure(torch.Generator().manual_seed(1)))
 initial = InitialStates(segments, (0, 1), torch.ones(2).double())
-eager, compiled = (Misfit(twin, segments, initial, compiled=c).normal_equations() for c in (False, True))
+by_step = Sensitivities(plant, twin.closure, compiled_step=True)
+eager, compiled = (Misfit(twin, segments, initial, sensitivities=s).normal_equations() for s in (None, by_step))
 # The same sums in another order.
 for first, second in zip(eager, compiled, strict=True):
     torch.testing.assert_close(first, second, rtol=1e-11, atol=1e-13)

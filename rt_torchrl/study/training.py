@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from rt_torchrl.algorithm import Arm
-from rt_torchrl.recipe import load_recipe
+from rt_torchrl.recipe import from_command_line, load_recipe
 
 CHANGED = "model error"
 """The variant whose real system is not what the twin was made for."""
@@ -87,7 +85,7 @@ class Training:
             print(command, flush=True)
             try:
                 recipe = load_recipe(self.recipe)
-                recipe.main(tyro.cli(recipe.Config, args=arguments))
+                recipe.main(from_command_line(recipe.Config, arguments))
             except (Exception, SystemExit) as error:
                 raise RuntimeError(f"{command} failed; see {log}: {error}") from error
 

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from torch import nn
 
 from rt_torchrl.classical import ClassicalController
 from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.evaluation import UnseenEpisodes, exact_optimum
 from rt_torchrl.plant import Plant
-from rt_torchrl.recipe import load_recipe
+from rt_torchrl.recipe import from_command_line, load_recipe
 from rt_torchrl.run_config import RunConfig
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.tuning import tune
@@ -184,4 +183,4 @@ def changed_closure(system: Plant, recipe: Path, options: Options) -> nn.Module 
 
 def configured(recipe: Path, options: Options) -> RunConfig:
     """The recipe's configuration under these options; its ``plant()`` is the real system in simulation."""
-    return tyro.cli(load_recipe(recipe).Config, args=list(options)).effective()
+    return from_command_line(load_recipe(recipe).Config, options).effective()
