@@ -15,7 +15,7 @@ from rt_torchrl.descent import Descended, Descent, DescentConfig
 from rt_torchrl.exogenous import ExogenousProcess
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
 from rt_torchrl.memory import Record, Segment
-from rt_torchrl.misfit import NOISE_TOLERANCE, InitialStates, Misfit, discrepancy_derivatives
+from rt_torchrl.misfit import NOISE_TOLERANCE, InitialStates, Misfit, compared, discrepancy_derivatives
 from rt_torchrl.trajectory import identification_cost
 from rt_torchrl.twin import DigitalTwin
 
@@ -184,9 +184,8 @@ class Assimilation:
         records = map(Record, measured, exogenous, actions)
         segments = [Segment(*pair) for pair in zip(starts, records, strict=True)]
         twin = self.twin
-        curvature = discrepancy_derivatives(twin.plant, measured, measured)[1]
-        compared = (curvature != 0.0).flatten(0, 2).any(0).nonzero().flatten().tolist()
-        initial = InitialStates.estimated(twin, segments, compared, twin.sensitivities)
+        free = compared(discrepancy_derivatives(twin.plant, measured, measured)[1]).nonzero().flatten().tolist()
+        initial = InitialStates.estimated(twin, segments, free, twin.sensitivities)
         return Misfit(twin, segments, initial, weights=weights)
 
     def _mean_equations(self, misfit: Misfit) -> NormalEquations:
@@ -228,8 +227,8 @@ class Assimilation:
         plant, target = self.twin.plant, measured[:, 1:]
         share = plant.dt / len(measured)
         g, H = discrepancy_derivatives(plant, states, target)
-        # Of the states that J_p looks at: the products below are most of the work for a closure of many weights.
-        seen = (H != 0.0).flatten(0, 2).any(0)
+        # The products below are most of the work for a closure of many weights.
+        seen = compared(H)
         H, S_seen = H[..., seen, :][..., seen], S[:, :, seen]
         return NormalEquations(
             share * plant.discrepancy(states, target).sum(),

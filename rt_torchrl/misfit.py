@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
@@ -170,3 +170,8 @@ def discrepancy_derivatives(
     pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
     curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
     return pointwise(states, measured), curvature(states, measured)
+
+
+def compared(curvature: Float[Tensor, "batch n n_s n_s"]) -> Bool[Tensor, " n_s"]:
+    """The states that L_p looks at, by its Hessian."""
+    return (curvature != 0.0).flatten(0, 2).any(0)
