@@ -116,7 +116,7 @@ def untrained_costs(
     unseen: UnseenEpisodes,
     make_policy: Callable[[torch.Generator], nn.Module],
     *,
-    starts: int = 20,
+    starts: int,
     seed: int = UNSEEN_SEED,
 ) -> Float[Tensor, " {starts}"]:
     """Mean J_a of random initial policies, the scale that a training's cost is seen on whatever start it drew itself.

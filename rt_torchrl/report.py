@@ -11,6 +11,7 @@ from rt_torchrl.algorithm import ReinforcementTwinning
 from rt_torchrl.evaluation import Judged, Optimum, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.real_episodes import Baseline
 from rt_torchrl.switching import Role
+from rt_torchrl.trajectory import Trajectory
 from rt_torchrl.visited import rms_error, visited_features
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
@@ -43,9 +44,9 @@ def progress(record: dict[str, Any]) -> str:
 
 
 @torch.no_grad()
-def judge(unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: dict[str, Baseline]) -> dict[str, Judged]:
-    """Both policies, then the classical controllers, on the unseen episodes of the system as it is."""
-    judged = {role: unseen.judge(unseen.fly(policies[role])) for role in ROLES}
+def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: dict[str, Baseline]) -> dict[str, Judged]:
+    """Both policies as flown, then the classical controllers, on the unseen episodes of the system as it is."""
+    judged = {role: unseen.judge(flights[role]) for role in ROLES}
     return judged | {name: unseen.judge(unseen.fly_baseline(law)) for name, law in baselines.items()}
 
 
@@ -53,11 +54,12 @@ def judge(unseen: UnseenEpisodes, policies: dict[Role, nn.Module], baselines: di
 def summary(
     algorithm: ReinforcementTwinning,
     unseen: UnseenEpisodes,
+    flights: dict[Role, Trajectory],
     judged: dict[str, Judged],
     initial_policies: dict[Role, nn.Module],
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
-    untrained: Float[Tensor, " starts"],
+    untrained: Float[Tensor, " starts"] | None,
     optimum: Optimum | None,
 ) -> dict[str, Any]:
     """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
@@ -67,15 +69,15 @@ def summary(
     closure, live = algorithm.twin.closure, algorithm.switch.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
-    J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure)
-    after = {role: judged[role].control_costs.mean() for role in ROLES}
-    better = min(ROLES, key=lambda role: after[role].item())
-    means = {"J_p": J_p, "J_p_before": J_p_before, "J_a_untrained": untrained}
+    J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
+    after = {role: judged[role].control_costs.mean().item() for role in ROLES}
+    better = min(ROLES, key=after.__getitem__)
+    means = {"J_p": J_p, "J_p_before": J_p_before} | ({} if untrained is None else {"J_a_untrained": untrained})
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
     found = {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
-        **{f"J_a_ratio_{role}": (after[role] / before[role].mean()).item() for role in ROLES},
-        **{f"J_a_over_untrained_{role}": (after[role] / untrained.mean()).item() for role in ROLES},
+        **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
+        **over_untrained(after, untrained),
         "unseen": {"episodes": len(unseen.initial_state)}
         | {name: mean_with_confidence(values) for name, values in means.items()}
         | results(unseen, judged),
@@ -87,16 +89,22 @@ def summary(
     }
     if optimum is None:
         return found
-    share = after[better].item() / optimum.cost
-    reference = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs, "better_over_reference": share}
-    return found | {"reference": reference}
+    reference = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs}
+    return found | {"reference": reference | {"better_over_reference": after[better] / optimum.cost}}
+
+
+def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"] | None) -> dict[str, float]:
+    """Mean J_a after training over that of random starts; nothing without these."""
+    if untrained is None:
+        return {}
+    return {f"J_a_over_untrained_{role}": cost / untrained.mean().item() for role, cost in after.items()}
 
 
 def twin_costs(
-    unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module
+    unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module, flown: Trajectory
 ) -> list[Float[Tensor, " count"]]:
-    """J_p of the twin as it is and as it was, on the unseen episodes as the live policy flies them."""
-    twin, flown = algorithm.twin, unseen.fly(algorithm.policies[algorithm.switch.live])
+    """J_p of the twin as it is and as it was, on the unseen episodes as flown."""
+    twin = algorithm.twin
     return [unseen.identification_costs(twin.plant, closure, flown) for closure in (twin.closure, initial_closure)]
 
 
@@ -158,8 +166,9 @@ def table(metrics: dict[str, Any]) -> str:
     for name, before, after, ratio in rows:
         means = f"{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}"
         lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{ratio:>10.3g}")
-    shares = ", ".join(f"{role.replace('_', '-')} {found[f'J_a_over_untrained_{role}']:.3g}" for role in ROLES)
-    lines.append(f"  over a random start's mean J_a of {unseen['J_a_untrained']['mean']:.4g}: {shares}")
+    if "J_a_untrained" in unseen:
+        shares = ", ".join(f"{role.replace('_', '-')} {found[f'J_a_over_untrained_{role}']:.3g}" for role in ROLES)
+        lines.append(f"  over a random start's mean J_a of {unseen['J_a_untrained']['mean']:.4g}: {shares}")
     if "reference" in found:
         best, share = found["reference"]["J_a"], found["reference"]["better_over_reference"]
         lines.append(f"  exact gradients on the true plant: J_a {best:.5g}; the better policy is at {share:.3f} of it")

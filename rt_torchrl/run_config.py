@@ -44,6 +44,8 @@ class RunConfig:
         overwrite: replace what an earlier run left in log_dir.
         quick: a whole small run: at most 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end.
+        untrained: number of random starts whose mean cost on the unseen episodes the costs are also compared with; 0
+            leaves that out.
         reference: also compute what exact gradients on the true plant reach for this policy on the unseen episodes.
         figures: draw the figures at all; a training among many is done sooner without.
         figures_every: draw the figures into the dashboard every so many episodes, and at the end; 0 only at the end.
@@ -68,6 +70,7 @@ class RunConfig:
     overwrite: bool = False
     quick: bool = False
     unseen: int = 20
+    untrained: int = 20
     reference: bool = False
     figures: bool = True
     figures_every: int = 5
@@ -80,6 +83,7 @@ class RunConfig:
             ("episodes", 1),
             ("threads", 0),
             ("unseen", 2),
+            ("untrained", 0),
             ("figures_every", 0),
             ("unseen_every", 0),
         ):

@@ -28,6 +28,8 @@ from rt_torchrl.real_system import RealSystem
 from rt_torchrl.recipe import from_command_line
 from rt_torchrl.run_config import RunConfig
 from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.switching import Role
+from rt_torchrl.trajectory import Trajectory
 from rt_torchrl.twin import DigitalTwin
 
 PlantFigures = Callable[[Snapshot], dict[str, Figure]]
@@ -40,8 +42,8 @@ class Run:
         config: see :class:`RunConfig`.
         plant: the real system in simulation, and the twin's physics.
         env: the real system, where it is not a plant in simulation. It is judged on ``plant`` under ``env.closure``;
-            where that is not known, on real episodes: four times ``unseen`` of them (the policy before, both after, and
-            the live one again for the twin), and one for each of twenty random starts.
+            where that is not known, on real episodes: four times ``unseen`` of them (both policies before and after),
+            and one for each of the random starts, ``untrained``.
         believed: the twin's physics where they are not those of the real system; None where they are.
         plant_figures: figures only this plant has.
         baselines: controllers to judge beside the policies, by name: classical ones, or with an ``env`` of unknown
@@ -115,8 +117,9 @@ class Run:
             raise SystemExit("interrupted before the first episode was done; nothing to report.")
         self._drop_half_an_episode()
         self._follow_wear()
-        judged = report.judge(self.unseen, self.algorithm.policies, self.baselines)
-        metrics = self._results(gap, judged)
+        flights = {role: self.unseen.fly(self.algorithm.policies[role]) for role in report.ROLES}
+        judged = report.judge(self.unseen, flights, self.baselines)
+        metrics = self._results(gap, flights, judged)
         if self.config.figures:
             self._draw(dashboard, judged)
         dashboard.close()
@@ -150,11 +153,12 @@ class Run:
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
             self.episodes = checkpoint.load(self.folder / "checkpoint.pt", self.algorithm)
 
-    def _results(self, gap: float, judged: dict[str, Judged]) -> dict[str, Any]:
+    def _results(self, gap: float, flights: dict[Role, Trajectory], judged: dict[str, Judged]) -> dict[str, Any]:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
-        untrained = untrained_costs(self.unseen, self.make_policy)
-        initial = self.initial_policies, self.initial_closure
-        summary = report.summary(self.algorithm, self.unseen, judged, *initial, self.episodes, untrained, optimum)
+        starts = self.config.untrained
+        untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
+        before, after = (self.initial_policies, self.initial_closure), (flights, judged)
+        summary = report.summary(self.algorithm, self.unseen, *after, *before, self.episodes, untrained, optimum)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = {"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary}

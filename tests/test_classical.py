@@ -17,7 +17,7 @@ from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation import Judged, UnseenEpisodes
 from rt_torchrl.policies import SaturatedAffine
-from rt_torchrl.report import judge
+from rt_torchrl.report import ROLES, judge
 from rt_torchrl.trajectory import control_cost
 from rt_torchrl.tuning import tune
 
@@ -63,7 +63,7 @@ def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
     unseen = UnseenEpisodes(plant, 4)
     unseen.closure = worn
     affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
-    judged = judge(unseen, {"model_based": affine, "model_free": affine}, {"PD": PD(plant)})["PD"]
+    judged = judge(unseen, dict.fromkeys(ROLES, unseen.fly(affine)), {"PD": PD(plant)})["PD"]
     own = PD(plant).fly(unseen.initial_state, unseen.exogenous, worn)
     assert torch.equal(judged.control_costs, control_cost(plant, own, unseen.exogenous))
 

@@ -93,6 +93,26 @@ def test_ratios_are_costs_after_over_costs_before_on_the_real_plant(tmp_path):
     assert found["J_a_ratio_model_based"] == pytest.approx(costs["after"] / costs["before"], rel=1e-12)
 
 
+def test_a_run_without_random_starts_has_the_same_results(tmp_path, capsys):
+    compared = small_run(tmp_path / "compared", episodes=1).train()["summary"]
+    assert "over a random start's mean J_a" in capsys.readouterr().out
+    bare = small_run(tmp_path / "bare", episodes=1, untrained=0).train()["summary"]
+    assert "random start" not in capsys.readouterr().out
+    del compared["unseen"]["J_a_untrained"], compared["seconds"], bare["seconds"]
+    left = {key: value for key, value in compared.items() if "untrained" not in key}
+    assert left == bare and len(left) == len(compared) - 2
+
+
+def test_every_policy_is_flown_once_before_and_once_after(tmp_path, monkeypatch):
+    """An unseen episode of a real system may take hours."""
+    run, flown = small_run(tmp_path, episodes=1, untrained=0), []
+    fly = run.unseen.fly
+    monkeypatch.setattr(run.unseen, "fly", lambda policy: flown.append(policy) or fly(policy))
+    run.train()
+    both = [*run.algorithm.policies.values(), *run.initial_policies.values()]
+    assert len(flown) == 4 and {id(policy) for policy in flown} == {id(policy) for policy in both}
+
+
 def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
     run = small_run(tmp_path, episodes=4, unseen_every=2)
     metrics = run.train()

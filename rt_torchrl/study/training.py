@@ -57,7 +57,9 @@ class Training:
         """Options of the recipe; goes on with a run that was interrupted after its first episode."""
         begun = (self.folder / "checkpoint.pt").exists()
         options = ["--seed", str(self.seed), "--twinning.arm", self.arm, "--log-dir", str(self.folder)]
-        options += ["--figures-every", "0", "--threads", "1", "--resume" if begun else "--overwrite"]
+        # The report compares costs with each seed's own start, not with those of random ones.
+        options += ["--figures-every", "0", "--untrained", "0", "--threads", "1"]
+        options += ["--resume" if begun else "--overwrite"]
         options += [] if self.figures else ["--no-figures"]
         return [*options, *VARIANTS[self.variant], *self.options]
 
