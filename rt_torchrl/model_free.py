@@ -182,8 +182,8 @@ class ModelFree:
             memory.refresh(batch["index"], td_error)
             for key, value in zip(found, (loss.detach() / scale**2, td_error.mean() / scale, norm), strict=False):
                 found[key].append(value)
-        for _ in range(self.config.actor_iterations):
-            loss = _actor_loss(self.loss, memory.sample(size))
+        for batch in memory.samples(size, self.config.actor_iterations):
+            loss = _actor_loss(self.loss, batch)
             self.actor_optimiser.zero_grad(set_to_none=True)
             loss.backward()
             norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.gradient_limit)

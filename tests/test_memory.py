@@ -7,7 +7,7 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig, ShortTermMemory
+from rt_torchrl.memory import AT_ONCE, LongTermMemory, LongTermMemoryConfig, ShortTermMemory
 
 
 def memory(capacity=10, seed=0, **options):
@@ -110,6 +110,21 @@ def test_state_round_trip_samples_the_same():
         each.store(transitions([10.0, 11.0, 12.0]), torch.ones(3))
     # Label 1 had the least error once 0 was refreshed: it is evicted from both.
     assert labels(first) == labels(second) and 1.0 not in labels(second) and 0.0 in labels(second)
+
+
+def test_many_samples_are_those_of_single_calls():
+    many, single = memory(seed=1), memory(seed=1)
+    for each in (many, single):
+        each.store(transitions(list(range(8))), ERRORS)
+    count = 2 * AT_ONCE + 3
+    drawn = list(many.samples(16, count))
+    expected = [single.sample(16) for _ in range(count)]
+    for one, other in zip(drawn, expected, strict=True):
+        assert torch.equal(one["label"], other["label"])
+        # Powers of few numbers and of many are rounded apart.
+        torch.testing.assert_close(one["priority_weight"], other["priority_weight"])
+    assert torch.equal(many.sample(5)["label"], single.sample(5)["label"])
+    assert not list(many.samples(16, 0))
 
 
 def test_an_episode_that_does_not_fit_is_refused():

@@ -121,8 +121,8 @@ def test_critic_iterations_come_first_and_are_counted(monkeypatch):
     gain = found.policy.gain.detach().clone()
     found.update(memory, 20)
     assert calls == ["q"] * 7 + ["a"] * 4
-    # n_b = 32, but at most n_t = 20.
-    assert sizes == [20] * 11
+    # n_b = 32, but at most n_t = 20; those of the four policy iterations are drawn in one call.
+    assert sizes == [20] * 7 + [80]
     assert not torch.equal(gain, found.policy.gain)
 
 
