@@ -25,7 +25,7 @@ NOISE_TOLERANCE = 1e-8
 J_p by one part in the number of samples, so that the default for noise-free records would end too early here."""
 INITIAL_ITERATIONS = 10
 """Trial steps for initial states alone: J_p is nearly quadratic in them."""
-REMEDY = "Check the units of the log's columns, use a smaller dt, or start from a closure nearer to the system."
+REMEDY = "Check the units of what was recorded, use a smaller dt, or start from a closure nearer to the system."
 
 
 class InitialStates(nn.Module):

@@ -1,0 +1,59 @@
+"""The digital twin: what is varied when it replays and when it is planned on."""
+
+import copy
+
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from torch import nn
+
+from rt_torchrl.twin import DigitalTwin, constant
+
+
+def twin_and_policy():
+    plant = LinearQuadratic(horizon=1.0)
+    generator = torch.Generator().manual_seed(0)
+    twin = DigitalTwin(plant, LinearClosure(0.1 * torch.randn(2, 2, generator=generator)))
+    return (
+        twin,
+        plant.make_policy(generator),
+        (plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)),
+    )
+
+
+def test_a_constant_module_follows_the_one_it_was_made_from():
+    original = nn.Sequential(nn.Linear(2, 3), nn.BatchNorm1d(3)).double()
+    shared, x = constant(original), torch.randn(5, 2, dtype=torch.float64)
+    assert not any(w.requires_grad for w in shared.parameters()) and all(w.requires_grad for w in original.parameters())
+    # As Levenberg-Marquardt, Adam and a checkpoint move weights: in place. The buffers move with a forward pass.
+    original.load_state_dict({key: 2 * value for key, value in original.state_dict().items()})
+    original(x)
+    shared.eval(), original.eval()
+    assert torch.equal(shared(x), original(x))
+
+
+def test_planning_holds_the_closure_constant_and_changes_no_gradient_of_the_policy():
+    twin, policy, episodes = twin_and_policy()
+    twin.cost(policy, *episodes).backward()
+    planned = [w.grad.clone() for w in policy.parameters()]
+    assert all(w.grad is None and w.requires_grad for w in twin.closure.parameters())
+    # Independent of the engines: the plant's step in a loop, with a closure of its own that is differentiated too.
+    law, (state, exogenous), total = copy.deepcopy(twin.closure), episodes, 0.0
+    weights = [*policy.parameters(), *law.parameters()]
+    for k in range(twin.plant.n_steps):
+        t, z = torch.tensor(k * twin.plant.dt), exogenous[:, k]
+        action = policy(state)
+        total = total + twin.plant.running_cost(t, state, action, z).mean() / twin.plant.n_steps
+        state = twin.plant.step(t, state, action, z, law).state
+    expected = torch.autograd.grad(total, weights)
+    for found, exact in zip(planned, expected, strict=False):
+        torch.testing.assert_close(found, exact)
+    assert expected[-1].abs().max() > 0.0
+
+
+def test_a_twin_is_planned_on_with_the_weights_it_has_now():
+    twin, policy, episodes = twin_and_policy()
+    before = twin.cost(policy, *episodes)
+    with torch.no_grad():
+        for weight in twin.closure.parameters():
+            weight.add_(0.1)
+    assert twin.cost(policy, *episodes) != before
