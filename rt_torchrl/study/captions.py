@@ -68,7 +68,7 @@ def variants(results: Results) -> str:
         harder = {variant: named(entries)["twinning"].mean for variant, entries in results.variants[plant].items()}
         ratios = {variant: mean / found["twinning"].mean for variant, mean in harder.items()}
         worst = max(ratios, key=ratios.__getitem__)
-        lines.append(f"{title(plant)}: twinning suffers most from {worst}, {ratios[worst]:.3g} times its nominal cost.")
+        lines.append(f"{title(plant)}: twinning suffers most from {worst}, {ratios[worst]:.4g} times its nominal cost.")
     return " ".join(lines)
 
 

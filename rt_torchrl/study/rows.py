@@ -22,7 +22,12 @@ def merit_cells(entry: Entry) -> list[str]:
 def twin_cells(entry: Entry) -> list[str]:
     """Under ``TWIN_HEADER``: mean over the seeds, and the worst of them."""
     ratio = f"{np.mean(entry.J_p_ratio):.1e}" if entry.J_p_ratio else "–"
-    return [ratio, f"{100 * max(entry.weight_error):.2g} %" if entry.weight_error else "–"]
+    return [ratio, percent(max(entry.weight_error)) if entry.weight_error else "–"]
+
+
+def percent(share: float) -> str:
+    """A share with two digits; the second rounding only keeps 220 % from being written 2.2e+02 %."""
+    return f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def compared(first: Entry, second: Entry) -> str:
