@@ -1,5 +1,7 @@
 """What the tests of figures share: a snapshot without a training, and what is read off a drawn figure."""
 
+from itertools import combinations
+
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
@@ -36,6 +38,18 @@ def draw(figure) -> set[str]:
     """Draw it, which raises on broken mathtext; return every text."""
     FigureCanvasAgg(figure).draw()
     return {text.get_text() for text in figure.findobj(Text)}
+
+
+def collisions(figure) -> list[tuple[str, str]]:
+    """Pairs of titles, ticks along x and legends of a drawn figure that lie on each other."""
+    boxes = []
+    for ax in figure.axes:
+        texts = [ax._left_title, ax._right_title, *ax.get_xticklabels()]
+        boxes += [
+            (text.get_text(), text.get_window_extent()) for text in texts if text.get_text() and text.get_visible()
+        ]
+        boxes += [("legend", ax.get_legend().get_window_extent())] if ax.get_legend() else []
+    return [(one, other) for (one, first), (other, second) in combinations(boxes, 2) if first.overlaps(second)]
 
 
 def line(ax, label):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from figure_reading import draw, line
+from figure_reading import collisions, draw, line
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
 
@@ -199,7 +199,8 @@ def test_contours_of_a_constant_policy(oscillator):
 def test_learning_curves_timeline_and_events(oscillator):
     live = ["model_free", "model_free", "model_based", "model_based"]
     events = ["keep", "swap", "clone", "keep"]
-    costs = [{"real_cost": 4.0 - k, "J_a_model_based": 1.0, "J_a_model_free": 2.0, "J_p": 0.1**k} for k in range(4)]
+    twin = {"J_a_model_based": 1.0, "J_a_model_free": 2.0}
+    costs = [twin | {"real_cost": 4.0 - k, "J_a_unseen": 3.0, "J_p_before": 1.0, "J_p": 0.1**k} for k in range(4)]
     episodes = [c | {"live": r, "event": e} for c, r, e in zip(costs, live, events, strict=True)]
     figure = figures.learning_curves(replace(oscillator, episodes=episodes))
     control, identification, strip = figure.axes
@@ -214,7 +215,7 @@ def test_learning_curves_timeline_and_events(oscillator):
     ]
     assert [label.get_text() for label in strip.get_yticklabels()] == ["model-free", "model-based"]
     assert spans == [[(-0.5, 0.5), (0.5, 1.5)], [(1.5, 2.5), (2.5, 3.5)]]
-    assert draw(figure) >= {"swap", "clone"}
+    assert draw(figure) >= {"swap", "clone"} and not collisions(figure)
 
 
 @pytest.mark.parametrize("arm", ["model_free", "model_based"])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from figure_reading import collisions, draw
 
 from rt_torchrl import figures
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -21,7 +21,7 @@ def judged(*names):
 def test_every_episode_is_a_point_and_every_mean_a_bar():
     found, strong = judged("model_based", "model_free", "PD"), torch.arange(COUNT) < 3
     figure = figures.unseen(found, {"weak": ~strong, "strong": strong})
-    FigureCanvasAgg(figure).draw()
+    draw(figure)
     assert len(figure.axes) == 2
     for ax, pick in zip(figure.axes, ("costs", "merit"), strict=True):
         shown = [line for line in ax.lines if line.get_marker() in ("o", "^") and len(line.get_ydata())]
@@ -33,6 +33,12 @@ def test_every_episode_is_a_point_and_every_mean_a_bar():
             assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
             assert (np.abs(weak.get_xdata() - column) < 0.3).all()
     assert {text.get_text() for text in figure.legends[0].get_texts()} == {"weak", "strong"}
+
+
+def test_names_of_four_controllers_do_not_meet():
+    figure = figures.unseen(judged("model_based", "model_free", "on-off", "Jonkman"), {})
+    draw(figure)
+    assert not collisions(figure)
 
 
 def test_kinds_of_episodes_are_counted_and_averaged_apart():

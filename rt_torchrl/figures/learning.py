@@ -28,7 +28,7 @@ from rt_torchrl.switching import Role
 
 CONTROL = {
     "real_cost": {"color": REAL, "marker": "o", "label": "real system, live"},
-    "J_a_unseen": {"color": REAL, "marker": "*", "linestyle": ":", "label": "live, unseen episodes"},
+    "J_a_unseen": {"color": REAL, "marker": "*", "linestyle": ":", "label": "live, unseen"},
     "J_a_model_based": {"color": ROLES["model_based"], "marker": "s", "label": "model-based, twin"},
     "J_a_model_free": {"color": ROLES["model_free"], "marker": "^", "label": "model-free, twin"},
 }

@@ -52,5 +52,6 @@ def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]
     together = np.concatenate(list(values.values()))
     if together.min() > 0.0 and together.max() > WIDEST_LINEAR * together.min():
         ax.set_yscale("log")
-    ax.set_xticks(range(len(values)), [who.replace("_", "-") for who in values])
+    # In two lines: beside each other, four names are wider than a panel.
+    ax.set_xticks(range(len(values)), [who.replace("_", "-\n") for who in values])
     ax.set_xlim(-0.6, len(values) - 0.4)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from rt_torchrl.figures.style import with_unit
 from rt_torchrl.study.findings import Entry, difference
 
 COST_HEADER = ["J_a", "95 % interval"]
@@ -22,12 +23,7 @@ def merit_cells(entry: Entry) -> list[str]:
 def twin_cells(entry: Entry) -> list[str]:
     """Under ``TWIN_HEADER``: mean over the seeds, and the worst of them."""
     ratio = f"{np.mean(entry.J_p_ratio):.1e}" if entry.J_p_ratio else "–"
-    return [ratio, percent(max(entry.weight_error)) if entry.weight_error else "–"]
-
-
-def percent(share: float) -> str:
-    """A share with two digits; the second rounding only keeps 220 % from being written 2.2e+02 %."""
-    return f"{float(f'{100 * share:.2g}'):g} %"
+    return [ratio, with_unit(100 * max(entry.weight_error), "%") if entry.weight_error else "–"]
 
 
 def compared(first: Entry, second: Entry) -> str:
