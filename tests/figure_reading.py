@@ -44,7 +44,10 @@ def collisions(figure) -> list[tuple[str, str]]:
     """Pairs of titles, ticks along x and legends of a drawn figure that lie on each other."""
     boxes = []
     for ax in figure.axes:
-        texts = [ax._left_title, ax._right_title, *ax.get_xticklabels()]
+        first, last = sorted(ax.get_xlim())
+        # A tick beyond the ends has a label too, which is not drawn.
+        ticks = [text for text in ax.get_xticklabels() if first <= text.get_position()[0] <= last]
+        texts = [ax._left_title, ax._right_title, *ticks]
         boxes += [
             (text.get_text(), text.get_window_extent()) for text in texts if text.get_text() and text.get_visible()
         ]

@@ -85,7 +85,7 @@ def test_every_figure_is_drawn_within_its_canvas(name, request):
         drawn |= more
     for figure in drawn.values():
         assert draw(figure)
-        assert clipped_texts(figure) == []
+        assert clipped_texts(figure) == [] and not collisions(figure)
     # Nothing is left behind: no figure is registered anywhere.
     pyplot = sys.modules.get("matplotlib.pyplot")
     assert pyplot is None or pyplot.get_fignums() == []

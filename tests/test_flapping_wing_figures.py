@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from figure_reading import draw, line, snapshot_of
+from figure_reading import collisions, draw, line, snapshot_of
 from PIL import Image
 from torch import nn
 
@@ -40,6 +40,7 @@ def test_every_figure_is_drawn_within_its_canvas(snapshot):
     assert set(drawn) == {"flight_path", "flight", "polars", "control_surfaces"}
     for name, figure in drawn.items():
         assert draw(figure)
+        assert not collisions(figure), name
         width, height = figure.bbox.size
         texts = [figure._suptitle]
         for ax in figure.axes:
