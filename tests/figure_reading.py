@@ -40,6 +40,16 @@ def draw(figure) -> set[str]:
     return {text.get_text() for text in figure.findobj(Text)}
 
 
+def clipped_texts(figure) -> list[str]:
+    """Titles and axis labels that stick out of the canvas of a drawn figure."""
+    texts = [figure._suptitle]
+    for ax in figure.axes:
+        texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in texts if text.get_text()]
+    width, height = figure.bbox.size
+    return [name for name, b in boxes if b.x0 < 0 or b.y0 < 0 or b.x1 > width or b.y1 > height]
+
+
 def collisions(figure) -> list[tuple[str, str]]:
     """Pairs of titles, ticks along x and legends of a drawn figure that lie on each other."""
     boxes = []

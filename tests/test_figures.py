@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from figure_reading import collisions, draw, line
+from figure_reading import clipped_texts, collisions, draw, line
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
 
@@ -58,16 +58,6 @@ def oscillator() -> Snapshot:
 @pytest.fixture(scope="module")
 def turbine() -> Snapshot:
     return trained(WindTurbine(horizon=60.0))
-
-
-def clipped_texts(figure) -> list[str]:
-    """Titles and axis labels that stick out of the canvas of a drawn figure."""
-    texts = [figure._suptitle]
-    for ax in figure.axes:
-        texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
-    boxes = {text.get_text(): text.get_window_extent() for text in texts if text.get_text()}
-    width, height = figure.bbox.size
-    return [name for name, b in boxes.items() if b.x0 < 0 or b.y0 < 0 or b.x1 > width or b.y1 > height]
 
 
 def same(line, values) -> bool:

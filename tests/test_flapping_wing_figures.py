@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from figure_reading import collisions, draw, line, snapshot_of
+from figure_reading import clipped_texts, collisions, draw, line, snapshot_of
 from PIL import Image
 from torch import nn
 
@@ -40,13 +40,7 @@ def test_every_figure_is_drawn_within_its_canvas(snapshot):
     assert set(drawn) == {"flight_path", "flight", "polars", "control_surfaces"}
     for name, figure in drawn.items():
         assert draw(figure)
-        assert not collisions(figure), name
-        width, height = figure.bbox.size
-        texts = [figure._suptitle]
-        for ax in figure.axes:
-            texts += [ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
-        for box in (text.get_window_extent() for text in texts if text.get_text()):
-            assert min(box.x0, box.y0) >= 0 and box.x1 <= width and box.y1 <= height, name
+        assert clipped_texts(figure) == [] and not collisions(figure), name
 
 
 def test_flight_path_is_the_record(snapshot):
