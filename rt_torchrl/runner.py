@@ -157,8 +157,9 @@ class Run:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
         starts = self.config.untrained
         untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
-        before, after = (self.initial_policies, self.initial_closure), (flights, judged)
-        summary = report.summary(self.algorithm, self.unseen, *after, *before, self.episodes, untrained, optimum)
+        initial = self.initial_policies, self.initial_closure
+        found = self.episodes, untrained, optimum
+        summary = report.summary(self.algorithm, self.unseen, flights, judged, *initial, *found)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = {"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary}
