@@ -9,9 +9,9 @@ from pathlib import Path
 
 import torch
 
-from rt_torchrl.catalogue import plants
-from rt_torchrl.runner import main_of
-from rt_torchrl.trajectory import Engine, Rollout, control_cost
+from rt_torchrl.runs.run import main_of
+from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl.trajectories.trajectory import Engine, Rollout, control_cost
 
 REFERENCE: Engine = "odeint_adjoint"
 

@@ -10,19 +10,19 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from rt_torchrl.catalogue import plants
 from rt_torchrl.figures import identification as charts
-from rt_torchrl.identification import (
+from rt_torchrl.identification.identification import (
     Identification,
     IdentificationConfig,
     Identified,
     held_back,
     measured_states,
 )
-from rt_torchrl.log import Column, checked, read_log
-from rt_torchrl.plant import Plant
-from rt_torchrl.resampling import Resampled, hold_out, resample
-from rt_torchrl.runner import can_compile, main_of
+from rt_torchrl.identification.resampling import Resampled, hold_out, resample
+from rt_torchrl.identification.sensor_log import Column, checked, read_log
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.run import can_compile, main_of
+from rt_torchrl.runs.shipped_plants import plants
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,15 +7,15 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from rt_torchrl.catalogue import plants
-from rt_torchrl.classical import ClassicalController
+from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.log import Log, logged_states
-from rt_torchrl.plant import Plant
-from rt_torchrl.recorder import ClassicalLaw, Law, policy_law, recorded
-from rt_torchrl.runner import main_of
+from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.identification.simulated_log import ClassicalLaw, Law, policy_law, recorded
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.run import main_of
+from rt_torchrl.runs.shipped_plants import plants
 
 CONTROLLERS: dict[str, type[ClassicalController]] = {
     "wind_turbine": JonkmanController,

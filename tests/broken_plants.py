@@ -5,7 +5,7 @@ from linear_quadratic import LinearQuadratic
 from torch import nn
 
 from rt_torchrl import Signal
-from rt_torchrl.plant import Transition
+from rt_torchrl.plants.plant import Transition
 
 SPEED = LinearQuadratic.states[1]
 

@@ -6,9 +6,8 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from rt_torchrl.memory import Record
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.trajectory import Rollout
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.trajectories.trajectory import Record, Rollout
 
 
 def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapshot:

@@ -9,8 +9,8 @@ library's solvers: the tests compute matrix exponentials and Riccati solutions w
 import torch
 from torch import nn
 
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 
 
 class LinearClosure(nn.Module):

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from rt_torchrl.memory import Record, Segment
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal, bounds
-from rt_torchrl.trajectory import Rollout
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.trajectories.trajectory import Record, Rollout, Segment
 
 
 class Slope(nn.Module):

@@ -10,17 +10,17 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from tensordict import TensorDict
 from test_model_free import optimal_gain
 
-from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
-from rt_torchrl.assimilation import AssimilationConfig
-from rt_torchrl.descent import DescentConfig
-from rt_torchrl.environment import PlantEnv
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.exploration import ExplorationConfig
-from rt_torchrl.model_based import ModelBasedConfig
-from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.switching import SwitchConfig
-from rt_torchrl.trajectory import DivergenceError
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.trajectories.trajectory import DivergenceError
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.model_based import ModelBasedConfig
+from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.switching import SwitchConfig
 
 STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "plan", "switch_policies"]
 

@@ -9,8 +9,8 @@ import torch
 from linear_quadratic import LinearQuadratic
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl.calling_simulator import CallingSimulator
-from rt_torchrl.real_system import Reading, RealSystem
+from rt_torchrl.systems.calling_simulator import CallingSimulator
+from rt_torchrl.systems.real_system import Reading, RealSystem
 
 PLANT = LinearQuadratic(horizon=2.0)
 CALLS: list[str] = []

@@ -9,17 +9,17 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from test_model_free import optimal_gain
 
-from rt_torchrl.classical import ClassicalController
-from rt_torchrl.compilation import missing_for_compilation
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.baselines.tuning import tune
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.evaluation import Judged, UnseenEpisodes
-from rt_torchrl.policies import SaturatedAffine
-from rt_torchrl.report import ROLES, judge
-from rt_torchrl.trajectory import control_cost
-from rt_torchrl.tuning import tune
+from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
+from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.runs.results import ROLES, judge
+from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.trajectory import control_cost
 
 
 class PD(ClassicalController):

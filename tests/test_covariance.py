@@ -8,13 +8,13 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
 
-from rt_torchrl.covariance import covariance, named_values, newey_west, standard_errors
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.identification import Identification, IdentificationConfig
-from rt_torchrl.memory import Segment
-from rt_torchrl.misfit import InitialStates, Misfit
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.identification.covariance import covariance, named_values, newey_west, standard_errors
+from rt_torchrl.identification.identification import Identification, IdentificationConfig
+from rt_torchrl.identification.output_error import InitialStates, Misfit
+from rt_torchrl.trajectories.trajectory import Segment
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 def regression_error(n, dt, *, smooth):

@@ -21,8 +21,8 @@ from torch import nn
 
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.policies import mlp
-from rt_torchrl.trajectory import DivergenceError, Rollout
+from rt_torchrl.plants.policies import mlp
+from rt_torchrl.trajectories.trajectory import DivergenceError, Rollout
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from rt_torchrl import figures as general
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.memory import Record
-from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.trajectories.trajectory import Record
 
 FOUND = {"U_s": [8.0, 46.0], "U_HX": [12.0, 70.0], "K_JT": [90e9, 480e9]}
 TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from rt_torchrl.descent import Descent, DescentConfig
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
 
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
 CURVATURE = torch.tensor([1.0, 4.0, 10.0], dtype=torch.float64)

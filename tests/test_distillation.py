@@ -5,13 +5,13 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from test_algorithm import STEPS, twinning, weights
 
-from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.distillation import Distillation, DistillationConfig, ShareOfRange, imitate, same_architecture
-from rt_torchrl.environment import PlantEnv
-from rt_torchrl.model_based import VirtualEpisodes
-from rt_torchrl.policies import SaturatedAffine, SaturatedMLP
-from rt_torchrl.switching import SwitchConfig
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.distillation import Distillation, DistillationConfig, ShareOfRange, imitate, same_architecture
+from rt_torchrl.twinning.model_based import VirtualEpisodes
+from rt_torchrl.twinning.switching import SwitchConfig
 
 PLANT = LinearQuadratic(horizon=2.0)
 

@@ -5,10 +5,10 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from tensordict import TensorDict
 
-from rt_torchrl.environment import PlantEnv
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.integrators import rk4_step
-from rt_torchrl.trajectory import DivergenceError
+from rt_torchrl.plants.integrators import rk4_step
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import DivergenceError
 
 
 def act(env, found, action):

@@ -4,7 +4,7 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from test_model_free import optimal_gain
 
-from rt_torchrl.evaluation import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
 
 
 def random_gain(generator):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from rt_torchrl.exogenous import ExogenousConfig, ExogenousProcess
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5

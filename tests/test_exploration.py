@@ -6,7 +6,7 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
 
 class Held(torch.nn.Module):

@@ -10,11 +10,11 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
-from rt_torchrl.catalogue import plants
 from rt_torchrl.export import c_file, export_c, export_onnx, export_program, onnx_model
 from rt_torchrl.export.agreement import detached, sample_observations
-from rt_torchrl.policies import SaturatedMLP
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs.shipped_plants import plants
 
 # The same operations in double precision, at most in another order.
 ROUNDING = 1e-12

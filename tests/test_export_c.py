@@ -11,11 +11,11 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
-from rt_torchrl.catalogue import plants
 from rt_torchrl.export import c_file, export_c
 from rt_torchrl.export.c_operators import literal
-from rt_torchrl.policies import SaturatedAffine, SaturatedMLP, SmoothClip
-from rt_torchrl.signal import Signal, bounds
+from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
+from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.runs.shipped_plants import plants
 
 COMPILER = next(filter(None, map(shutil.which, c_file.COMPILERS)), None)
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")

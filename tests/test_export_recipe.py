@@ -11,9 +11,9 @@ import torch
 from linear_quadratic import LinearQuadratic
 from test_run import SMALL
 
-from rt_torchrl.finished_run import FinishedRun, config_class_of, rebuilt
-from rt_torchrl.run_config import RunConfig
-from rt_torchrl.runner import Run
+from rt_torchrl.runs.loaded_run import FinishedRun, config_class_of, rebuilt
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 PLANTS = ("cryogenic_tank", "flapping_wing", "wind_turbine")

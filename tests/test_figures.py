@@ -12,19 +12,19 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
 
 from rt_torchrl import figures
-from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
-from rt_torchrl.assimilation import AssimilationConfig
-from rt_torchrl.environment import PlantEnv
 from rt_torchrl.envs.wind_turbine import figures as turbine_figures
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures.policy import RESOLUTION, visited_observations
-from rt_torchrl.memory import Record
-from rt_torchrl.model_based import ModelBasedConfig
-from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.report import episode_record
-from rt_torchrl.signal import Signal
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs.results import episode_record
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import Record
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.model_based import ModelBasedConfig
+from rt_torchrl.twinning.model_free import ModelFreeConfig
 
 EVERYWHERE = {"states", "actions", "policy_contours", "learning_curves", "seconds"}
 

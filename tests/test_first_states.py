@@ -9,11 +9,11 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
-from rt_torchrl.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.closures import BoundedPerceptron
-from rt_torchrl.identification import Identification, IdentificationConfig
-from rt_torchrl.recipe import from_command_line, load_recipe
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.identification.identification import Identification, IdentificationConfig
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 WINDS = (1.0, -2.0)
 

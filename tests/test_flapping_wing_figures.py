@@ -14,8 +14,8 @@ from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.animation import FRAMES, RATE, save_animation
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.memory import Record
-from rt_torchrl.snapshot import Snapshot
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.trajectories.trajectory import Record
 
 SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
 

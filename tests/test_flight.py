@@ -4,11 +4,11 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.catalogue import plants
-from rt_torchrl.environment import PlantEnv
-from rt_torchrl.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.flight import EpisodeCollector, FlightCollector
-from rt_torchrl.trajectory import DivergenceError
+from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.trajectories.trajectory import DivergenceError
 
 
 def system(plant, batch=1, **options):

@@ -7,8 +7,8 @@ from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.signal import bounds
-from rt_torchrl.trajectory import Rollout, control_cost
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.trajectory import Rollout, control_cost
 
 
 def generator(seed=0):

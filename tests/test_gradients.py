@@ -9,14 +9,14 @@ import torch
 from linear_quadratic import LinearQuadratic
 from torch import nn
 
-from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.policies import SaturatedMLP, mlp
-from rt_torchrl.signal import bounds
-from rt_torchrl.trajectory import Rollout, control_cost
+from rt_torchrl.plants.policies import SaturatedMLP, mlp
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.trajectory import Rollout, control_cost
 
 PLANTS = {
     "linear_quadratic": lambda: LinearQuadratic(dt=0.1, horizon=4.0),

@@ -5,16 +5,16 @@ import pytest
 import torch
 from torchrl.envs import GymWrapper
 
-from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
-from rt_torchrl.assimilation import AssimilationConfig
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.exploration import ExplorationConfig
-from rt_torchrl.model_based import ModelBasedConfig
-from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.real_system import Actuation, Reading, RealSystem
-from rt_torchrl.safety import SafetyConfig, SafetyLayer
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
+from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.model_based import ModelBasedConfig
+from rt_torchrl.twinning.model_free import ModelFreeConfig
 
 RATE = 5.0
 APPLIED = Reading(keys=("applied",), scale=2.0)

@@ -11,24 +11,23 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
 
-from rt_torchrl.compilation import missing_for_compilation
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import identification as charts
-from rt_torchrl.identification import (
+from rt_torchrl.identification.identification import (
     Identification,
     IdentificationConfig,
     held_back,
     lag_one,
     measured_states,
 )
-from rt_torchrl.memory import Record, Segment
-from rt_torchrl.misfit import InitialStates, Misfit
-from rt_torchrl.recorder import policy_law, recorded
-from rt_torchrl.resampling import hold_out, resample
-from rt_torchrl.trajectory import DivergenceError
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.identification.output_error import InitialStates, Misfit
+from rt_torchrl.identification.resampling import hold_out, resample
+from rt_torchrl.identification.simulated_log import policy_law, recorded
+from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.trajectory import DivergenceError, Record, Segment
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 @pytest.mark.parametrize("kind", [LinearQuadratic, FlappingWing])

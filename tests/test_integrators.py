@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import brentq
 from torchdiffeq import odeint
 
-from rt_torchrl.integrators import RK4_REAL_STABILITY, rk4_step
-from rt_torchrl.plant import require_stable_step
+from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
+from rt_torchrl.plants.plant import require_stable_step
 
 
 def tensor(*values):

@@ -10,10 +10,10 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.log import Column, Log, checked, logged_signals, read_log
-from rt_torchrl.recorder import policy_law, recorded
-from rt_torchrl.resampling import hold_means, hold_out, resample
-from rt_torchrl.trajectory import Rollout
+from rt_torchrl.identification.resampling import hold_means, hold_out, resample
+from rt_torchrl.identification.sensor_log import Column, Log, checked, logged_signals, read_log
+from rt_torchrl.identification.simulated_log import policy_law, recorded
+from rt_torchrl.trajectories.trajectory import Rollout
 
 pytest.importorskip("pandas")
 PLANT = LinearQuadratic(dt=0.1)

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from rt_torchrl.memory import AT_ONCE, LongTermMemory, LongTermMemoryConfig, ShortTermMemory
+from rt_torchrl.twinning.memory import AT_ONCE, LongTermMemory, LongTermMemoryConfig, ShortTermMemory
 
 
 def memory(capacity=10, seed=0, **options):

@@ -9,9 +9,9 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 from tensordict import TensorDict
 
-from rt_torchrl.memory import LongTermMemory, LongTermMemoryConfig
-from rt_torchrl.model_free import ModelFree, ModelFreeConfig
-from rt_torchrl.trajectory import Rollout
+from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.twinning.memory import LongTermMemory, LongTermMemoryConfig
+from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
 
 GAMMA = 0.9
 GAMMA_IN_TORCHRL = torch.tensor(GAMMA, dtype=torch.float32).item()  # DDPGLoss keeps it in single precision

@@ -11,18 +11,17 @@ from test_sensitivity import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.closures import BoundedPerceptron
-from rt_torchrl.engines.linearisation import as_one_batch, linearise, linearise_by_rows
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.interval import Interval
-from rt_torchrl.memory import Record
-from rt_torchrl.runner import main_of
-from rt_torchrl.trajectory import drive_of
-from rt_torchrl.twin import DigitalTwin
-from rt_torchrl.visited import rms_error, visited_features
+from rt_torchrl.evaluation.closure_error import rms_error, visited_features
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.runs.run import main_of
+from rt_torchrl.trajectories.engines.interval import Interval
+from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, linearise_by_rows
+from rt_torchrl.trajectories.trajectory import Record, drive_of
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "wind_turbine.py"
 PLANTS = [WindTurbine(horizon=20.0), FlappingWing(horizon=0.01), CryogenicTank(horizon=1200.0)]

@@ -12,14 +12,13 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from rt_torchrl.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.envs.pendulum.models import UniformRod
 from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
-from rt_torchrl.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.memory import Record
-from rt_torchrl.trajectory import Rollout, control_cost
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.trajectories.trajectory import Record, Rollout, control_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"
 

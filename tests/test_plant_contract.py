@@ -11,10 +11,10 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl import check_plant
-from rt_torchrl.catalogue import plants
-from rt_torchrl.environment import PlantEnv
-from rt_torchrl.trajectory import control_cost
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 CLASSES = {"linear_quadratic": LinearQuadratic} | plants()
 GREATEST_EPISODE = 2000

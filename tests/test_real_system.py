@@ -17,9 +17,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem
-from rt_torchrl.real_episodes import RealEpisodes
-from rt_torchrl.run_config import RunConfig
-from rt_torchrl.runner import Run
+from rt_torchrl.evaluation.real_episodes import RealEpisodes
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
 
 MILLIMETRES = torch.tensor([1e3, 1e3], dtype=torch.float64)
 

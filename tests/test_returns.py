@@ -5,7 +5,7 @@ import torch
 from linear_quadratic import LinearQuadratic
 from tensordict import TensorDict
 
-from rt_torchrl.model_free import ModelFree, ModelFreeConfig
+from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
 
 
 def episode(n):

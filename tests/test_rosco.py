@@ -7,8 +7,8 @@ from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine, steps_of
-from rt_torchrl.real_episodes import RealEpisodes
-from rt_torchrl.real_system import episode_seed
+from rt_torchrl.evaluation.real_episodes import RealEpisodes
+from rt_torchrl.systems.real_system import episode_seed
 
 HORIZON = 60.0
 

@@ -8,16 +8,16 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from rt_torchrl.algorithm import ReinforcementTwinning, TwinningConfig
-from rt_torchrl.assimilation import AssimilationConfig
-from rt_torchrl.evaluation import UNSEEN_SEED, mean_with_confidence
-from rt_torchrl.exploration import ExplorationConfig
-from rt_torchrl.memory import LongTermMemoryConfig
-from rt_torchrl.model_free import ModelFreeConfig
-from rt_torchrl.run_config import RunConfig
-from rt_torchrl.runner import Run
-from rt_torchrl.switching import SwitchConfig
-from rt_torchrl.trajectory import Rollout, identification_cost
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.trajectories.trajectory import Rollout, identification_cost
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.memory import LongTermMemoryConfig
+from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.switching import SwitchConfig
 
 SMALL = TwinningConfig(
     realisations=2,

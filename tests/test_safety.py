@@ -10,9 +10,9 @@ from test_algorithm import twinning
 from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl.algorithm import ReinforcementTwinning
-from rt_torchrl.environment import PlantEnv
-from rt_torchrl.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
 DT = 0.1
 

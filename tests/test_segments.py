@@ -4,12 +4,11 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.assimilation import Assimilation, AssimilationConfig, Replay
-from rt_torchrl.exogenous import ExogenousProcess
-from rt_torchrl.memory import Record
-from rt_torchrl.sensitivity import Sensitivities
-from rt_torchrl.trajectory import Rollout, identification_cost
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.trajectories.sensitivity import Sensitivities
+from rt_torchrl.trajectories.trajectory import Record, Rollout, identification_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, Replay
+from rt_torchrl.twinning.exogenous import ExogenousProcess
 
 
 class Seasonal(LinearQuadratic):

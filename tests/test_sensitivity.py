@@ -4,13 +4,13 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.contract.calls import random_commands
-from rt_torchrl.engines import linearisation
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.gauss_newton import LevenbergMarquardt, NormalEquations
-from rt_torchrl.trajectory import Rollout, identification_cost
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from rt_torchrl.trajectories.engines import linearisation
+from rt_torchrl.trajectories.trajectory import Rollout, identification_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 
 def recorded(plant, batch=3, seed=0):

@@ -7,11 +7,11 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.descent import Descent, DescentConfig
-from rt_torchrl.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
-from rt_torchrl.short_horizon import ShortHorizon, ShortHorizonConfig
-from rt_torchrl.trajectory import control_cost
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
+from rt_torchrl.twinning.short_horizon import ShortHorizon, ShortHorizonConfig
 
 CONFIG = ShortHorizonConfig(window=10, critic_hidden=(32, 32))
 

@@ -12,9 +12,9 @@ import pytest
 import torch
 import tyro
 
-from rt_torchrl.catalogue import plants
-from rt_torchrl.evaluation import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.figures import study as charts
+from rt_torchrl.runs.shipped_plants import plants
 from rt_torchrl.study import captions, page, report, yardsticks
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
@@ -88,7 +88,7 @@ def written(path, main):
     path.write_text(
         "import json, os\n"
         "from dataclasses import dataclass\n"
-        "from rt_torchrl.run_config import RunConfig\n\n"
+        "from rt_torchrl.runs.run_config import RunConfig\n\n"
         "@dataclass(frozen=True, kw_only=True)\n"
         "class Config(RunConfig):\n    pass\n\n"
         f"def main(config):\n    {main}\n"

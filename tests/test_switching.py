@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from rt_torchrl.switching import PolicySwitch, SwitchConfig
+from rt_torchrl.twinning.switching import PolicySwitch, SwitchConfig
 
 WORSE, BETTER, EQUAL = (2.0, 1.0), (1.0, 2.0), (1.0, 1.0)
 MOVING, STALLED = 0.9, 0.1

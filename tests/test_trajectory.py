@@ -9,8 +9,8 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from torch import nn
 
-from rt_torchrl.trajectory import DivergenceError, Rollout, Trajectory, control_cost, identification_cost
-from rt_torchrl.twin import DigitalTwin
+from rt_torchrl.trajectories.trajectory import DivergenceError, Rollout, Trajectory, control_cost, identification_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)

@@ -6,7 +6,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
 
-from rt_torchrl.twin import DigitalTwin, constant
+from rt_torchrl.trajectories.twin import DigitalTwin, constant
 
 
 def twin_and_policy():

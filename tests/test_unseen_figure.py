@@ -6,8 +6,8 @@ from figure_reading import collisions, draw
 
 from rt_torchrl import figures
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.evaluation import Judged, UnseenEpisodes
-from rt_torchrl.report import merit_lines, results
+from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
+from rt_torchrl.runs.results import merit_lines, results
 
 COUNT = 12
 

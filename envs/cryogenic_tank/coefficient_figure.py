@@ -3,6 +3,8 @@
 import torch
 from matplotlib.figure import Figure
 
+from rt_torchrl.evaluation.closure_error import visited_features
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     CLOSURE_LINES,
     REAL,
@@ -15,8 +17,6 @@ from rt_torchrl.figures.style import (
     panels,
     veil,
 )
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.visited import visited_features
 
 LABELS = {
     "U_s": ("wall to fluid $U_s$ [W/(m² K)]", 1.0),

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.disturbance import require_request
+from rt_torchrl.plants.disturbance import require_request
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from rt_torchrl.envs.cryogenic_tank.merit import BAND
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.figures.learning import closure_weights, tracked_weights
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     CLOSURE_LINES,
     LARGE_SCALE,
@@ -34,7 +35,6 @@ from rt_torchrl.figures.style import (
     twin_label,
     veil,
 )
-from rt_torchrl.snapshot import Snapshot
 
 POINTS = 720
 """Groups of samples a record is drawn in at most: ten minutes each in five days, a ninth of an orbit."""

@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 SETTLED_SHARE = 0.6
 """Share of an episode after which the pressure should be held: three of five days."""

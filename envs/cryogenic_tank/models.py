@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.closures import PositiveCoefficients
-from rt_torchrl.policies import SmoothClip
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.closures import PositiveCoefficients
+from rt_torchrl.plants.policies import SmoothClip
+from rt_torchrl.plants.signal import Signal
 
 
 class ConstantCoefficients(PositiveCoefficients):

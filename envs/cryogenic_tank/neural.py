@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.closures import BoundedPerceptron
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.plants.plant import Plant
 
 
 class NeuralCoefficients(nn.Module):

@@ -15,9 +15,9 @@ from rt_torchrl.envs.cryogenic_tank.neural import first_neural_guess
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, valve_conductance, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
-from rt_torchrl.integrators import rk4_step
-from rt_torchrl.plant import Plant, Transition, require_stable_step
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.integrators import rk4_step
+from rt_torchrl.plants.plant import Plant, Transition, require_stable_step
+from rt_torchrl.plants.signal import Signal
 
 Wall = Literal["explicit", "exponential"]
 

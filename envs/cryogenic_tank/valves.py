@@ -4,14 +4,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.classical import ClassicalController
+from rt_torchrl.baselines.classical import ClassicalController
 
 
 class OnOffValve(ClassicalController):
     r"""A valve with hysteresis: opens to one fixed drop above :math:`\tilde p + h`, shuts below :math:`\tilde p - h`.
 
     It starts shut. h = 1 kPa is not tuned: a narrower band is always a little better for J_a, and wears the valve out.
-    The drop is: :func:`rt_torchrl.tuning.tune` on twenty loads leaves it where it starts, at the end of the range.
+    The drop is: :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads leaves it where it starts, at the end of
+    the range.
     """
 
     gain_units = {"opening": "Pa"}
@@ -33,9 +34,9 @@ class PIValve(ClassicalController):
     .. math:: \Delta p_V = K_P\,(p - \tilde p) + K_I\int(p - \tilde p)\,dt
 
     Started from ``placed_gains``, a time constant of τ = 12 h and K_I = K_P/(4τ) (an open valve takes up 1.3 W per kPa
-    of drop, and 1 W raises the pressure of the tank at the start by 8.3 Pa/h), :func:`rt_torchrl.tuning.tune` on twenty
-    loads goes for a tenfold gain and gives the integral up: a load of 129 W is then held 1 kPa above the target, and an
-    integral would only overshoot after starts that are 25 kPa off.
+    of drop, and 1 W raises the pressure of the tank at the start by 8.3 Pa/h),
+    :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads goes for a tenfold gain and gives the integral up: a load
+    of 129 W is then held 1 kPa above the target, and an integral would only overshoot after starts that are 25 kPa off.
     """
 
     gain_units = {"K_P": "-", "K_I": "1/s"}

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from matplotlib.animation import PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array, caption, last_episode, legend_below, panels
-from rt_torchrl.snapshot import Snapshot
 
 FRAMES = 125
 """Frames at most: the paper's five seconds in real time."""

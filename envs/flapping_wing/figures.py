@@ -9,7 +9,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
+from rt_torchrl.evaluation.closure_error import visited_features as features_of
 from rt_torchrl.figures.policy import contours
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     CLOSURE_LINES,
     LARGE_SCALE,
@@ -31,8 +33,6 @@ from rt_torchrl.figures.style import (
     twin_label,
     veil,
 )
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.visited import visited_features as features_of
 
 POLAR_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 SPAN_SHARE = 0.7

@@ -3,7 +3,7 @@
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 
 def merit(

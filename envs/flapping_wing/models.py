@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.closures import PositiveCoefficients
+from rt_torchrl.plants.closures import PositiveCoefficients
 
 
 class QuasiSteadyPolar(PositiveCoefficients):

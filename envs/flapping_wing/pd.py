@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.classical import ClassicalController
+from rt_torchrl.baselines.classical import ClassicalController
 
 
 class TrimmedPD(ClassicalController):
@@ -18,7 +18,7 @@ class TrimmedPD(ClassicalController):
     policies.
 
     Started from ``placed_gains`` (a point mass with two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and
-    g of thrust per radian of β_w), :func:`rt_torchrl.tuning.tune` on twenty gusts goes for steeper ones:
+    g of thrust per radian of β_w), :func:`~rt_torchrl.baselines.tuning.tune` on twenty gusts goes for steeper ones:
     full stroke until the target is near.
     """
 

@@ -12,9 +12,9 @@ from rt_torchrl.envs.flapping_wing import merit as judgement
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
-from rt_torchrl.plant import Plant, require_stable_step
-from rt_torchrl.policies import SaturatedAffine
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant, require_stable_step
+from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.signal import Signal
 
 Peak = Literal["unit", "printed"]
 

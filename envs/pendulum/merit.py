@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 UPRIGHT = 0.25
 """Angle within which the rod counts as upright [rad]."""

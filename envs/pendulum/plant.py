@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.pendulum.merit import merit
 from rt_torchrl.envs.pendulum.models import UniformRod
-from rt_torchrl.plant import Plant, Transition
-from rt_torchrl.policies import SaturatedMLP
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.plants.signal import Signal
 
 
 class Pendulum(Plant):

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.disturbance import require_request
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
+from rt_torchrl.plants.disturbance import require_request
 
 CUT_IN_SPEED = 3.0
 """Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""

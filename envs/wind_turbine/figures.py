@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     CLOSURE_LINES,
     FILTERED,
@@ -26,7 +27,6 @@ from rt_torchrl.figures.style import (
     panels,
     time_axis,
 )
-from rt_torchrl.snapshot import Snapshot
 
 PITCHES = (0.0, 5.0, 10.0, 15.0)
 """Pitch angles at which C_p is drawn [deg]."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 
 class GainScheduled(nn.Module):

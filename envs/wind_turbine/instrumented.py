@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.signal import Signal
 
 
 class InstrumentedTurbine(WindTurbine):

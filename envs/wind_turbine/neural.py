@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.closures import BoundedPerceptron
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.plants.closures import BoundedPerceptron
 
 
 class NeuralPowerCoefficient(nn.Module):

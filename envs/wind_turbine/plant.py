@@ -13,9 +13,9 @@ from rt_torchrl.envs.wind_turbine.merit import merit
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
-from rt_torchrl.plant import Plant, require_stable_step
-from rt_torchrl.policies import SaturatedAffine
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant, require_stable_step
+from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.signal import Signal
 
 DRIVETRAIN_INERTIA = 38_759_228.0 + 534.116 * 97.0**2
 """Rotor and generator on the low-speed shaft, 43 784 725 kg m² (NREL/TP-500-38060)."""

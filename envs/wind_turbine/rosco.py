@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rt_torchrl.calling_simulator import CallingSimulator, Controller
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.real_episodes import Flown, RealController
-from rt_torchrl.real_system import Reading, RealSystem, episode_seed
+from rt_torchrl.evaluation.real_episodes import Flown, RealController
+from rt_torchrl.systems.calling_simulator import CallingSimulator, Controller
+from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
 
 STEP = 0.1
 """Time step of ROSCO's simulator, which integrates the rotor by Euler's method [s]."""

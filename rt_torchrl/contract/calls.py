@@ -7,9 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.contract.draws import seeded
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import bounds
-from rt_torchrl.trajectory import Rollout
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.trajectory import Rollout
 
 Arguments = dict[str, Tensor]
 

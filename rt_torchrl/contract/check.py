@@ -11,7 +11,7 @@ from rt_torchrl.contract.methods import methods
 from rt_torchrl.contract.signals import signals
 from rt_torchrl.contract.stability import stability
 from rt_torchrl.contract.tracing import forward_mode, tracing
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 
 class PlantContractError(ValueError):

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 
 BATCH = 3
 

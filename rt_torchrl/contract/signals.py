@@ -3,8 +3,8 @@
 import math
 from collections.abc import Iterator
 
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 
 GROUPS = {"states": "n_s", "actions": "n_a", "inputs": "n_z", "observations": "n_o"}
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.contract.calls import Arguments, Calls
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 GROWTH = 1.0 + 1e-6
 """Factor per step from which a mode that decays counts as growing; an undamped one has rounding around 1."""

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from rt_torchrl.compilation import raised_limits
 from rt_torchrl.contract.calls import Arguments, Calls
-from rt_torchrl.engines.linearisation import linearise
-from rt_torchrl.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.compilation import raised_limits
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.linearisation import linearise
 
 REMEDY = (
     "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal, bounds
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal, bounds
 
 TOLERANCE = 1e-6
 """Greatest difference allowed, as a share of the action's range; what is computed in double precision needs 1e-12."""

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from rt_torchrl.export.agreement import detached, require_agreement, sample_observations
 from rt_torchrl.export.c_function import CFunction
 from rt_torchrl.export.program import trace
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 
 COMPILERS = ("cc", "gcc", "clang")
 EXAMPLES = 3

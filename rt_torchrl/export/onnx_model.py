@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.export.agreement import detached, require_agreement
 from rt_torchrl.export.program import INTERFACE, interface, trace
-from rt_torchrl.plant import Plant
+from rt_torchrl.plants.plant import Plant
 
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
 

@@ -12,8 +12,8 @@ from torch import nn
 from torch.export import Dim, ExportedProgram
 
 from rt_torchrl.export.agreement import detached, require_agreement, sample_observations
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 
 INTERFACE = "interface.json"
 """Name of the extra file of a program that describes its observations and actions."""

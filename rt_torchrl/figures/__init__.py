@@ -5,8 +5,8 @@ from matplotlib.figure import Figure
 from rt_torchrl.figures.episode import actions, exogenous, states
 from rt_torchrl.figures.learning import closure_weights, learning_curves, seconds, tracked_weights
 from rt_torchrl.figures.policy import policy_contours
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.unseen import unseen
-from rt_torchrl.snapshot import Snapshot
 
 __all__ = [
     "actions",

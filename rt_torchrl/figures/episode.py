@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     LARGE_SCALE,
     REAL,
@@ -20,8 +21,7 @@ from rt_torchrl.figures.style import (
     twin_label,
     with_unit,
 )
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.switching import Role
+from rt_torchrl.twinning.switching import Role
 
 
 def states(snapshot: Snapshot) -> Figure:

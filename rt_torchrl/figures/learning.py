@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     REAL,
     REFERENCE_LINE,
@@ -22,9 +23,8 @@ from rt_torchrl.figures.style import (
     panels,
     role_name,
 )
-from rt_torchrl.report import named_weights
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.switching import Role
+from rt_torchrl.plants.closures import named_weights
+from rt_torchrl.twinning.switching import Role
 
 CONTROL = {
     "real_cost": {"color": REAL, "marker": "o", "label": "real system, live"},

@@ -12,10 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from rt_torchrl.plant import Plant
-from rt_torchrl.signal import Signal
-from rt_torchrl.snapshot import Snapshot
-from rt_torchrl.switching import Role
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.twinning.switching import Role
 
 REAL, TWIN, REFERENCE, LARGE_SCALE = "#222222", "#D55E00", "#009E73", "#D55E00"
 FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from rt_torchrl.evaluation import Judged
+from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures.style import REFERENCE, ROLES, array, caption, legend_below, panels
 
 MARKERS = ("o", "^", "s", "D")

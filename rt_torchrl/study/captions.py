@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from rt_torchrl.figures.study import shown
+from rt_torchrl.study.figures import shown
 from rt_torchrl.study.findings import NEAR, Entry, Results, named
 from rt_torchrl.study.training import CHANGED
 from rt_torchrl.study.variants import HALVES

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rt_torchrl.figures.study import shown
 from rt_torchrl.study import variants
 from rt_torchrl.study.captions import title
+from rt_torchrl.study.figures import shown
 from rt_torchrl.study.findings import Entry, Results, named
 from rt_torchrl.study.page import table
 from rt_torchrl.study.rows import COST_HEADER, TWIN_HEADER, compared, cost_cells, merit_cells, twin_cells

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rt_torchrl.algorithm import Arm
-from rt_torchrl.recipe import from_command_line, load_recipe
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.twinning.algorithm import Arm
 
 CHANGED = "model error"
 """The variant whose real system is not what the twin was made for."""

@@ -1,6 +1,6 @@
 """What noise of the sensors and errors of the model do to every arm, in a table and in sentences."""
 
-from rt_torchrl.figures.study import shown
+from rt_torchrl.study.figures import shown
 from rt_torchrl.study.findings import Entry, named
 from rt_torchrl.study.page import table
 from rt_torchrl.study.rows import COST_HEADER, TWIN_HEADER, compared, cost_cells, merit_cells, twin_cells

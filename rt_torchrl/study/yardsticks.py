@@ -10,14 +10,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from rt_torchrl.classical import ClassicalController
-from rt_torchrl.compilation import missing_for_compilation
-from rt_torchrl.evaluation import UnseenEpisodes, exact_optimum
-from rt_torchrl.plant import Plant
-from rt_torchrl.recipe import from_command_line, load_recipe
-from rt_torchrl.run_config import RunConfig
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.baselines.tuning import tune
+from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.study.training import CHANGED, VARIANTS
-from rt_torchrl.tuning import tune
+from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 
 Options = tuple[str, ...]
 """Of a recipe's command line."""

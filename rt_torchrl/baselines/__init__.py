@@ -1,0 +1,1 @@
+"""Classical controllers that policies are compared with."""

@@ -1,0 +1,107 @@
+"""Classical controllers: laws of the measured state that may have a memory, to compare learned policies with."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
+from rt_torchrl.trajectories.trajectory import Trajectory, drive_of
+
+
+class ClassicalController(nn.Module, ABC):
+    r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k)` with memory m, which no ``policy(observation)`` can be.
+
+    Its gains are held by their logarithms, so that a search changes each in proportion and never its sign.
+
+    Args:
+        plant: what it controls; its actuators limit range and rate.
+        gains: in the order and the units of ``gain_units``; None for the defaults.
+        compiled: compile the flight.
+
+    Raises:
+        ValueError: if the number of gains is wrong or one of them is not positive and finite.
+    """
+
+    gain_units: dict[str, str] = {}
+    """Unit of each gain, by name."""
+    default_gains: tuple[float, ...] = ()
+    placed_gains: tuple[float, ...] | None = None
+    """Gains by a rule of thumb, where a search is to start from them and not from the defaults."""
+    memory_size: int = 0
+
+    def __init__(self, plant: Plant, gains: tuple[float, ...] | None = None, *, compiled: bool = False):
+        super().__init__()
+        values = torch.tensor(self.default_gains if gains is None else gains, dtype=torch.float64)
+        if len(values) != len(self.gain_units) or not (values.isfinite() & (values > 0)).all():
+            wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.gain_units.items())
+            raise ValueError(f"gains={gains} of {type(self).__name__} must be positive and finite: {wanted}.")
+        self.plant = plant
+        self.log_gains = nn.Parameter(values.log(), requires_grad=False)
+        low, high = bounds(plant.actions)
+        self.register_buffer("low_action", low)
+        self.register_buffer("high_action", high)
+        self._march = compiled_if(compiled, march_by_scan, march)
+
+    def named_gains(self) -> dict[str, float]:
+        """The gains by name."""
+        return dict(zip(self.gain_units, self.log_gains.exp().tolist(), strict=True))
+
+    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
+        """Memory at the start of an episode; zeros unless overridden."""
+        return state.new_zeros(len(state), self.memory_size)
+
+    @abstractmethod
+    def act(
+        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """Command, held to the ranges of the actions by the caller, and the new memory."""
+
+    @torch.no_grad()
+    def fly(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        closure: nn.Module | None = None,
+    ) -> Trajectory:
+        """Real episodes under this controller, of a system with this closure; None for the plant's own."""
+        closure = self.plant.closure if closure is None else closure
+        loop, n_s = ControlledInterval(self, closure), len(self.plant.states)
+        start = marked_dynamic(torch.cat([initial_state, self.first_memory(initial_state)], -1), 0)
+        drive = drive_of(self.plant, exogenous, None)
+        carries = torch.cat([start.unsqueeze(0), self._march(loop, start, drive)])
+        states = carries[..., :n_s].transpose(0, 1)
+        command = loop.commanded(carries[:-1].flatten(0, 1))[0].unflatten(0, carries[:-1].shape[:2])
+        return Trajectory(states, self.plant.actuate(states[:, :-1], command.transpose(0, 1)))
+
+
+class ControlledInterval(Interval):
+    """One control interval of a system under a classical controller; its state is (s, m).
+
+    Args:
+        controller: with its plant.
+        closure: of the system.
+    """
+
+    def __init__(self, controller: ClassicalController, closure: nn.Module | None):
+        super().__init__(controller.plant, closure, controller)
+
+    def commanded(
+        self, carry: Float[Tensor, "batch n_c"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """The command within the ranges of the actions, and the new memory."""
+        n_s = len(self.plant.states)
+        command, memory = self.policy.act(carry[..., :n_s], carry[..., n_s:])
+        return command.clamp(self.policy.low_action, self.policy.high_action), memory
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """(state, memory) at the end of the interval."""
+        command, memory = self.commanded(state)
+        s = state[..., : len(self.plant.states)]
+        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
+        return torch.cat([end, memory], -1)

@@ -1,0 +1,90 @@
+"""Unseen episodes on a real system whose true closure nobody knows."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Bool, Float
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+
+class Flown(Trajectory):
+    """A trajectory as measured, with the exogenous input that acted in it."""
+
+    exogenous: Float[Tensor, "count n n_z"]
+
+
+class RealController(nn.Module, ABC):
+    """A controller that can only be flown on the real system.
+
+    Args:
+        plant: physics and control problem of the twin.
+        compiled: compile what can be.
+    """
+
+    def __init__(self, plant: Plant, *, compiled: bool = False):
+        super().__init__()
+        self.plant = plant
+
+    @abstractmethod
+    def fly_real(self, count: int, *, seed: int) -> Flown:
+        """As many episodes of the sequence that belongs to a seed."""
+
+
+Baseline = ClassicalController | RealController
+"""What policies are compared with: on the plant, or on a real system of which no closure is known."""
+
+
+class RealEpisodes(UnseenEpisodes):
+    """Episodes flown on the real system itself, without exploration, each time they are asked for.
+
+    A system that takes a seed flies the same episodes for every policy, and its sequence of training episodes goes on
+    afterwards as if nothing had been flown. Another one flies what comes.
+
+    Args:
+        system: the real system.
+        count: number of episodes, at least 2.
+        device: where the twin is, whose replay of them is judged.
+    """
+
+    def __init__(self, system: RealSystem, count: int = 20, *, device: torch.device | str = "cpu"):
+        super().__init__(system.plant, count, device=device)
+        self.closure = None
+        self._system, self._count = system, count
+
+    def fly(self, policy: nn.Module) -> Flown:
+        return self._flown(policy, self._count)
+
+    def untrained_cost(self, policy: nn.Module) -> float:
+        """J_a of one episode: that of a random policy is a matter of its order of size."""
+        return self.judge(self._flown(policy, 1)).control_costs.mean().item()
+
+    def fly_baseline(self, law: RealController) -> Flown:
+        return law.fly_real(self._count, seed=UNSEEN_SEED)
+
+    @torch.no_grad()
+    def _flown(self, policy: nn.Module, count: int) -> Flown:
+        actor = TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
+        kept = self._system.state_dict()
+        self._system.set_seed(UNSEEN_SEED)
+        try:
+            found = torch.cat([self._system.rollout(self.plant.n_steps, actor) for _ in range(count)])
+        finally:
+            self._system.load_state_dict(kept)
+        states = torch.cat([found["state"], found["next", "state"][:, -1:]], 1)
+        flown = Flown(states, found["next", "applied"])
+        flown.exogenous = found["exogenous"]
+        return flown
+
+    def exogenous_of(self, flown: Flown) -> Float[Tensor, "count n n_z"]:
+        return flown.exogenous
+
+    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
+        """None: what acts from outside need not be the same each time."""
+        return {}

@@ -1,0 +1,194 @@
+"""How good twin and policies are on episodes they were never trained on."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.stats import bootstrap
+from torch import Tensor, nn
+
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Rollout, Trajectory, control_cost, identification_cost
+
+UNSEEN_SEED = 1_000_000
+"""Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
+
+
+class UnseenEpisodes:
+    """Real episodes with initial states and disturbances that no training has drawn.
+
+    The true closure is the plant's own; assign :attr:`closure` for a system that has worn.
+
+    Args:
+        plant: the real system.
+        count: number of episodes, at least 2.
+        compiled: compile the rollouts.
+        device: where they run.
+        seed: of their draws.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        count: int = 20,
+        *,
+        compiled: bool = False,
+        device: torch.device | str = "cpu",
+        seed: int = UNSEEN_SEED,
+    ):
+        if count < 2:
+            raise ValueError(f"count={count} of unseen episodes must be at least 2 for a confidence interval.")
+        generator = torch.Generator(device=device).manual_seed(seed)
+        self.plant, self._compiled = plant, compiled
+        self.closure: nn.Module | None = plant.closure
+        self.initial_state = plant.draw_initial_state(count, generator)
+        self.exogenous = plant.draw_exogenous(count, generator)
+
+    @torch.no_grad()
+    def fly(self, policy: nn.Module) -> Trajectory:
+        """The episodes under a policy, on the real system."""
+        rollout = Rollout(self.plant, self.closure, policy, compiled=self._compiled)
+        return rollout(self.initial_state, self.exogenous)
+
+    def fly_baseline(self, law: ClassicalController) -> Trajectory:
+        """The episodes under a classical controller, on the system as it is."""
+        return law.fly(self.initial_state, self.exogenous, self.closure)
+
+    def exogenous_of(self, flown: Trajectory) -> Float[Tensor, "count n n_z"]:
+        """What acted from outside in the episodes as flown."""
+        return self.exogenous
+
+    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+        """J_a of each episode."""
+        flown = self.fly(policy)
+        return control_cost(self.plant, flown, self.exogenous_of(flown))
+
+    def untrained_cost(self, policy: nn.Module) -> float:
+        """Mean J_a of one of many random initial policies."""
+        return self.control_costs(policy).mean().item()
+
+    def judge(self, flown: Trajectory) -> "Judged":
+        """J_a and the plant's own quantities of the episodes as flown."""
+        exogenous = self.exogenous_of(flown)
+        costs = control_cost(self.plant, flown, exogenous)
+        return Judged(costs, self.plant.merit(flown.states, flown.actions, exogenous))
+
+    def categories(self) -> dict[str, Bool[Tensor, " count"]]:
+        """The kinds of episodes that this plant's results are also shown apart for."""
+        return self.plant.categories(self.exogenous)
+
+    @torch.no_grad()
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
+        """J_p of each episode: a twin replays what was flown, under the true disturbances.
+
+        Args:
+            physics: the twin's, which need not be those of the real system.
+            closure: the twin's.
+            flown: the episodes on the real system.
+        """
+        rollout = Rollout(physics, closure, compiled=self._compiled)
+        replayed = rollout(flown.states[:, 0], self.exogenous_of(flown), flown.actions)
+        return identification_cost(self.plant, replayed, flown.states)
+
+
+class Judged(NamedTuple):
+    """J_a and the plant's own quantities of each unseen episode under one controller."""
+
+    control_costs: Float[Tensor, " count"]
+    merit: dict[str, Float[Tensor, " count"]]
+
+    def statistics(self, chosen: Bool[Tensor, " count"] | None = None) -> dict[str, Any]:
+        """``J_a`` and ``merit``: mean with confidence interval, and median; of the ``chosen`` episodes only."""
+        chosen = torch.ones_like(self.control_costs, dtype=torch.bool) if chosen is None else chosen
+        merit = {
+            name: mean_with_confidence(values[chosen]) | {"median": values[chosen].median().item()}
+            for name, values in self.merit.items()
+        }
+        return {"J_a": mean_with_confidence(self.control_costs[chosen]), "merit": merit}
+
+
+@torch.no_grad()
+def untrained_costs(
+    unseen: UnseenEpisodes,
+    make_policy: Callable[[torch.Generator], nn.Module],
+    *,
+    starts: int,
+    seed: int = UNSEEN_SEED,
+) -> Float[Tensor, " {starts}"]:
+    """Mean J_a of random initial policies, the scale that a training's cost is seen on whatever start it drew itself.
+
+    Args:
+        unseen: the episodes.
+        make_policy: draws a policy of the class.
+        starts: number of policies.
+        seed: of their weights.
+    """
+    device = unseen.initial_state.device
+    generator = torch.Generator(device=device).manual_seed(seed)
+    costs = [unseen.untrained_cost(make_policy(generator).to(device)) for _ in range(starts)]
+    return torch.tensor(costs, dtype=torch.float64, device=device)
+
+
+class Optimum(NamedTuple):
+    """Best mean J_a found, the policy that has it, and the cost that every start reached on a few of the episodes."""
+
+    cost: float
+    policy: nn.Module
+    costs: list[float]
+
+
+def exact_optimum(
+    unseen: UnseenEpisodes,
+    make_policy: Callable[[torch.Generator], nn.Module],
+    *,
+    starts: int = 3,
+    iterations: int = 80,
+    few: int = 10,
+    polish: int = 20,
+    seed: int = UNSEEN_SEED,
+) -> Optimum:
+    """The best a class of policies can do: exact gradients on the *true* plant, on the episodes it is judged on.
+
+    Every start descends on a few episodes, because a gradient over a hundred takes ten times as long and points where
+    one over ten does; the best of them goes on with all.
+
+    Args:
+        unseen: the episodes.
+        make_policy: draws a policy of the class.
+        starts: number of initial weights.
+        iterations: gradients from each, on the first ``few`` episodes.
+        few: number of these.
+        polish: gradients of the best, on all episodes.
+        seed: of the initial weights.
+    """
+    generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
+
+    def descend(policy: nn.Module, count: int, iterations: int) -> float:
+        rollout = Rollout(unseen.plant, unseen.closure, policy, compiled=unseen._compiled)
+        state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
+
+        def cost() -> Tensor:
+            return control_cost(unseen.plant, rollout(state, exogenous), exogenous).mean()
+
+        return Descent(policy, DescentConfig(optimiser="lbfgs", rate=1.0)).run(cost, iterations).best
+
+    policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
+    costs = [descend(policy, few, iterations) for policy in policies]
+    best = policies[min(range(starts), key=costs.__getitem__)]
+    return Optimum(descend(best, len(unseen.initial_state), polish), best, costs)
+
+
+def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:
+    """Mean and percentile-bootstrap confidence interval (2000 resamples), as it is written into ``metrics.json``."""
+    numbers = values.detach().cpu().numpy().astype(np.float64)
+    mean = float(numbers.mean())
+    if np.ptp(numbers) == 0.0:
+        return {"mean": mean, "confidence_interval": [mean, mean]}
+    interval = bootstrap(
+        (numbers,), np.mean, n_resamples=2000, confidence_level=level, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    return {"mean": mean, "confidence_interval": [float(interval.low), float(interval.high)]}

@@ -1,0 +1,68 @@
+"""What there is to look at after an episode."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Record
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.switching import Role
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """Input of every figure.
+
+    Args:
+        plant: with the true closure, if that is known.
+        known: whether it is; not that of a real system.
+        closure: the learned closure.
+        initial_closure: the closure that the training started from.
+        policies: both policies.
+        live: role of the live one.
+        record: the last real episode.
+        replay: states of the twin under the record's actions and exogenous input.
+        large_scale: d̃ of the record's exogenous input; None if the arm trains no twin.
+        realisations: samples of its exogenous process; None likewise.
+        episodes: one record per episode, as in ``metrics.json``.
+    """
+
+    plant: Plant
+    known: bool
+    closure: nn.Module
+    initial_closure: nn.Module
+    policies: dict[Role, nn.Module]
+    live: Role
+    record: Record
+    replay: Float[Tensor, "samples n_s"]
+    large_scale: Float[Tensor, "n n_z"] | None
+    realisations: Float[Tensor, "k n n_z"] | None
+    episodes: list[dict[str, Any]]
+
+    @classmethod
+    @torch.no_grad()
+    def take(
+        cls, algorithm: ReinforcementTwinning, initial_closure: nn.Module, episodes: list[dict[str, Any]]
+    ) -> "Snapshot":
+        """Of an algorithm after an episode; draws its realisations from a generator of its own."""
+        record, twin = algorithm.short_term[-1], algorithm.twin
+        replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None])
+        process = algorithm.processes[-1] if algorithm.processes else None
+        generator = torch.Generator(device=record.states.device).manual_seed(0)
+        return cls(
+            plant=twin.plant,
+            known=algorithm.env.closure is not None,
+            closure=twin.closure,
+            initial_closure=initial_closure,
+            policies=algorithm.policies,
+            live=algorithm.switch.live,
+            record=record,
+            replay=replay.states[0],
+            large_scale=process and process.mean,
+            realisations=process and process.sample(5, generator),
+            episodes=episodes,
+        )

@@ -1,0 +1,1 @@
+"""Twins from logs of a plant that nobody controls."""

@@ -1,0 +1,91 @@
+r"""Standard errors of identified weights.
+
+With the scores :math:`g_k = \Delta t\,S_k^\top\partial L_p/\partial s` of every sample and the Gauss-Newton matrix H,
+the estimate scatters by
+
+.. math::
+    \mathrm{Cov} = H^{-1}MH^{-1}, \qquad
+    M = \Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top), \quad
+    \Gamma_l = \sum_kg_kg_{k+l}^\top
+
+which needs neither the noise's variance, nor that it is the same in all samples and sensors, nor that neighbouring
+samples are independent, as interpolation makes them depend. It does take the physics to be right: what a closure cannot
+fit at all is bias, and no record shows its size.
+
+Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.identification.output_error import Misfit
+
+LEAST_EIGENVALUE = 1e-12
+"""Of H with unit diagonal, below which a direction of the weights is not shown by the record."""
+
+
+@torch.no_grad()
+def covariance(misfit: Misfit) -> Float[Tensor, "n_w n_w"]:
+    """Of the closure's weights at a minimum of J_p; inf on the diagonal for a weight that the segments do not show."""
+    replays = misfit.replays()
+    H = misfit.normal_equations(replays).matrix
+    M, samples = torch.zeros_like(H), 0
+    for replayed in replays:
+        scores = misfit.plant.dt * torch.einsum("ki,kiw->kw", replayed.gradient, replayed.sensitivity)
+        index = replayed.index
+        M[index[:, None], index] += newey_west(scores)
+        samples += len(scores)
+    diagonal = H.diagonal().clamp_min(0.0).sqrt()
+    unit = torch.where(diagonal > 0.0, diagonal, 1.0)
+    values, vectors = torch.linalg.eigh(H / unit / unit[:, None])
+    shown = values > LEAST_EIGENVALUE
+    inverse = (vectors[:, shown] / values[shown]) @ vectors[:, shown].T / unit / unit[:, None]
+    freedom = samples / max(samples - len(H), 1)
+    found = freedom * inverse @ M @ inverse
+    hidden = (vectors[:, ~shown] ** 2).sum(-1) > 1e-6
+    found.diagonal()[hidden] = math.inf
+    n = misfit.weight_count
+    return found[:n, :n]
+
+
+def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
+    """M of one segment, with L = ⌈4 (n/100)^{2/9}⌉."""
+    lags = min(math.ceil(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0)), len(scores) - 1)
+    found = scores.T @ scores
+    for lag in range(1, lags + 1):
+        product = scores[:-lag].T @ scores[lag:]
+        found = found + (1.0 - lag / (lags + 1.0)) * (product + product.T)
+    return found
+
+
+def standard_errors(misfit: Misfit) -> dict[str, float]:
+    """Of every named value of the closure, to first order; inf where the segments do not show it."""
+    closure = misfit.twin.closure
+    weights = [w for w in closure.parameters() if w.requires_grad]
+    found = covariance(misfit)
+    unknown = found.diagonal().isinf()
+    found = torch.where(unknown | unknown[:, None], 0.0, found)
+    errors = {}
+    with torch.enable_grad():
+        for name, value in named_values(closure).items():
+            slopes = torch.autograd.grad(value, weights, retain_graph=True, allow_unused=True, materialize_grads=True)
+            slope = torch.cat([s.flatten() for s in slopes])
+            hidden = bool((slope[unknown] != 0.0).any())
+            errors[name] = math.inf if hidden else (slope @ found @ slope).clamp_min(0.0).sqrt().item()
+    return errors
+
+
+def named_values(closure: nn.Module) -> dict[str, Tensor]:
+    """``named_coefficients`` of a closure that has them, else every trainable weight by its parameter and place."""
+    if hasattr(closure, "named_coefficients"):
+        return closure.named_coefficients()
+    return {
+        f"{name}[{','.join(map(str, place))}]": weight[place]
+        for name, weight in closure.named_parameters()
+        if weight.requires_grad
+        for place in np.ndindex(*weight.shape)
+    }

@@ -1,0 +1,189 @@
+"""Identification from a recorded log: the closure is trained without control, and judged on what was held out."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.identification.covariance import named_values, standard_errors
+from rt_torchrl.identification.output_error import NOISE_TOLERANCE, InitialStates, Misfit
+from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.sensitivity import Sensitivities
+from rt_torchrl.trajectories.trajectory import Segment
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+Optimiser = Literal["levenberg_marquardt", "adam", "lbfgs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentificationConfig:
+    """How the closure's weights are found.
+
+    Args:
+        iterations: trial steps of each descent, see :class:`Identification`.
+        optimiser: levenberg_marquardt, for closures of some ten weights; adam or lbfgs for more.
+        rate: learning rate of adam, first step length of lbfgs.
+        initial: estimated takes the initial state of each segment as unknown, measured as its first sample says.
+    """
+
+    iterations: int = 30
+    optimiser: Optimiser = "levenberg_marquardt"
+    rate: float = 0.1
+    initial: Literal["estimated", "measured"] = "estimated"
+
+    def __post_init__(self):
+        if self.iterations < 1:
+            raise ValueError(f"iterations={self.iterations} of the identification must be at least 1.")
+        if self.optimiser not in get_args(Optimiser):
+            raise ValueError(f"optimiser={self.optimiser!r} does not exist; choose one of {get_args(Optimiser)}.")
+        if self.initial not in ("estimated", "measured"):
+            raise ValueError(f"initial={self.initial!r} does not exist; choose estimated or measured.")
+
+
+class Judgement(NamedTuple):
+    """A twin on segments: J_p summed over them, their length [s], errors, and the states as it replays them."""
+
+    J_p: float
+    seconds: float
+    rms: Float[Tensor, " n_s"]
+    states: list[Tensor]
+
+
+class Identified(NamedTuple):
+    """What an identification found; the closure itself is trained in place."""
+
+    weights: dict[str, dict[str, float]]  # before, after, standard_error of each, by name
+    training: tuple[Judgement, Judgement]  # before and after
+    held_out: tuple[Judgement, Judgement]
+    autocorrelation: Float[Tensor, " n_s"]  # of the residuals from sample to sample; near 0 for white noise
+    iterations: int
+
+
+class Identification:
+    """Trains a closure on segments of a log.
+
+    The twin is driven by the actions and the exogenous input that were logged; what it is compared in is the plant's
+    own J_p. Where initial states are unknown there are two ways, and the weights with the lower J_p stay: weights and
+    initial states together, and the weights alone before both. On the first, initial states can be drawn away to make
+    up for weights far from the right ones; on the second, weights can be driven by the error of a first sample to where
+    the states no longer depend on them.
+
+    Args:
+        plant: the twin's physics.
+        closure: trained in place.
+        free: indices of the states whose initial value is estimated, see :func:`measured_states`.
+        config: see :class:`IdentificationConfig`.
+        compiled: compile one interval.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        closure: nn.Module,
+        *,
+        free: Sequence[int],
+        config: IdentificationConfig,
+        compiled: bool = False,
+    ):
+        self.twin, self.config = DigitalTwin(plant, closure), config
+        self.free = tuple(free) if config.initial == "estimated" else ()
+        self._sensitivities = Sensitivities(plant, closure, compiled_step=compiled)
+
+    def run(self, training: Sequence[Segment], held_out: Sequence[Segment]) -> Identified:
+        """Train on some segments and judge on others; the initial states of both are treated the same way.
+
+        Raises:
+            DivergenceError: if the twin diverges under the weights that it starts from.
+        """
+        closure, both = self.twin.closure, (training, held_out)
+        before = [self.judge(segments) for segments in both]
+        start = coefficients(closure)
+        misfit, done = self._train(training)
+        errors = standard_errors(misfit)
+        after = [self.judge(segments) for segments in both]
+        weights = {
+            name: {"before": start[name], "after": value, "standard_error": errors[name]}
+            for name, value in coefficients(closure).items()
+        }
+        autocorrelation = lag_one(training, after[0].states)
+        return Identified(weights, *zip(before, after, strict=True), autocorrelation, done)
+
+    def judge(self, segments: Sequence[Segment]) -> Judgement:
+        """The twin with its present weights, from the initial states that suit it best, or from the measured ones."""
+        plant = self.twin.plant
+        misfit = self._misfit(segments, self.free, weights=False)
+        if self.free:
+            misfit.fit_initial_states()
+        states = [replayed.states for replayed in misfit.replays()]
+        measured = [segment.record.states for segment in segments]
+        J_p = sum(plant.dt * plant.discrepancy(s, m).sum().item() for s, m in zip(states, measured, strict=True))
+        error = torch.cat(states) - torch.cat(measured)
+        seconds = plant.dt * sum(len(m) for m in measured)
+        return Judgement(J_p, seconds, (error**2).mean(0).sqrt(), states)
+
+    def _misfit(self, segments: Sequence[Segment], free: Sequence[int], *, weights: bool = True) -> Misfit:
+        initial = InitialStates.estimated(self.twin, segments, free, self._sensitivities)
+        return Misfit(self.twin, segments, initial, weights=weights, sensitivities=self._sensitivities)
+
+    def _train(self, segments: Sequence[Segment]) -> tuple[Misfit, int]:
+        """The misfit at its minimum, and the trial steps taken; both ways where initial states are unknown."""
+        closure = self.twin.closure
+        start = copy.deepcopy(closure.state_dict())
+        together = self._misfit(segments, self.free)
+        done = self._descend(together)
+        if not self.free:
+            return together, done
+        found, J_p = copy.deepcopy(closure.state_dict()), together.normal_equations().cost
+        closure.load_state_dict(start)
+        done += self._descend(self._misfit(segments, ()))
+        staged = self._misfit(segments, self.free)
+        done += self._descend(staged)
+        if staged.normal_equations().cost < J_p:
+            return staged, done
+        closure.load_state_dict(found)
+        return together, done
+
+    def _descend(self, misfit: Misfit) -> int:
+        iterations = self.config.iterations
+        if self.config.optimiser == "levenberg_marquardt":
+            optimiser = LevenbergMarquardt(misfit.unknowns, tolerance=NOISE_TOLERANCE)
+            return optimiser.run(misfit.normal_equations, iterations).iterations
+        descent = Descent(misfit.unknowns, DescentConfig(optimiser=self.config.optimiser, rate=self.config.rate))
+        return descent.run(misfit.cost, iterations).iterations
+
+
+def measured_states(plant: Plant, log: Log) -> list[int]:
+    """Indices of the states that a log holds."""
+    names = [state.name for state in logged_states(plant) if state.name in log.columns]
+    return [k for k, state in enumerate(plant.states) if state.name in names]
+
+
+def coefficients(closure: nn.Module) -> dict[str, float]:
+    """The weights by name, in physical units where the closure has ``named_coefficients``."""
+    return {name: value.item() for name, value in named_values(closure).items()}
+
+
+def lag_one(segments: Sequence[Segment], states: Sequence[Tensor]) -> Float[Tensor, " n_s"]:
+    """Correlation of the residuals of neighbouring samples; nan for a state without residuals."""
+    residuals = [s - segment.record.states for s, segment in zip(states, segments, strict=True)]
+    products = sum((r[1:] * r[:-1]).sum(0) for r in residuals)
+    return products / sum((r**2).sum(0) for r in residuals)
+
+
+def held_back(plant: Plant, segments: Sequence[Segment]) -> dict[str, float]:
+    """Share of the control intervals in which the plant's actuators would not have applied the logged action.
+
+    The twin is then driven by what they allow: a sign of wrong rate limits, units or columns.
+    """
+    found = []
+    for _, record in segments:
+        allowed = plant.actuate(record.states[:-1], record.actions)
+        found.append((allowed - record.actions).abs() > 1e-6 * record.actions.abs().amax(0).clamp_min(1e-12))
+    return dict(zip((a.name for a in plant.actions), torch.cat(found).double().mean(0).tolist(), strict=True))

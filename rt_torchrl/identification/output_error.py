@@ -1,0 +1,176 @@
+r"""How far a twin is from segments of a log, and how that changes with the closure's weights and the initial states.
+
+.. math:: J_p(w, s_0^1, \dots, s_0^m) = \sum_i\sum_{k=0}^{n_i} L_p(s^i_k, \check s^i_k)\,\Delta t
+
+A sensor's first sample is as noisy as any other, and a system that forgets slowly carries its error through the whole
+segment. The initial states are therefore unknowns beside the weights, and their samples count as any other.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.sensitivity import Sensitivities
+from rt_torchrl.trajectories.trajectory import Segment, require_finite
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+NOISE_TOLERANCE = 1e-8
+"""Levenberg-Marquardt ends where a step promises less than this share of J_p. One standard error of a weight changes
+J_p by one part in the number of samples, so that the default for noise-free records would end too early here."""
+INITIAL_ITERATIONS = 10
+"""Trial steps for initial states alone: J_p is nearly quadratic in them."""
+REMEDY = "Check the units of what was recorded, use a smaller dt, or start from a closure nearer to the system."
+
+
+class InitialStates(nn.Module):
+    """s_0 of every segment: what was measured, plus trainable offsets of the measured components.
+
+    Args:
+        segments: of the log.
+        free: indices of the states that have an offset.
+        scale: unit of the offsets, by state; about the noise, so that a step of one is neither long nor short.
+    """
+
+    def __init__(self, segments: Sequence[Segment], free: Sequence[int], scale: Float[Tensor, " n_s"]):
+        super().__init__()
+        self.register_buffer("measured", torch.stack([segment.record.states[0] for segment in segments]))
+        self.register_buffer("unit", torch.diag(scale)[list(free)])
+        self.free = tuple(free)
+        self.offsets = nn.Parameter(scale.new_zeros(len(segments), len(self.free)))
+
+    def forward(self) -> Float[Tensor, "segments n_s"]:
+        return self.measured + self.offsets @ self.unit
+
+    @classmethod
+    def as_measured(cls, segments: Sequence[Segment]) -> "InitialStates":
+        """Without offsets."""
+        return cls(segments, (), torch.ones_like(segments[0].record.states[0]))
+
+    @classmethod
+    def estimated(
+        cls, twin: DigitalTwin, segments: Sequence[Segment], free: Sequence[int], sensitivities: Sensitivities
+    ) -> "InitialStates":
+        """Offsets in units of the twin's present residual, so that no step leaves what the sensors allow by much."""
+        if not free:
+            return cls.as_measured(segments)
+        fixed = Misfit(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
+        measured = torch.cat([segment.record.states for segment in segments])
+        residual = (torch.cat([replayed.states for replayed in fixed.replays()]) - measured).square().mean(0).sqrt()
+        # A residual of zero would leave no unit to measure an offset in.
+        return cls(segments, free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
+
+
+class Replayed(NamedTuple):
+    """A segment as the twin replays it: states s_0 ... s_n, and what every sample says of the unknowns.
+
+    ``gradient`` and ``curvature`` are those of L_p by the state, ``sensitivity`` is that of the state by the unknowns
+    with the places ``index`` in the vector of all.
+    """
+
+    states: Float[Tensor, "samples n_s"]
+    gradient: Float[Tensor, "samples n_s"]
+    curvature: Float[Tensor, "samples n_s n_s"]
+    sensitivity: Float[Tensor, "samples n_s n_local"]
+    index: Int[Tensor, " n_local"]
+
+
+class Misfit:
+    """J_p of a twin on segments of a log.
+
+    Args:
+        twin: its closure's trainable weights come first among the unknowns.
+        segments: of any lengths.
+        initial: the initial states; their offsets come last.
+        weights: whether the closure's weights are unknowns.
+        sensitivities: of the twin; its own by default.
+    """
+
+    def __init__(
+        self,
+        twin: DigitalTwin,
+        segments: Sequence[Segment],
+        initial: InitialStates,
+        *,
+        weights: bool = True,
+        sensitivities: Sensitivities | None = None,
+    ):
+        self.twin, self.segments, self.initial = twin, list(segments), initial
+        self._sensitivities = sensitivities or twin.sensitivities
+        self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
+        self._shown = self.weight_count if weights else 0
+        self.unknowns = nn.ModuleList([twin.closure, initial] if weights else [initial])
+
+    @property
+    def plant(self) -> Plant:
+        return self.twin.plant
+
+    def cost(self) -> Tensor:
+        """J_p, differentiable by the adjoint of the twin's engine."""
+        total = 0.0
+        for (start, record), first in zip(self.segments, self.initial(), strict=True):
+            flown = self.twin.replay(first[None], record.exogenous[None], record.actions[None], start=start)
+            total = total + self.plant.dt * self.plant.discrepancy(flown.states[0], record.states).sum()
+        return total
+
+    @torch.no_grad()
+    def replays(self) -> list[Replayed]:
+        """Every segment under the present unknowns.
+
+        Raises:
+            DivergenceError: if a state is not finite.
+        """
+        return [self._replay(*numbered) for numbered in enumerate(zip(self.segments, self.initial(), strict=True))]
+
+    def _replay(self, number: int, given: tuple[Segment, Tensor]) -> Replayed:
+        (start, record), first = given
+        ends, S = self._sensitivities(
+            first[None], record.exogenous[None], record.actions[None], start=start, initial=True
+        )
+        require_finite(self.plant, ends[0, :, None], first[None], [self.twin.closure], start=start, remedy=REMEDY)
+        states = torch.cat([first[None], ends[0]])
+        at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
+        S = torch.cat([at_start[None], S[0]])
+        by_initial = S[..., self.weight_count :] @ self.initial.unit.T
+        g, H = discrepancy_derivatives(self.plant, states[None], record.states[None])
+        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
+
+    @torch.no_grad()
+    def normal_equations(self, replays: Sequence[Replayed] | None = None) -> NormalEquations:
+        """J_p, its gradient and its Gauss-Newton matrix by all unknowns, of ``replays`` that were made already."""
+        count = self._shown + self.initial.offsets.numel()
+        gradient, matrix = self.initial.measured.new_zeros(count), self.initial.measured.new_zeros(count, count)
+        cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
+        for replayed, segment in zip(replays or self.replays(), self.segments, strict=True):
+            S, i = replayed.sensitivity, replayed.index
+            cost = cost + dt * self.plant.discrepancy(replayed.states, segment.record.states).sum()
+            gradient[i] += dt * torch.einsum("ki,kiw->w", replayed.gradient, S)
+            matrix[i[:, None], i] += dt * torch.einsum("kiv,kiw->vw", S, replayed.curvature @ S)
+        return NormalEquations(cost, gradient, matrix)
+
+    def fit_initial_states(self) -> None:
+        """Estimate the initial states under the present weights, of a misfit whose only unknowns they are."""
+        LevenbergMarquardt(self.initial, tolerance=NOISE_TOLERANCE).run(self.normal_equations, INITIAL_ITERATIONS)
+
+    def _index(self, number: int) -> Int[Tensor, " n_local"]:
+        free = len(self.initial.free)
+        own = self._shown + number * free + torch.arange(free)
+        return torch.cat([torch.arange(self._shown), own])
+
+
+def discrepancy_derivatives(
+    plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
+) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
+    """Gradient and Hessian of L_p with respect to every state."""
+    pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
+    curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
+    return pointwise(states, measured), curvature(states, measured)
+
+
+def compared(curvature: Float[Tensor, "batch n n_s n_s"]) -> Bool[Tensor, " n_s"]:
+    """The states that L_p looks at, by its Hessian."""
+    return (curvature != 0.0).flatten(0, 2).any(0)

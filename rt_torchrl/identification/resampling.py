@@ -1,0 +1,142 @@
+r"""From a log at irregular instants to records at a plant's control intervals.
+
+A plant is sampled-data. Its states are instantaneous, so they are interpolated linearly at :math:`t_k`. Its actions and
+exogenous inputs are held over an interval, so the one of :math:`[t_k, t_{k+1}]` is the mean over that interval of what
+the log held, which keeps the impulse of a force and the energy of a load whatever the instants were.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Record, Segment
+
+GAP_INTERVALS = 3.0
+"""Sampling intervals after which a pause counts as a gap, unless a limit is stated."""
+ROUNDING = 1e-6
+"""Share of an interval by which an instant may miss the grid."""
+
+
+class Resampled(NamedTuple):
+    """Segments of a log, in order, and what became of the rest; times in s."""
+
+    segments: list[Segment]
+    interval: float  # median sampling interval
+    jitter: float  # standard deviation of the intervals within the segments, over their median
+    gap: float  # limit that was used
+    gaps: list[tuple[float, float]]  # last time before and first time after each
+    too_short: list[tuple[float, float]]  # first and last time of the parts that were left out
+
+
+def resample(log: Log, plant: Plant, *, gap: float | None = None, shortest: int = 10) -> Resampled:
+    """Cut a log at its gaps and bring each part to the plant's control intervals.
+
+    Args:
+        log: see :func:`rt_torchrl.identification.sensor_log.checked`.
+        plant: its control interval dt, and :meth:`Plant.complete_states`.
+        gap: longest time between two rows that is bridged [s]; None for three median sampling intervals, but not less
+            than dt.
+        shortest: control intervals below which a part is left out.
+
+    Raises:
+        ValueError: if an argument is out of its range, no part is long enough, or states are missing that the plant
+            cannot complete.
+    """
+    intervals = np.diff(log.times)
+    interval = float(np.median(intervals))
+    if gap is not None and not gap > 0.0:
+        raise ValueError(f"gap={gap} s must be positive; it is the longest time between two rows that is bridged.")
+    if shortest < 2:
+        raise ValueError(f"shortest={shortest} control intervals must be at least 2.")
+    limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
+    cuts = np.flatnonzero(intervals > limit * (1.0 + ROUNDING))
+    ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
+    segments, too_short = [], []
+    for first, last in ends:
+        steps = _steps(log.times[first], log.times[last], plant.dt)
+        if steps < shortest:
+            too_short.append((float(log.times[first]), float(log.times[last])))
+        else:
+            segments.append(_segment(log, slice(first, last + 1), steps, plant))
+    if not segments:
+        raise ValueError(
+            f"log of {len(log.times)} rows has no part of {shortest} control intervals of {plant.dt:g} s without a gap "
+            f"longer than {limit:g} s; raise --gap above {interval:g} s, its median sampling interval, or log longer."
+        )
+    within = np.delete(intervals, cuts)
+    gaps = [(float(log.times[k]), float(log.times[k + 1])) for k in cuts]
+    return Resampled(segments, interval, float(within.std() / interval), float(limit), gaps, too_short)
+
+
+def hold_out(segments: Sequence[Segment], dt: float, share: float, *, shortest: int = 10) -> tuple[list, list]:
+    """Segments to train on and, last in time, segments to judge by; the one in which the cut falls is divided.
+
+    Args:
+        segments: in order.
+        dt: control interval [s].
+        share: of all control intervals that is held out.
+        shortest: control intervals that a part needs; a shorter one goes whole to the other side.
+
+    Raises:
+        ValueError: if the share is not between 0 and 1, or one side is left empty.
+    """
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"held_out={share} must lie between 0 and 1, a share of the log.")
+    total = sum(len(segment.record.actions) for segment in segments)
+    wanted = total - round(share * total)  # intervals to train on
+    training, held_out, seen = [], [], 0
+    for segment in segments:
+        n = len(segment.record.actions)
+        cut = min(max(wanted - seen, 0), n)
+        cut = 0 if cut < shortest else n if n - cut < shortest else cut
+        if cut:
+            training.append(_part(segment, 0, cut, dt))
+        if cut < n:
+            held_out.append(_part(segment, cut, n, dt))
+        seen += n
+    if not (training and held_out):
+        raise ValueError(
+            f"held_out={share} of {total} control intervals leaves no {shortest} of them to "
+            f"{'train on' if not training else 'judge by'}; choose another share, or log longer."
+        )
+    return training, held_out
+
+
+def hold_means(
+    times: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " intervals"]:
+    """Mean over every interval of the grid of a signal that is held from each time to the next; exact."""
+    integral = np.append(0.0, np.cumsum(values[:-1] * np.diff(times)))
+    return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
+
+
+def _steps(first: float, last: float, dt: float) -> int:
+    return int((last - first) / dt + ROUNDING)
+
+
+def _segment(log: Log, rows: slice, steps: int, plant: Plant) -> Segment:
+    times = log.times[rows]
+    grid = times[0] + plant.dt * np.arange(steps + 1)
+
+    def held(signals) -> torch.Tensor:
+        return torch.from_numpy(np.stack([hold_means(times, log.columns[s.name][rows], grid) for s in signals], -1))
+
+    actions, exogenous = held(plant.actions), held(plant.inputs)
+    measured = {
+        state.name: torch.from_numpy(np.interp(grid, times, log.columns[state.name][rows]))
+        for state in logged_states(plant)
+        if state.name in log.columns
+    }
+    states = plant.complete_states(measured, exogenous, actions)
+    return Segment(float(times[0]), Record(states, exogenous, actions))
+
+
+def _part(segment: Segment, first: int, last: int, dt: float) -> Segment:
+    states, exogenous, actions = segment.record
+    record = Record(states[first : last + 1], exogenous[first:last], actions[first:last])
+    return Segment(segment.start + first * dt, record)

@@ -1,0 +1,234 @@
+"""Recorded logs of a real system: what its sensors and actuators wrote down, in a CSV or Parquet file."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+
+TIME = "time"
+NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
+COLUMN = re.compile(
+    rf"(?P<header>.+)=(?P<signal>\w+)(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?", re.DOTALL
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    r"""Which column of a file holds which signal, and in which unit: value = factor·number + offset.
+
+    Args:
+        header: of the column in the file.
+        signal: name of the plant's signal, or ``time``.
+        factor: signal's unit over the column's.
+        offset: in the signal's unit.
+
+    Raises:
+        ValueError: if the factor is zero, or one of the two numbers is not finite.
+    """
+
+    header: str
+    signal: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self):
+        if not (np.isfinite(self.factor) and self.factor != 0.0 and np.isfinite(self.offset)):
+            raise ValueError(
+                f"column {self.header!r} has factor={self.factor} and offset={self.offset}; both must be finite and "
+                "the factor not zero."
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> "Column":
+        """From ``HEADER=SIGNAL``, ``HEADER=SIGNAL*FACTOR`` or ``HEADER=SIGNAL*FACTOR+OFFSET``.
+
+        Raises:
+            ValueError: if the text has another form.
+        """
+        found = COLUMN.fullmatch(text.strip())
+        try:
+            factor, offset = (float(found[key] or default) for key, default in (("factor", 1.0), ("offset", 0.0)))
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL*FACTOR or "
+                "HEADER=SIGNAL*FACTOR+OFFSET, such as rpm=rotor_speed*0.10472 or T=wall_temperature+273.15."
+            ) from None
+        return cls(header=found["header"], signal=found["signal"], factor=factor, offset=offset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """Signals of a real system, sampled together at instants that need not be regular.
+
+    A row is what a controller knows and does at one instant: states are instantaneous, actions and exogenous inputs are
+    held from there until the next row.
+
+    Args:
+        times: instants [s], increasing.
+        columns: values of every signal by its name, in its unit; NaN where a sensor gave none.
+
+    Raises:
+        ValueError: if the times are not finite and increasing, or a column has another length.
+    """
+
+    times: Float[np.ndarray, " rows"]
+    columns: dict[str, Float[np.ndarray, " rows"]]
+
+    def __post_init__(self):
+        t = self.times
+        if len(t) < 2 or not np.isfinite(t).all():
+            raise ValueError(
+                f"log has {len(t)} rows, {int((~np.isfinite(t)).sum())} of them without a time; it needs at least 2, "
+                "all with a finite time."
+            )
+        wrong = np.flatnonzero(np.diff(t) <= 0.0)
+        if wrong.size:
+            k = wrong[0] + 1
+            kind = "the same time as the one before" if t[k] == t[k - 1] else "an earlier time than the one before"
+            raise ValueError(
+                f"row {k} of the log (counted from 0) has {kind}: {t[k]:.12g} s after {t[k - 1]:.12g} s; {wrong.size} "
+                "rows in all. Sort the log and keep one row of each instant."
+            )
+        for name, values in self.columns.items():
+            if values.shape != t.shape:
+                raise ValueError(f"column {name!r} has shape {values.shape}; the log has {len(t)} rows.")
+
+    def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "Log":
+        """Of some rows only; what is left out becomes a gap."""
+        return Log(times=self.times[rows], columns={name: values[rows] for name, values in self.columns.items()})
+
+    def without(self, names: Sequence[str]) -> "Log":
+        """Without some columns."""
+        return Log(times=self.times, columns={k: v for k, v in self.columns.items() if k not in names})
+
+    def write(self, path: Path) -> None:
+        """As CSV, or Parquet if the name ends so; read again by :func:`read_log` without a mapping."""
+        frame = pandas().DataFrame({TIME: self.times, **self.columns})
+        if path.suffix == ".parquet":
+            frame.to_parquet(path, index=False)
+        else:
+            frame.to_csv(path, index=False)
+
+
+def logged_states(plant: Plant) -> tuple[Signal, ...]:
+    """States with a column of their own; one that remembers an action or input by its name has none."""
+    driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
+    return tuple(state for state in plant.states if state.name not in driven)
+
+
+def logged_signals(plant: Plant) -> tuple[Signal, ...]:
+    """All signals that a log of this plant can hold: its states, actions and exogenous inputs."""
+    return (*logged_states(plant), *plant.actions, *plant.inputs)
+
+
+def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Log:
+    """The columns of a file that are signals of a plant; others are left alone.
+
+    Args:
+        path: a file ending in ``.csv`` or ``.parquet``. The time is a number of seconds on the plant's clock, or a
+            date and time of day (ISO 8601), which is counted from the first row.
+        plant: names the signals.
+        columns: those whose header is not the name of their signal, or whose unit is another.
+
+    Raises:
+        ValueError: if the file cannot be read, a column is missing, of an unknown signal or not numeric, or the times
+            are not increasing.
+    """
+    frame = _read(path)
+    names = [signal.name for signal in logged_signals(plant)]
+    for column in columns:
+        if column.header not in frame or column.signal not in (TIME, *names):
+            raise ValueError(
+                f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(map(str, frame))}; "
+                f"plant {plant.name!r} has the signals {', '.join((TIME, *names))}."
+            )
+    declared = {column.signal: column for column in columns}
+    if len(declared) < len(columns):
+        raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; one column for each.")
+    by_name = {name: Column(header=name, signal=name) for name in (TIME, *names) if name in frame}
+    chosen = by_name | declared
+    if TIME not in chosen:
+        raise ValueError(f"{path} has no column 'time'; say which it is, such as --columns t=time.")
+    values = {signal: _values(frame[column.header], column, path) for signal, column in chosen.items()}
+    return Log(times=values.pop(TIME), columns=values)
+
+
+def checked(log: Log, plant: Plant, *, drop: bool = False) -> Log:
+    """A log that a twin of this plant can be driven by.
+
+    Args:
+        log: as read.
+        plant: says what is needed, and the range of each signal.
+        drop: leave out rows in which a value is missing or out of range, instead of refusing the log.
+
+    Raises:
+        ValueError: if an action or input has no column; without ``drop`` also if a value is missing or out of range.
+    """
+    missing = [signal.name for signal in (*plant.actions, *plant.inputs) if signal.name not in log.columns]
+    if missing:
+        raise ValueError(
+            f"log of plant {plant.name!r} has no column {', '.join(missing)}; it has {', '.join(log.columns)}. Actions "
+            "and inputs drive the twin, so each is needed: log it, or name its column, such as --columns "
+            f"HEADER={missing[0]}."
+        )
+    good = np.ones(len(log.times), dtype=bool)
+    for signal in logged_signals(plant):
+        if signal.name not in log.columns:
+            continue
+        values = log.columns[signal.name]
+        inside = (values >= signal.low) & (values <= signal.high) & np.isfinite(values)
+        if not (drop or inside.all()):
+            k = int(np.argmin(inside))
+            raise ValueError(
+                f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log (counted from 0, t = "
+                f"{log.times[k]:g} s), {int((~inside).sum())} such rows; it must be a number from {signal.low:g} to "
+                f"{signal.high:g} {signal.unit}. Mend the log or the column's unit, or leave such rows out with --drop."
+            )
+        good &= inside
+    return log if good.all() else log.chosen(good)
+
+
+def _read(path: Path) -> Any:
+    readers = {".csv": pandas().read_csv, ".parquet": pandas().read_parquet}
+    if path.suffix not in readers:
+        raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
+    try:
+        return readers[path.suffix](path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"log {path} cannot be read: {error}") from error
+
+
+def _values(series: Any, column: Column, path: Path) -> Float[np.ndarray, " rows"]:
+    """Numbers of a column in the signal's unit; a date becomes the seconds since the first."""
+    pd = pandas()
+    if series.empty:
+        return np.empty(0)
+    try:
+        if column.signal == TIME and not pd.api.types.is_numeric_dtype(series):
+            instants = pd.to_datetime(series, utc=True, format="ISO8601")
+            numbers = (instants - instants.iloc[0]).dt.total_seconds()
+        else:
+            numbers = pd.to_numeric(series)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"column {column.header!r} of {path} holds what is no number: {error}") from error
+    return column.factor * numbers.to_numpy(dtype=np.float64, na_value=np.nan) + column.offset
+
+
+def pandas() -> Any:
+    """The library that reads and writes tables, which only logs need.
+
+    Raises:
+        ValueError: if it is not installed.
+    """
+    try:
+        import pandas
+    except ImportError as error:
+        raise ValueError("logs need pandas: install the extra, pip install 'rt_torchrl[logs]'.") from error
+    return pandas

@@ -1,0 +1,88 @@
+"""What a data logger writes of a simulated real system: irregular instants, noisy sensors."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.plants.integrators import rk4_step
+from rt_torchrl.plants.plant import Plant
+
+Law = Callable[[Float[Tensor, ""], Float[Tensor, "1 n_s"], Float[Tensor, "1 n_z"]], Float[Tensor, "1 n_a"]]
+"""Time [s], state and exogenous input to a command; may remember."""
+
+
+def policy_law(plant: Plant, policy: nn.Module) -> Law:
+    """A policy of the plant's observation."""
+    return lambda t, state, exogenous: policy(plant.observe(t, state, exogenous))
+
+
+class ClassicalLaw:
+    """A classical controller with its memory, for one episode."""
+
+    def __init__(self, controller: ClassicalController):
+        self._controller, self._memory = controller, None
+
+    def __call__(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        if self._memory is None:
+            self._memory = self._controller.first_memory(state)
+        command, self._memory = self._controller.act(state, self._memory)
+        return command.clamp(self._controller.low_action, self._controller.high_action)
+
+
+@torch.no_grad()
+def recorded(plant: Plant, law: Law, generator: torch.Generator, *, jitter: float = 0.0, noise: float = 0.0) -> Log:
+    r"""One episode of the real system under a control loop whose intervals are not quite dt.
+
+    .. math:: t_j = (j + \eta_j)\,\Delta t, \qquad \eta_j \sim U(-\tfrac12, \tfrac12)\cdot\mathrm{jitter}
+
+    At t_j the loop observes and acts; action and exogenous input are held until t_{j+1}, over which the plant is
+    integrated by one step. The loop acts on the true state; what is logged has the sensors' noise.
+
+    Args:
+        plant: its own closure is the true one.
+        law: see :data:`Law`.
+        generator: source of initial state, exogenous input, jitter and noise, in this order.
+        jitter: greatest difference of an interval from dt, as a share of dt; in [0, 1).
+        noise: standard deviation of the sensors of the states, as a share of what they read.
+
+    Raises:
+        ValueError: if an argument is out of its range.
+    """
+    if not 0.0 <= jitter < 1.0:
+        raise ValueError(f"jitter={jitter} must lie in [0, 1), a share of the control interval.")
+    if not 0.0 <= noise < 1.0:
+        raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
+    n = plant.n_steps
+    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64) - 0.5)
+    offsets[0] = 0.0
+    times = plant.dt * (torch.arange(n + 1) + offsets)
+    rows = []
+    for k in range(n + 1):
+        z = exogenous[:, min(k, n - 1)]
+        applied = plant.actuate(state, law(times[k], state, z))
+        rows.append(torch.cat([state, applied, z], -1))
+        if k < n:
+            state = _held(plant, times[k], state, applied, z, (times[k + 1] - times[k]).item())
+    return _log(plant, times, torch.cat(rows), generator, noise)
+
+
+def _held(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, length: float) -> Tensor:
+    """The state after an interval of any length."""
+    end = rk4_step(lambda t, s: plant.vector_field(t, s, applied, z, plant.closure), t, state, length)
+    return plant.latch(end, applied)
+
+
+def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, noise: float) -> Log:
+    n_s = len(plant.states)
+    errors = torch.randn(len(rows), n_s, generator=generator, dtype=torch.float64)
+    values = torch.cat([rows[:, :n_s] * (1.0 + noise * errors), rows[:, n_s:]], -1).numpy()
+    own = {signal.name for signal in logged_states(plant)}
+    signals = (*plant.states, *plant.actions, *plant.inputs)
+    chosen = {s.name: k for k, s in enumerate(signals) if k >= n_s or s.name in own}
+    return Log(times=times.numpy(), columns={name: np.ascontiguousarray(values[:, k]) for name, k in chosen.items()})

@@ -1,0 +1,1 @@
+"""Descents that steps 4 and 5 share."""

@@ -1,0 +1,1 @@
+"""What a plant is, and the laws that may stand in it."""

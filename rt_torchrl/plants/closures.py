@@ -1,0 +1,103 @@
+"""Closures of general use: any ``closure(features) -> coefficients`` can stand in for a plant's own."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.policies import mlp
+
+
+class PositiveCoefficients(nn.Module):
+    """Base of a closure with a few positive coefficients; a subclass names them and says in ``forward`` what they do.
+
+    The trained weights are the logarithms: the coefficients stay positive, and a step changes each by the same
+    percentage, whatever its size and unit.
+
+    Args:
+        coefficients: in the order and the units of ``names``.
+
+    Raises:
+        ValueError: if their number is wrong or one of them is not positive and finite.
+    """
+
+    names: dict[str, str]
+    """Unit of each coefficient, by name."""
+    true_coefficients: tuple[float, ...]
+    """Those of the real system."""
+
+    def __init__(self, coefficients: Float[Tensor, " n"]):
+        super().__init__()
+        coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
+        shape = (len(self.names),)
+        if coefficients.shape != shape or not (coefficients.isfinite() & (coefficients > 0.0)).all():
+            wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.names.items())
+            raise ValueError(
+                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and finite; "
+                f"those of the paper are {self.true_coefficients}."
+            )
+        self.log_coefficients = nn.Parameter(coefficients.log())
+
+    @classmethod
+    def true(cls) -> "PositiveCoefficients":
+        """Those of the real system; the weights are frozen, they are not what is learned."""
+        return cls(torch.tensor(cls.true_coefficients, dtype=torch.float64)).requires_grad_(False)
+
+    @property
+    def coefficients(self) -> Float[Tensor, " n"]:
+        """In the units of ``names``."""
+        return self.log_coefficients.exp()
+
+    def named_coefficients(self) -> dict[str, Tensor]:
+        """The coefficients by name."""
+        return dict(zip(self.names, self.coefficients.unbind(), strict=True))
+
+
+class BoundedPerceptron(nn.Module):
+    r"""A perceptron of scaled features with bounded outputs, all zero at the start.
+
+    .. math:: y = b\,\tanh N(\hat x), \qquad \hat x_i = \frac{2x_i - x_{i,hi} - x_{i,lo}}{x_{i,hi} - x_{i,lo}}
+
+    What a neural closure adds to a law it starts from: nothing at first, and never more than b, wherever the states go.
+
+    Args:
+        ranges: low and high end of each feature, a fixed physical range that is scaled to [−1, 1]; no limit.
+        bounds: b, greatest absolute value of each output.
+        hidden: width of each hidden layer.
+        generator: source of the initial weights; those of the last layer are zero.
+
+    Raises:
+        ValueError: if a range is empty or a bound is not positive.
+    """
+
+    def __init__(
+        self,
+        ranges: Sequence[tuple[float, float]],
+        bounds: Sequence[float],
+        *,
+        hidden: Sequence[int],
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        low, high = torch.tensor(ranges, dtype=torch.float64, device=generator.device).unbind(-1)
+        bound = torch.tensor(bounds, dtype=torch.float64, device=generator.device)
+        if not (low < high).all() or not (bound > 0.0).all():
+            raise ValueError(f"ranges={ranges} must each go from low to high, and bounds={bounds} must be positive.")
+        self.network = mlp(len(ranges), hidden, len(bounds), generator=generator).to(generator.device)
+        nn.init.zeros_(self.network[-1].weight)
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("half_range", 0.5 * (high - low))
+        self.register_buffer("bound", bound)
+
+    def forward(self, features: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
+        return self.bound * torch.tanh(self.network((features - self.middle) / self.half_range))
+
+
+@torch.no_grad()
+def named_weights(closure: nn.Module) -> dict[str, Any] | None:
+    """Weights of a closure, in physical units where it has ``named_coefficients``; None if it has no weights."""
+    if hasattr(closure, "named_coefficients"):
+        return {name: float(value) for name, value in closure.named_coefficients().items()}
+    return {name: weight.tolist() for name, weight in closure.named_parameters()} or None

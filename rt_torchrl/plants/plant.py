@@ -1,0 +1,241 @@
+r"""The contract a plant fulfils.
+
+A plant is sampled-data: at :math:`t_k = k\,\Delta t` the agent sends a command, the actuators make an applied action
+of it, that action and the exogenous input are held over :math:`[t_k, t_{k+1}]` while the vector field is integrated
+by one Runge-Kutta step. :meth:`Plant.step` is that map,
+
+.. math:: s_{k+1} = \Phi(t_k, s_k, a_k, z_k; w_p),
+
+and it is the *same* map for the real system and for its digital twin: they differ in the closure they pass.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
+from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.signal import Signal
+
+
+class Transition(NamedTuple):
+    """What one control interval did: the state at its end and the action the actuators applied during it."""
+
+    state: Tensor
+    applied: Tensor
+
+
+class Plant(nn.Module, ABC):
+    """Physics and control problem of one system; see ``envs/`` for three of them.
+
+    A subclass names its signals in the four class attributes (``inputs`` may be empty), and writes
+    :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`discrepancy`, :meth:`draw_initial_state`,
+    :meth:`draw_exogenous` and :meth:`make_closure`. Every method is pure and takes any leading batch dimensions,
+    features last, so that it can be compiled, batched and differentiated: no clamp, detach, random number, device
+    choice or Python branch on a tensor.
+    :func:`rt_torchrl.check_plant` finds where a subclass falls short of this.
+
+    Args:
+        dt: control interval and integration step Δt [s].
+        horizon: length of an episode T_o [s], a whole number of steps.
+        closure: the true closure, used by the real system; maps the features that :meth:`vector_field` hands it to
+            coefficients.
+
+    Raises:
+        ValueError: if ``dt`` or ``horizon`` is not positive, or ``horizon`` is no multiple of ``dt``.
+    """
+
+    name: str
+    states: tuple[Signal, ...]
+    actions: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    observations: tuple[Signal, ...]
+    own_scheme: bool = False
+    """Whether :meth:`step` is another scheme, to be kept to the last digit; ``odeint_adjoint`` is then refused."""
+
+    def __init__(self, *, dt: float, horizon: float, closure: nn.Module):
+        super().__init__()
+        for argument, value in (("dt", dt), ("horizon", horizon)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{argument}={value} s of plant {self.name!r} must be positive and finite.")
+        self.dt = float(dt)
+        self.n_steps = round(horizon / dt)
+        if self.n_steps < 1 or abs(self.n_steps * dt - horizon) > 1e-6 * dt:
+            raise ValueError(
+                f"horizon={horizon} s of plant {self.name!r} must be a whole number of steps dt={dt} s; "
+                f"try {max(1, self.n_steps) * dt} s."
+            )
+        self.closure = closure
+
+    @property
+    def horizon(self) -> float:
+        """Length of an episode T_o [s]."""
+        return self.n_steps * self.dt
+
+    # The system
+
+    @abstractmethod
+    def vector_field(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        action: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        """Time derivative of the state, ds/dt = f(t, s, a, z, g(s; w_p)), for a held action and exogenous input."""
+
+    def actuate(
+        self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch n_a"]
+    ) -> Float[Tensor, "*batch n_a"]:
+        """The action that the actuators apply on a command, such as one with a rate limit; here the command itself."""
+        return command
+
+    def latch(
+        self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch n_a"]
+    ) -> Float[Tensor, "*batch n_s"]:
+        """Write what the sampled-data parts remember at the end of an interval into its end state; here nothing."""
+        return state
+
+    def step(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        command: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Transition:
+        r"""One control interval, :math:`\Phi`: actuate, hold, integrate, latch.
+
+        Args:
+            t: start of the interval [s].
+            state: state at ``t``.
+            command: what the policy asks for.
+            exogenous: input, held over the interval.
+            closure: the true closure in the real system, the learned one in the twin.
+        """
+        applied = self.actuate(state, command)
+        end = rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
+        return Transition(self.latch(end, applied), applied)
+
+    # The control problem
+
+    @abstractmethod
+    def observe(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+    ) -> Float[Tensor, "*batch n_o"]:
+        """What the policies see: the tracking errors e, scaled to order one."""
+
+    @abstractmethod
+    def running_cost(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        applied: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+    ) -> Float[Tensor, "*batch"]:
+        r"""Lagrangian L_a of the control problem; :math:`J_a = \frac1{T_o}\int L_a\,dt`, the reward is −L_a."""
+
+    @abstractmethod
+    def discrepancy(
+        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
+    ) -> Float[Tensor, "*batch"]:
+        r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`."""
+
+    def merit(
+        self,
+        states: Float[Tensor, "batch samples n_s"],
+        applied: Float[Tensor, "batch n n_a"],
+        exogenous: Float[Tensor, "batch n n_z"],
+    ) -> dict[str, Float[Tensor, " batch"]]:
+        """Physical quantities an engineer judges whole episodes by, named with their unit; here none."""
+        return {}
+
+    def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
+        """Kinds of episodes, by name, that results are also shown apart for; here none."""
+        return {}
+
+    def complete_states(
+        self,
+        measured: dict[str, Float[Tensor, " samples"]],
+        exogenous: Float[Tensor, "n n_z"],
+        actions: Float[Tensor, "n n_a"],
+    ) -> Float[Tensor, "samples n_s"]:
+        """All states at n + 1 samples, from those that a log holds; here it must hold all.
+
+        A plant overrides it for states that no sensor gives but that follow from the rest, such as filters.
+
+        Args:
+            measured: states that were logged, by name.
+            exogenous: inputs of the n intervals between.
+            actions: applied actions of the n intervals between.
+
+        Raises:
+            ValueError: with the names of the states that are missing.
+        """
+        missing = [state.name for state in self.states if state.name not in measured]
+        if missing:
+            raise ValueError(
+                f"log of plant {self.name!r} holds no {', '.join(missing)}, and the plant does not say how to complete "
+                "its states; log them, name their columns, or override Plant.complete_states."
+            )
+        return torch.stack([measured[state.name] for state in self.states], -1)
+
+    # Randomness, always from the generator that is passed in
+
+    @abstractmethod
+    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
+        """Initial states of ``batch`` episodes."""
+
+    @abstractmethod
+    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps n_z"]:
+        """Exogenous inputs of ``batch`` episodes, one sample per control interval."""
+
+    @abstractmethod
+    def make_closure(self, generator: torch.Generator) -> nn.Module:
+        """The closure a twin of this plant starts from, w_p⁰."""
+
+    def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
+        """A closure with a perceptron in it that starts where :meth:`make_closure` does, for a plant that has one.
+
+        Raises:
+            ValueError: if this one has none.
+        """
+        raise ValueError(f"plant {self.name!r} has no neural closure; write its make_neural_closure or take its own.")
+
+    def make_policy(self, generator: torch.Generator) -> nn.Module:
+        """The policy both controllers start from, w_a⁰; a saturated affine law of the observation unless overridden."""
+        return SaturatedAffine(len(self.observations), self.actions, generator=generator)
+
+    def extra_repr(self) -> str:
+        return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
+
+
+def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy: str) -> None:
+    """Refuse a step that makes an explicit Runge-Kutta step unstable.
+
+    Args:
+        plant: name of the plant, for the message.
+        dt: step [s].
+        rate: fastest decay rate |Re μ| of the linearised plant [1/s].
+        mode: what decays at that rate, for the message.
+        remedy: what else the user can do, for the message.
+
+    Raises:
+        ValueError: if dt·rate exceeds the stability limit of RK4 on the negative real axis, 2.785.
+    """
+    if dt * rate > RK4_REAL_STABILITY:
+        raise ValueError(
+            f"dt={dt} s makes plant {plant!r} unstable: {mode} decays at {rate:.4g} 1/s, so dt·rate = {dt * rate:.3g} "
+            f"exceeds the limit {RK4_REAL_STABILITY} of an explicit fourth-order Runge-Kutta step. "
+            # The share keeps the rounded advice below the limit.
+            f"Use dt <= {0.995 * RK4_REAL_STABILITY / rate:.3g} s, or {remedy}."
+        )

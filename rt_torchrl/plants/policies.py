@@ -1,0 +1,126 @@
+r"""Policies of general use: any ``policy(observation) -> action`` with actions in physical units can stand in for them.
+
+Both saturate by the paper's smooth clip (eq. clip), which maps x = 0 to the middle of the range:
+
+.. math:: \mathrm{clip}(x, a_{lo}, a_{hi}) = \tfrac12(\tanh x + 1)(a_{hi} - a_{lo}) + a_{lo}
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.signal import Signal, bounds
+
+
+class SmoothClip(nn.Module):
+    """The paper's smooth saturation to the ranges of the actions.
+
+    Args:
+        actions: the actions, each with a finite range.
+
+    Raises:
+        ValueError: if an action has no finite range.
+    """
+
+    def __init__(self, actions: Sequence[Signal]):
+        super().__init__()
+        for action in actions:
+            if not (math.isfinite(action.low) and math.isfinite(action.high)):
+                raise ValueError(
+                    f"action {action.name!r} has range [{action.low}, {action.high}] {action.unit}; "
+                    "a saturated policy needs finite bounds: give the Signal a low and a high."
+                )
+        low, high = bounds(actions)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+
+    def forward(self, x: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
+        return 0.5 * (torch.tanh(x) + 1.0) * (self.high - self.low) + self.low
+
+
+class SaturatedAffine(nn.Module):
+    r"""One affine map per action through the smooth clip: :math:`a = \mathrm{clip}(We + b)`.
+
+    Args:
+        n_observations: number of observations.
+        actions: the actions and their ranges.
+        bias: learn b; without it zero error gives mid-range.
+        weight_scale: standard deviation of the initial W; zero starts at mid-range.
+        generator: source of the initial weights.
+    """
+
+    def __init__(
+        self,
+        n_observations: int,
+        actions: Sequence[Signal],
+        *,
+        bias: bool = True,
+        weight_scale: float = 0.1,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        self.linear = nn.Linear(n_observations, len(actions), bias=bias, dtype=torch.float64)
+        with torch.no_grad():
+            self.linear.weight.normal_(0.0, weight_scale, generator=generator)
+            if bias:
+                self.linear.bias.zero_()
+        self.clip = SmoothClip(actions)
+
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        return self.clip(self.linear(observation))
+
+
+class SaturatedMLP(nn.Module):
+    r"""A multilayer perceptron through the smooth clip.
+
+    Args:
+        n_observations: number of observations.
+        actions: the actions and their ranges.
+        hidden: width of each hidden layer.
+        output_scale: factor on the last layer's initial weights, so that the policy starts near mid-range.
+        generator: source of the initial weights.
+    """
+
+    def __init__(
+        self,
+        n_observations: int,
+        actions: Sequence[Signal],
+        *,
+        hidden: Sequence[int] = (32, 32),
+        output_scale: float = 0.1,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        self.network = mlp(n_observations, hidden, len(actions), generator=generator)
+        with torch.no_grad():
+            self.network[-1].weight.mul_(output_scale)
+        self.clip = SmoothClip(actions)
+
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        return self.clip(self.network(observation))
+
+
+def mlp(
+    n_inputs: int,
+    hidden: Sequence[int],
+    n_outputs: int,
+    *,
+    generator: torch.Generator,
+    activation: type[nn.Module] = nn.Tanh,
+    dtype: torch.dtype = torch.float64,
+) -> nn.Sequential:
+    """A perceptron with smooth units (adjoints need derivatives), LeCun-normal weights and zero biases."""
+    widths = (n_inputs, *hidden, n_outputs)
+    if min(widths) < 1:
+        raise ValueError(f"layer widths {widths} must all be at least 1.")
+    layers: list[nn.Module] = []
+    for i, (fan_in, fan_out) in enumerate(zip(widths, widths[1:], strict=False)):
+        linear = nn.Linear(fan_in, fan_out, dtype=dtype)
+        with torch.no_grad():
+            linear.weight.normal_(0.0, fan_in**-0.5, generator=generator)
+            linear.bias.zero_()
+        layers += [linear] if i == len(widths) - 2 else [linear, activation()]
+    return nn.Sequential(*layers)

@@ -1,0 +1,1 @@
+"""A training with everything around it: options, progress, checkpoints, results."""

@@ -1,0 +1,139 @@
+"""The results of a run in numbers, as ``metrics.json`` holds them."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from rt_torchrl.evaluation.closure_error import rms_error, visited_features
+from rt_torchrl.evaluation.real_episodes import Baseline
+from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.plants.closures import named_weights
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.switching import Role
+
+ROLES: tuple[Role, ...] = ("model_based", "model_free")
+
+
+def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, Any]:
+    """One entry of ``episodes``: what :meth:`ReinforcementTwinning.episode` found, as plain numbers.
+
+    Args:
+        found: its return value.
+        episode: number of the episode, from 0.
+        live: role that acted on the real system in it.
+    """
+    record: dict[str, Any] = {"episode": episode, "live": live, "event": "keep"}
+    for key in found.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
+        value = found[key]
+        if key == "seconds":
+            record["seconds"] = {step: float(seconds) for step, seconds in value.items()}
+        else:
+            record[key] = value if isinstance(value, str) else float(value)
+    return record
+
+
+@torch.no_grad()
+def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: dict[str, Baseline]) -> dict[str, Judged]:
+    """Both policies as flown, then the classical controllers, on the unseen episodes of the system as it is."""
+    judged = {role: unseen.judge(flights[role]) for role in ROLES}
+    return judged | {name: unseen.judge(unseen.fly_baseline(law)) for name, law in baselines.items()}
+
+
+@torch.no_grad()
+def summarise(
+    algorithm: ReinforcementTwinning,
+    unseen: UnseenEpisodes,
+    flights: dict[Role, Trajectory],
+    judged: dict[str, Judged],
+    initial_policies: dict[Role, nn.Module],
+    initial_closure: nn.Module,
+    episodes: list[dict[str, Any]],
+    untrained: Float[Tensor, " starts"] | None,
+    optimum: Optimum | None,
+) -> dict[str, Any]:
+    """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
+
+    J_p before and after are of the same episodes, flown by the final live policy.
+    """
+    closure, live = algorithm.twin.closure, algorithm.switch.live
+    laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
+    before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
+    J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
+    after = {role: judged[role].control_costs.mean().item() for role in ROLES}
+    better = min(ROLES, key=after.__getitem__)
+    means = {"J_p": J_p, "J_p_before": J_p_before} | ({} if untrained is None else {"J_a_untrained": untrained})
+    means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
+    found = {
+        "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
+        **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
+        **over_untrained(after, untrained),
+        "unseen": {"episodes": len(unseen.initial_state)}
+        | {name: mean_with_confidence(values) for name, values in means.items()}
+        | results(unseen, judged),
+        "live": live,
+        "better": better,
+        "closure": {name: named_weights(law) for name, law in laws.items() if law is not None},
+        "closure_error": closure_errors(algorithm, laws),
+        "seconds": seconds_per_step(episodes),
+    }
+    if optimum is None:
+        return found
+    reference = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs}
+    return found | {"reference": reference | {"better_over_reference": after[better] / optimum.cost}}
+
+
+def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"] | None) -> dict[str, float]:
+    """Mean J_a after training over that of random starts; nothing without these."""
+    if untrained is None:
+        return {}
+    return {f"J_a_over_untrained_{role}": cost / untrained.mean().item() for role, cost in after.items()}
+
+
+def twin_costs(
+    unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module, flown: Trajectory
+) -> list[Float[Tensor, " count"]]:
+    """J_p of the twin as it is and as it was, on the unseen episodes as flown."""
+    twin = algorithm.twin
+    return [unseen.identification_costs(twin.plant, closure, flown) for closure in (twin.closure, initial_closure)]
+
+
+def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:
+    """What the controllers reach on all unseen episodes, and on each kind of them apart."""
+    overall = {name: found.statistics() for name, found in judged.items()}
+    kinds = {name: chosen for name, chosen in unseen.categories().items() if chosen.sum() > 1}
+    return {
+        **{f"J_a_{role}": overall[role]["J_a"] for role in ROLES},
+        "costs": {name: found.control_costs.tolist() for name, found in judged.items()},
+        "merit": {role: overall[role]["merit"] for role in ROLES},
+        "baselines": {name: found for name, found in overall.items() if name not in ROLES},
+        "categories": {
+            kind: {"episodes": int(chosen.sum())} | {name: found.statistics(chosen) for name, found in judged.items()}
+            for kind, chosen in kinds.items()
+        },
+    }
+
+
+def closure_errors(
+    algorithm: ReinforcementTwinning, laws: dict[str, nn.Module | None]
+) -> dict[str, list[float]] | None:
+    """RMS error of every coefficient of the closures ``found`` and ``start`` where the last real episode went.
+
+    None if the real system's closure is not known.
+    """
+    if laws["true"] is None:
+        return None
+    features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
+    return {name: rms_error(laws[name], laws["true"], features).tolist() for name in ("found", "start")}
+
+
+def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:
+    """Wall time of each step over all episodes [s]."""
+    total: dict[str, float] = {}
+    for record in episodes:
+        for step, seconds in record["seconds"].items():
+            total[step] = total.get(step, 0.0) + seconds
+    return total

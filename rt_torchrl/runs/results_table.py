@@ -1,0 +1,80 @@
+"""The results of a run on the terminal: the progress line and the table at the end."""
+
+from typing import Any
+
+from rt_torchrl.runs.results import ROLES
+
+
+def progress(record: dict[str, Any]) -> str:
+    """The part of the progress line behind the bar."""
+    costs = [(name, record.get(key)) for name, key in (("J_p", "J_p"), ("J_a mb", "J_a_model_based"))]
+    costs += [("J_a mf", record.get("J_a_model_free")), ("real", record["real_cost"])]
+    shown = [f"{name} {value:.3g}" for name, value in costs if value is not None]
+    return ", ".join([*shown, f"live {record['live'].replace('_', '-')}"])
+
+
+def results_table(metrics: dict[str, Any]) -> str:
+    """The results for the terminal."""
+    found = metrics["summary"]
+    unseen, n = found["unseen"], found["unseen"]["episodes"]
+    lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones"]
+    lines.append(f"  {'cost':<22}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
+    rows = [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
+    for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):
+        rows.append((f"J_a {role.replace('_', '-')}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
+    for name, before, after, ratio in rows:
+        means = f"{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}"
+        lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{ratio:>10.3g}")
+    if "J_a_untrained" in unseen:
+        shares = ", ".join(f"{role.replace('_', '-')} {found[f'J_a_over_untrained_{role}']:.3g}" for role in ROLES)
+        lines.append(f"  over a random start's mean J_a of {unseen['J_a_untrained']['mean']:.4g}: {shares}")
+    if "reference" in found:
+        best, share = found["reference"]["J_a"], found["reference"]["better_over_reference"]
+        lines.append(f"  exact gradients on the true plant: J_a {best:.5g}; the better policy is at {share:.3f} of it")
+    for name, baseline in unseen["baselines"].items():
+        lines.append(f"  {f'J_a {name}':<22}{'':>12}{baseline['J_a']['mean']:>12.5g}   {_interval(baseline['J_a'])}")
+    lines += merit_lines(unseen)
+    lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
+    lines += closure_lines(found["closure"])
+    lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
+    return "\n".join(lines)
+
+
+def _interval(found: dict[str, Any]) -> str:
+    return "[{:.4g}, {:.4g}]".format(*found["confidence_interval"])
+
+
+def merit_lines(unseen: dict[str, Any]) -> list[str]:
+    """The plant's own quantities under every controller: of all episodes, then with J_a of each kind apart."""
+    merits = {role: unseen["merit"][role] for role in ROLES}
+    merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
+    if not merits[ROLES[0]]:
+        return []
+    lines = [f"  {'mean (median)':<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
+    lines += _rows(merits)
+    for kind, found in unseen["categories"].items():
+        lines.append(f"  {kind}, {found['episodes']} of {unseen['episodes']} episodes")
+        lines += _rows({name: {"J_a": found[name]["J_a"]} | found[name]["merit"] for name in merits})
+    return lines
+
+
+def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
+    """A line for each quantity."""
+    lines = []
+    for name in next(iter(columns.values())):
+        values = [merit[name] for merit in columns.values()]
+        shown = (f"{v['mean']:.4g}" + (f" ({v['median']:.4g})" if "median" in v else "") for v in values)
+        lines.append(f"    {name:<26}" + "".join(f"{text:>20}" for text in shown))
+    return lines
+
+
+def closure_lines(closure: dict[str, Any]) -> list[str]:
+    """Weights found, beside the true ones where the real plant has the same closure."""
+    if not closure["found"] or not all(isinstance(value, float) for value in closure["found"].values()):
+        return []
+    true = closure.get("true") or {}
+    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}{'true':>12}"]
+    for name, value in closure["found"].items():
+        known = f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"
+        lines.append(f"  {name:<22}{closure['start'][name]:>12.5g}{value:>12.5g}{known}")
+    return lines

@@ -1,0 +1,153 @@
+"""Options that every recipe has."""
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.trajectories.trajectory import Engine
+from rt_torchrl.twinning.algorithm import TwinningConfig
+from rt_torchrl.twinning.switching import Role
+
+QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """Options every recipe has.
+
+    Args:
+        policy: paper for the plant's own, or mlp.
+        hidden: widths of the hidden layers of an mlp policy.
+        model_free_policy: another of these for the model-free policy alone; same for that of the model-based one, from
+            the same initial weights.
+        closure: paper for the plant's own law in the twin, or mlp for a law with a perceptron in it, which has other
+            defaults of twinning.records and twinning.assimilation: NEURAL in the recipe.
+        closure_hidden: widths of the hidden layers of an mlp closure.
+        episodes: number of real episodes n_e.
+        seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
+        engine: gradient engine of steps 4 and 5: parallel (exact, fast), odeint_adjoint (the paper's continuous
+            adjoint, slow) or autograd (exact, slow).
+        compiled: compile with torch.compile; by default where this machine has what that needs, otherwise a notice
+            says so. Without it nothing has to be compiled first, and every step is several times slower.
+        device: where everything runs, such as cpu or cuda.
+        threads: number of CPU threads; 0 leaves torch's default.
+        log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
+        resume: go on from the checkpoint in log_dir.
+        overwrite: replace what an earlier run left in log_dir.
+        quick: a whole small run: at most 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
+        unseen: number of unseen episodes that twin and policies are judged on at the end.
+        untrained: number of random starts whose mean cost on the unseen episodes the costs are also compared with; 0
+            leaves that out.
+        reference: also compute what exact gradients on the true plant reach for this policy on the unseen episodes.
+        figures: draw the figures at all; a training among many is done sooner without.
+        figures_every: draw the figures into the dashboard every so many episodes, and at the end; 0 only at the end.
+        unseen_every: judge the live policy on the unseen episodes after every so many episodes; 0 only at the end.
+        noise: standard deviation of the real system's sensors, as a share of what they read.
+        twinning: hyper-parameters of the six steps.
+    """
+
+    policy: str = "paper"
+    hidden: tuple[int, ...] = (32, 32)
+    model_free_policy: str = "same"
+    closure: Literal["paper", "mlp"] = "paper"
+    closure_hidden: tuple[int, ...] = (16, 16)
+    episodes: int = 20
+    seed: int = 0
+    engine: Engine = "parallel"
+    compiled: bool | None = None
+    device: str = "cpu"
+    threads: int = 0
+    log_dir: Path | None = None
+    resume: bool = False
+    overwrite: bool = False
+    quick: bool = False
+    unseen: int = 20
+    untrained: int = 20
+    reference: bool = False
+    figures: bool = True
+    figures_every: int = 5
+    unseen_every: int = 0
+    noise: float = 0.0
+    twinning: TwinningConfig = field(default_factory=TwinningConfig)
+
+    def __post_init__(self):
+        for argument, least in (
+            ("episodes", 1),
+            ("threads", 0),
+            ("unseen", 2),
+            ("untrained", 0),
+            ("figures_every", 0),
+            ("unseen_every", 0),
+        ):
+            if getattr(self, argument) < least:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
+        if self.resume and self.log_dir is None:
+            raise ValueError("resume needs log_dir, the folder of the run to go on with.")
+
+    def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
+        """The policy asked for, with random initial weights; override it for policies of your own.
+
+        Raises:
+            ValueError: if there is no policy of that name.
+        """
+        if self.policy == "paper":
+            return plant.make_policy(generator)
+        if self.policy == "mlp":
+            return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
+        raise ValueError(f"policy={self.policy!r} does not exist; choose paper or mlp.")
+
+    def make_closure(self, plant: Plant, generator: torch.Generator) -> nn.Module:
+        """The twin's closure asked for, w_p⁰; override it for closures of your own.
+
+        Raises:
+            ValueError: if the plant has no neural closure, or there is no closure of that name.
+        """
+        if self.closure == "paper":
+            return plant.make_closure(generator)
+        if self.closure == "mlp":
+            return plant.make_neural_closure(generator, self.closure_hidden)
+        raise ValueError(f"closure={self.closure!r} does not exist; choose paper or mlp.")
+
+    def make_policies(self, plant: Plant, generator: torch.Generator) -> dict[Role, nn.Module]:
+        """π_mb and π_mf: with the same initial weights where they are of the same kind."""
+        model_based = self.make_policy(plant, generator)
+        if self.model_free_policy == "same":
+            return {"model_based": model_based, "model_free": copy.deepcopy(model_based)}
+        other = dataclasses.replace(self, policy=self.model_free_policy)
+        return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
+
+    def defaults(self) -> "RunConfig":
+        """The defaults that go with the closure and the sensors asked for; override it where one is not like another.
+
+        See :func:`rt_torchrl.runs.command_line.from_command_line`.
+        """
+        return type(self)()
+
+    def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
+        """Closure of the real system in each episode, if it wears; override it for a system that does."""
+        return None
+
+    def effective(self) -> "RunConfig":
+        """With ``quick`` carried out."""
+        if not self.quick:
+            return self
+        model_free = dataclasses.replace(
+            self.twinning.model_free, critic_iterations=QUICK_ITERATIONS, actor_iterations=QUICK_ITERATIONS
+        )
+        twinning = dataclasses.replace(self.twinning, model_free=model_free)
+        return dataclasses.replace(
+            self,
+            quick=False,
+            episodes=min(self.episodes, QUICK_EPISODES),
+            unseen=QUICK_UNSEEN,
+            figures_every=0,
+            twinning=twinning,
+        )

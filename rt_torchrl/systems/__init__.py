@@ -1,0 +1,1 @@
+"""Real systems, simulated or not, and what stands between them and a policy."""

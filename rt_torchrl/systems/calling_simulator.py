@@ -1,0 +1,152 @@
+"""A simulator that calls its controller, turned round into an environment that is stepped."""
+
+from collections.abc import Callable, Mapping, Sequence
+from queue import SimpleQueue
+from threading import Thread
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.signal import Signal
+
+Report = Mapping[str, np.ndarray | Sequence[float]]
+Controller = Callable[[Report], np.ndarray]
+Simulation = Callable[[int, Controller], None]
+
+
+class EpisodeAbandoned(BaseException):
+    """Raised in the simulator where it calls its controller, when nobody will go on with its episode."""
+
+
+class Conversation:
+    """One episode of a simulator in a thread of its own, and the calls of its controller handed over to this one.
+
+    Args:
+        simulate: runs the episode.
+        seed: of the episode.
+    """
+
+    def __init__(self, simulate: Simulation, seed: int):
+        self._simulate, self._seed = simulate, seed
+        self._reports: SimpleQueue[Report | BaseException | None] = SimpleQueue()
+        self._actions: SimpleQueue[np.ndarray | None] = SimpleQueue()
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._simulate(self._seed, self._ask)
+        except EpisodeAbandoned:
+            pass
+        except BaseException as error:  # whatever it is, it is told to whoever steps, not to a thread nobody sees
+            self._reports.put(error)
+        self._reports.put(None)
+
+    def _ask(self, reported: Report) -> np.ndarray:
+        self._reports.put(dict(reported))
+        action = self._actions.get()
+        if action is None:
+            raise EpisodeAbandoned
+        return action
+
+    def listen(self) -> Report | None:
+        """What the simulator tells its controller next; None once it has ended.
+
+        Raises:
+            RuntimeError: if the simulator has failed; with its own error as the cause.
+        """
+        found = self._reports.get()
+        if isinstance(found, BaseException):
+            raise RuntimeError(f"the simulator failed: {type(found).__name__}: {found}") from found
+        return found
+
+    def answer(self, action: np.ndarray | None) -> None:
+        """The controller's action; None to abandon the episode."""
+        self._actions.put(action)
+
+    def end(self) -> None:
+        """Abandon what is left of the episode and wait for the simulator to return."""
+        if self._thread.is_alive():
+            self.answer(None)
+            self._thread.join()
+
+
+class CallingSimulator(EnvBase):
+    """An environment of a simulator that runs whole episodes itself and calls a controller in between.
+
+    That is how co-simulation, Bladed-style controller libraries and many course codes work: ``simulate(seed,
+    controller)`` runs an episode and asks ``action = controller(reported)`` once for every control interval, the last
+    time at its end, where the answer moves nothing any more. Here the simulator runs in a thread that waits while the
+    environment is not stepped; an episode that is reset before its end gets :class:`EpisodeAbandoned` out of its call.
+
+    Args:
+        simulate: the simulator. ``reported`` is a mapping from names to the numbers behind them; the action is a vector
+            in double precision.
+        reports: how many numbers stand behind each name.
+        actions: what is asked for; their ranges become those of the environment's action.
+        seed: of the first episode, until ``set_seed`` gives another; the next ones count on from it.
+
+    Raises:
+        ValueError: if nothing is reported or asked for, or a report lacks a name or has another size.
+        RuntimeError: if the simulator fails, or an episode has no call.
+    """
+
+    def __init__(self, simulate: Simulation, reports: Mapping[str, int], actions: Sequence[Signal], *, seed: int = 0):
+        if not reports or not actions:
+            raise ValueError(f"reports={dict(reports)} and actions={list(actions)} must not be empty.")
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        self._simulate, self._sizes, self._seed = simulate, dict(reports), seed
+        self._conversation: Conversation | None = None
+        double = {"dtype": torch.float64}
+        self.observation_spec = Composite({name: Unbounded((n,), **double) for name, n in self._sizes.items()})
+        low, high = (torch.tensor([getattr(a, end) for a in actions], **double) for end in ("low", "high"))
+        self.action_spec = Bounded(low, high, (len(actions),), **double)
+        self.reward_spec = Unbounded((1,), **double)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = self._seed if seed is None else seed
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        self.end_episode()
+        self._conversation = Conversation(self._simulate, self._seed)
+        self._seed += 1
+        first = self._conversation.listen()
+        if first is None:
+            raise RuntimeError("the simulator has ended its episode without calling its controller once.")
+        self._last = self._entries(first)
+        return self._last.clone()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The next call of the controller; the last report once more, and done, where the simulator has ended."""
+        self._conversation.answer(tensordict["action"].numpy().copy())
+        reported = self._conversation.listen()
+        if reported is not None:
+            self._last = self._entries(reported)
+        ended = torch.full((1,), reported is None)
+        ends = {"done": ended, "terminated": ended.clone(), "reward": torch.zeros(1, dtype=torch.float64)}
+        return self._last.clone().update(ends)
+
+    def _entries(self, reported: Report) -> TensorDict:
+        found: dict[str, Tensor] = {}
+        for name, size in self._sizes.items():
+            values = reported.get(name)
+            if values is None or np.shape(values) != (size,):
+                raise ValueError(
+                    f"the simulator reports {name}={values!r}; it must be {size} numbers, as declared in `reports`."
+                )
+            found[name] = torch.as_tensor(np.asarray(values, dtype=np.float64))
+        return TensorDict(found, batch_size=self.batch_size)
+
+    def end_episode(self) -> None:
+        """Abandon the episode that is running, if one is."""
+        if self._conversation is not None:
+            self._conversation.end()
+            self._conversation = None
+
+    def close(self, **kwargs) -> None:
+        self.end_episode()
+        super().close(**kwargs)

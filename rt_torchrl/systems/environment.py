@@ -1,0 +1,210 @@
+"""The real system in simulation: any plant as a TorchRL environment."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.engines.compilation import compiled_if
+from rt_torchrl.trajectories.trajectory import DivergenceError
+
+
+class Draw(NamedTuple):
+    """Initial states and exogenous inputs of episodes, and what the sensors multiply their first state by."""
+
+    initial_state: Float[Tensor, "batch n_s"]
+    exogenous: Float[Tensor, "batch n n_z"]
+    sensor_factor: Float[Tensor, "batch n_s"]
+
+
+class PlantEnv(EnvBase):
+    r"""A plant with its true closure, stepped by commands.
+
+    Entries of its TensorDict, each with the batch size in front:
+
+    =====================================  ======  ===================================================================
+    ``observation``                        n_o     the tracking errors e_k
+    ``state``, ``exogenous``               n_s, z  what a record needs beside the actions, s_k and z_k
+    ``action``                             n_a     the command, within the ranges of the plant's actions
+    ``("next", "applied")``                n_a     the action that the actuators applied
+    ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k)
+    ``("next", "truncated")``, ``"done"``  1       true at the horizon; ``terminated`` is never true
+    =====================================  ======  ===================================================================
+
+    Args:
+        plant: the plant; its own closure is the true one.
+        batch_size: number of episodes that run side by side.
+        seed: of the generator that draws initial states and exogenous inputs.
+        device: where it runs.
+        compiled: compile the step.
+        noise: standard deviation of the sensors as a share of what they read: every reported state is s(1 + noise·w),
+            w standard normal, and the observation is computed from it. The reward stays that of the true state.
+        wear: closure of the real system in each of its episodes, counted from 0; None for the plant's own in all.
+
+    Raises:
+        ValueError: if ``batch_size`` or ``noise`` is out of its range.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        batch_size: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        compiled: bool = False,
+        noise: float = 0.0,
+        wear: Callable[[int], nn.Module] | None = None,
+    ):
+        if batch_size < 1:
+            raise ValueError(f"batch_size={batch_size} must be at least 1.")
+        if not 0.0 <= noise < 1.0:
+            raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([batch_size]))
+        self.plant = plant.to(device)
+        self._transition = compiled_if(compiled, _transition)
+        self._generator = torch.Generator(device=device)
+        # Of their own, so that sensors of any quality see the same disturbances.
+        self._sensors = torch.Generator(device=device)
+        self._set_seed(seed)
+        self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
+        declare_specs(self, plant)
+
+    @property
+    def closure(self) -> nn.Module:
+        """The true closure, as worn as in the episode that was flown last."""
+        return self.plant.closure if self._wear is None else self._wear(max(self._episodes - 1, 0)).to(self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._generator.manual_seed(seed)
+            self._sensors.manual_seed(seed + 1)
+
+    def state_dict(self, *args, **kwargs) -> dict:
+        """Everything the next reset depends on."""
+        generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
+        return generators | {"episodes": self._episodes}
+
+    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+        self._generator.set_state(state["generator"])
+        self._sensors.set_state(state["sensors"])
+        self._episodes = state["episodes"]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        batch = self.batch_size[0]
+        state = self.plant.draw_initial_state(batch, self._generator)
+        exogenous = self.plant.draw_exogenous(batch, self._generator)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or mask.all():
+            self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
+            self._state, self._exogenous = state, exogenous
+        else:
+            again = mask.reshape(batch)
+            self._step_count = torch.where(again, 0, self._step_count)
+            self._state = torch.where(again[:, None], state, self._state)
+            self._exogenous = torch.where(again[:, None, None], exogenous, self._exogenous)
+        applied = torch.zeros(batch, len(self.plant.actions), dtype=torch.float64, device=self.device)
+        false = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
+        return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
+
+    def begin_episode(self) -> nn.Module:
+        """Count an episode and give the closure it has.
+
+        Not counted by a reset, because a collector may reset more than once before it flies.
+        """
+        self._episodes += 1
+        return self.closure
+
+    @property
+    def drawn(self) -> "Draw":
+        """What the last reset has drawn."""
+        return Draw(self._state, self._exogenous, self._factor)
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if (self._step_count == 0).any():
+            self._closure = self.begin_episode()
+        t, exogenous = self._time(), self._now()
+        command = tensordict["action"]
+        transition, cost = self._transition(self.plant, self._closure, t, self._state, command, exogenous)
+        if not cost.isfinite().all() or not transition.state.isfinite().all():
+            raise DivergenceError(
+                f"plant {self.plant.name!r} diverged at t = {t.max().item():g} s: state {self._state.tolist()}, "
+                f"command {command.tolist()}, exogenous input {exogenous.tolist()}."
+            )
+        # A compiled step may reuse its output buffer.
+        self._state = transition.state.clone()
+        self._step_count = self._step_count + 1
+        truncated = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        return self._observed(
+            {
+                "applied": transition.applied.clone(),
+                "reward": -cost.unsqueeze(-1),
+                "done": truncated,
+                "terminated": torch.zeros_like(truncated),
+                "truncated": truncated.clone(),
+            }
+        )
+
+    def _observed(self, entries: dict[str, Tensor]) -> TensorDict:
+        exogenous = self._now()
+        self._factor = self.sensor_factor()
+        state = self._state * self._factor
+        observation = self.plant.observe(self._time(), state, exogenous)
+        entries |= {"observation": observation, "state": state, "exogenous": exogenous}
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def sensor_factor(self) -> Float[Tensor, "batch n_s"]:
+        """What the sensors multiply the state by at the next reading, 1 + noise·w."""
+        if self._noise == 0.0:
+            return torch.ones_like(self._state)
+        like = {"dtype": torch.float64, "device": self.device}
+        return 1.0 + self._noise * torch.randn(self._state.shape, generator=self._sensors, **like)
+
+    def _time(self) -> Float[Tensor, " batch"]:
+        # An integer times a float would be single precision.
+        return self._step_count.double() * self.plant.dt
+
+    def _now(self) -> Float[Tensor, "batch n_z"]:
+        """The input of this interval; after the last one, still that of the last."""
+        k = self._step_count.clamp(max=self.plant.n_steps - 1)
+        return self._exogenous[torch.arange(len(k), device=self.device), k]
+
+
+def declare_specs(env: EnvBase, plant: Plant) -> None:
+    """Give an environment the entries of a plant; see :class:`PlantEnv`."""
+    batch, device = env.batch_size, env.device
+
+    def unbounded(n: int) -> Unbounded:
+        return Unbounded(shape=(*batch, n), dtype=torch.float64, device=device)
+
+    n_o, n_s, n_a, n_z = map(len, (plant.observations, plant.states, plant.actions, plant.inputs))
+    env.observation_spec = Composite(
+        observation=unbounded(n_o),
+        state=unbounded(n_s),
+        exogenous=unbounded(n_z),
+        applied=unbounded(n_a),
+        shape=batch,
+        device=device,
+    )
+    low, high = bounds(plant.actions, device=device)
+    env.action_spec = Bounded(
+        low=low.expand(*batch, n_a), high=high.expand(*batch, n_a), shape=(*batch, n_a), dtype=torch.float64
+    ).to(device)
+    env.reward_spec = unbounded(1)
+    flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
+    env.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device)
+
+
+def _transition(
+    plant: Plant, closure: nn.Module, t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor
+) -> tuple[Transition, Tensor]:
+    transition = plant.step(t, state, command, exogenous, closure)
+    return transition, plant.running_cost(t, state, transition.applied, exogenous)

@@ -1,0 +1,81 @@
+"""Exploration of step 1: noise on the command of the live policy."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorationConfig:
+    r"""The noise ξ(i)·N(0, Σ_a), with Σ_a diagonal and ξ falling linearly to zero.
+
+    Noise that is new at each control interval hardly moves a plant that is slow beside it, and the critic learns little
+    from it. With a correlation time τ it is an Ornstein-Uhlenbeck process of the same deviation,
+
+    .. math:: x_{k+1} = \rho x_k + \sqrt{1 - \rho^2}\,w_k, \qquad \rho = e^{-\Delta t/\tau}
+
+    Args:
+        spread: standard deviation of the noise on each action, as a share of half its range, in the first episode.
+        episodes: number of episodes until ξ is zero; 0 explores in none.
+        correlation_time: τ [s]; 0, as in the paper, for noise that is new at each control interval.
+    """
+
+    spread: float = 0.2
+    episodes: int = 5
+    correlation_time: float = 0.0
+
+    def __post_init__(self):
+        for argument in ("spread", "episodes", "correlation_time"):
+            if not getattr(self, argument) >= 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the exploration must not be negative.")
+
+    def strength(self, episode: int) -> float:
+        """ξ of an episode, counted from 0."""
+        return max(0.0, 1.0 - episode / self.episodes) if self.episodes else 0.0
+
+
+class LivePolicy(nn.Module):
+    """What acts on the real system: the live policy, plus noise, saturated to the ranges of the actions.
+
+    Args:
+        plant: gives the ranges and the control interval.
+        policy: the policy that is live.
+        config: see :class:`ExplorationConfig`.
+        generator: source of the noise.
+    """
+
+    def __init__(self, plant: Plant, policy: nn.Module, config: ExplorationConfig, *, generator: torch.Generator):
+        super().__init__()
+        low, high = bounds(plant.actions, device=generator.device)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+        self.policy, self.strength, self._noise = policy, 0.0, None
+        self._scale = 0.5 * config.spread * (high - low)
+        self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
+        self._generator = generator
+
+    def begin(self, policy: nn.Module, *, strength: float) -> None:
+        """Start an episode with the policy that is live now and ξ = ``strength``."""
+        self.policy, self.strength, self._noise = policy, strength, None
+
+    def draw_noise(self, shape: torch.Size | tuple[int, ...]) -> Float[Tensor, "*batch n_a"]:
+        """The noise of the next control interval; zeros, and no draw, where ξ is zero."""
+        if self.strength == 0.0:
+            return torch.zeros(shape, dtype=torch.float64, device=self.low.device)
+        fresh = torch.randn(shape, generator=self._generator, dtype=torch.float64, device=self.low.device)
+        if self._noise is None:
+            self._noise = fresh
+        else:
+            self._noise = self._memory * self._noise + math.sqrt(1.0 - self._memory**2) * fresh
+        return self.strength * self._scale * self._noise
+
+    @torch.no_grad()
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        command = self.policy(observation)
+        return (command + self.draw_noise(command.shape)).clamp(self.low, self.high)

@@ -1,0 +1,261 @@
+"""The real system where it is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.environment import declare_specs
+
+
+def joined(*entries: Tensor) -> Tensor:
+    """The entries one behind the other."""
+    return torch.cat(entries, -1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """Where a vector of the plant stands in what an environment reports: offset + scale·of(entries).
+
+    Args:
+        keys: entries of the environment's TensorDict.
+        of: makes the vector of them, handed over in that order in double precision, features last; by default they are
+            joined as they are. For an angle of which sine and cosine are reported, it is an arc tangent.
+        scale: unit of the vector in the plant's units; a number for all signals, or one for each.
+        offset: what the plant reads where the vector is zero, in the plant's units; likewise.
+    """
+
+    keys: tuple[NestedKey, ...] = ("observation",)
+    of: Callable[..., Tensor] = joined
+    scale: float | Sequence[float] = 1.0
+    offset: float | Sequence[float] = 0.0
+
+    def read(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
+        """The vector in the plant's units.
+
+        Raises:
+            ValueError: as :meth:`vector`, or if the vector is not finite.
+        """
+        found = self.vector(reported, signals, what)
+        if not found.isfinite().all():
+            names = [signal.name for signal in signals]
+            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {found[0].tolist()}.")
+        return found
+
+    def vector(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
+        """The vector in the plant's units, whatever its values.
+
+        Raises:
+            ValueError: if an entry is missing, or the vector has not the shape of the signals.
+        """
+        missing = [key for key in self.keys if reported.get(key, None) is None]
+        if missing:
+            known = sorted(map(str, reported.keys(include_nested=True, leaves_only=True)))
+            raise ValueError(f"{what} is read from {missing}, which the environment does not report; it has {known}.")
+        found = self.of(*(reported.get(key).double() for key in self.keys))
+        names = [signal.name for signal in signals]
+        if tuple(found.shape) != (*reported.batch_size, len(signals)):
+            raise ValueError(
+                f"{what}, read from {list(self.keys)}, has shape {tuple(found.shape)}; the plant needs "
+                f"{(*reported.batch_size, len(signals))}, which is {names}: give the reading a function `of` them."
+            )
+        return in_units(found, self.scale, self.offset).reshape(1, len(signals))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuation:
+    """Where an environment takes its action; the plant's command is offset + scale·action.
+
+    Args:
+        key: entry of the environment's TensorDict.
+        scale: unit of the environment's action in the plant's units; a number for all actions, or one for each.
+        offset: command of the plant that the environment knows as zero; likewise.
+    """
+
+    key: NestedKey = "action"
+    scale: float | Sequence[float] = 1.0
+    offset: float | Sequence[float] = 0.0
+
+    def __post_init__(self):
+        if not (np.asarray(self.scale) != 0.0).all():
+            raise ValueError(f"scale={self.scale} of the actuation must not be zero.")
+
+    def action(self, command: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """What the environment is told for a command in the plant's units."""
+        scale, offset = (
+            torch.as_tensor(x, dtype=torch.float64, device=command.device) for x in (self.scale, self.offset)
+        )
+        return (command - offset) / scale
+
+
+def in_units(values: Tensor, scale: float | Sequence[float], offset: float | Sequence[float]) -> Tensor:
+    like = {"dtype": torch.float64, "device": values.device}
+    return torch.as_tensor(offset, **like) + torch.as_tensor(scale, **like) * values
+
+
+def episode_seed(seed: int, number: int) -> int:
+    """What a real system is seeded with for an episode, from 0, of the sequence that belongs to a seed."""
+    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0] >> 1)
+
+
+class RealSystem(EnvBase):
+    """An environment that somebody else wrote, with the entries of a :class:`PlantEnv`.
+
+    State and exogenous input are read from what it reports; observation and reward are the plant's own functions of
+    them, and so mean the same on the real system and on its twin. An episode has the length of the plant's; the
+    environment must not end it before.
+
+    Args:
+        env: a TorchRL environment of one system (batch size () or (1,)); a Gymnasium one in TorchRL's ``GymWrapper``.
+        plant: physics and control problem of the twin. What it draws is not used here.
+        state: where its state is found.
+        exogenous: where its exogenous input is found, which must be that of the interval to come; a constant for each
+            input; or None for a plant without inputs.
+        actuation: where the command goes.
+        applied: where the action is found that was applied in an interval, in what is reported at its end; None to
+            take the plant's word for it (``plant.actuate``).
+        closure: the true closure, where it is known, for judging on the plant; None where it is not.
+        seed: each episode starts from a seed of its own, made of this and its number, so that a training can be
+            resumed; None for a system that takes no seed.
+        device: where its entries go.
+
+    Raises:
+        ValueError: if the environment is none of TorchRL or a batch, an entry is missing or misshapen, or its limits on
+            the action do not contain the plant's.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        plant: Plant,
+        *,
+        state: Reading,
+        exogenous: Reading | Sequence[float] | None = None,
+        actuation: Actuation | None = None,
+        applied: Reading | None = None,
+        closure: nn.Module | None = None,
+        seed: int | None = 0,
+        device: torch.device | str = "cpu",
+    ):
+        if not isinstance(env, EnvBase):
+            raise ValueError(f"env is a {type(env).__name__}; wrap it first, such as torchrl.envs.GymWrapper(env).")
+        if env.batch_size not in (torch.Size([]), torch.Size([1])):
+            raise ValueError(f"batch_size={tuple(env.batch_size)} of the environment must be () or (1,): one system.")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([1]))
+        self.env, self.plant, self.closure = env, plant.to(device), closure
+        self._state, self._applied, self._actuation = state, applied, actuation or Actuation()
+        self._exogenous = () if exogenous is None else exogenous
+        self._seed, self._episodes = seed, 0
+        declare_specs(self, plant)
+        self._require_fit()
+
+    def _require_fit(self) -> None:
+        """Refuse before the first step what would fail in it; nothing real is moved."""
+        imagined = self.env.fake_tensordict()  # zeros, of which a reading need not be finite
+        self._state.vector(imagined, self.plant.states, "state")
+        if isinstance(self._exogenous, Reading):
+            self._exogenous.vector(imagined, self.plant.inputs, "exogenous")
+        else:
+            self._input(imagined)
+        if self._applied is not None:
+            self._applied.vector(imagined["next"], self.plant.actions, "applied")
+        elif "applied" in self.env.full_observation_spec:
+            raise ValueError(
+                "the environment reports what it has applied, as a safety layer does, and nobody would read it: give "
+                'applied=Reading(keys=("applied",)), in the plant\'s units.'
+            )
+        key, names = self._actuation.key, [action.name for action in self.plant.actions]
+        if key not in self.env.action_keys:
+            raise ValueError(
+                f"key={key!r} of the actuation is no action of the environment; it has {self.env.action_keys}."
+            )
+        spec = self.env.full_action_spec[key]
+        if not isinstance(spec, Bounded | Unbounded) or spec.shape[len(self.env.batch_size) :].numel() != len(names):
+            raise ValueError(f"the environment's action is {spec}; the plant needs continuous ones for {names}.")
+        if isinstance(spec, Bounded):
+            self._require_range(spec)
+
+    def _require_range(self, spec: Bounded) -> None:
+        ends = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
+        ends = torch.stack([in_units(end, self._actuation.scale, self._actuation.offset) for end in ends])
+        for action, low, high in zip(self.plant.actions, ends.amin(0).tolist(), ends.amax(0).tolist(), strict=True):
+            slack = 1e-6 * (action.high - action.low)  # bounds in single precision
+            if low > action.low + slack or high < action.high - slack:
+                raise ValueError(
+                    f"action {action.name!r} of plant {self.plant.name!r} ranges over "
+                    f"[{action.low:g}, {action.high:g}] {action.unit}, the environment's over [{low:g}, {high:g}]; "
+                    "narrow the plant's, or mend scale and offset of the actuation."
+                )
+
+    def _input(self, reported: TensorDictBase) -> Float[Tensor, "1 n_z"]:
+        inputs = self.plant.inputs
+        if isinstance(self._exogenous, Reading):
+            return self._exogenous.read(reported, inputs, "exogenous")
+        if len(self._exogenous) != len(inputs):
+            names = [signal.name for signal in inputs]
+            raise ValueError(f"exogenous={self._exogenous} must be a Reading, or a constant for each input of {names}.")
+        return torch.tensor([list(self._exogenous)], dtype=torch.float64).reshape(1, len(inputs))
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Start the sequence of episodes that belongs to a seed; without effect on a system that takes none."""
+        if self._seed is not None and seed is not None:
+            self._seed, self._episodes = seed, 0
+
+    def state_dict(self, *args, **kwargs) -> dict:
+        """What can be known of where the real system is: how many episodes it has been through."""
+        return {"seed": self._seed, "episodes": self._episodes}
+
+    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+        self._seed, self._episodes = state["seed"], state["episodes"]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        if self._seed is not None:
+            # Of the episode, not of the reset: a collector may reset more than once before it steps.
+            self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
+        self._reported, self._step_count = self.env.reset(), 0
+        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64)
+        return self._entries(applied, ended=False)
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._episodes += self._step_count == 0
+        before = self._entries(None, ended=False)
+        command = tensordict["action"]
+        spec = self.env.full_action_spec[self._actuation.key]
+        action = self._actuation.action(command[0]).reshape(spec.shape).to(spec.device, spec.dtype)
+        stepped = self.env.step(self._reported.set(self._actuation.key, action))
+        self._step_count += 1
+        last = self._step_count >= self.plant.n_steps
+        if stepped["next", "done"].any() and not last:
+            raise ValueError(
+                f"the environment ended the episode after {self._step_count} of {self.plant.n_steps} intervals of "
+                f"plant {self.plant.name!r}; use a horizon of at most {self._step_count * self.plant.dt:g} s, or an "
+                "environment that goes on."
+            )
+        self._reported = self.env.step_mdp(stepped)
+        if self._applied is None:
+            applied = self.plant.actuate(before["state"], command)
+        else:
+            applied = self._applied.read(stepped["next"], self.plant.actions, "applied").to(self.device)
+        t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
+        cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
+        return self._entries(applied, ended=last).set("reward", -cost.unsqueeze(-1))
+
+    def _entries(self, applied: Tensor | None, *, ended: bool) -> TensorDict:
+        """What is reported now, in the plant's terms."""
+        state = self._state.read(self._reported, self.plant.states, "state").to(self.device)
+        exogenous = self._input(self._reported).to(self.device)
+        t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
+        flag = torch.full((1, 1), ended, dtype=torch.bool)
+        found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
+        found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag)}
+        found |= {} if applied is None else {"applied": applied}
+        return TensorDict(found, batch_size=self.batch_size, device=self.device)

@@ -1,0 +1,270 @@
+"""A safety layer between a policy and a real system: limits on what is sent, a watchdog on what comes back."""
+
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Unbounded
+from torchrl.envs import EnvBase
+
+from rt_torchrl.systems.action_limits import ActionLimits
+from rt_torchrl.systems.watchdog import Range, Watchdog
+
+Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyConfig:
+    """What the layer lets through.
+
+    Args:
+        interval: control interval of the system [s].
+        low: least actions, where they are to be above the system's own.
+        high: greatest actions, where they are to be below the system's own.
+        rates: greatest change of each action [unit/s]; infinity does not limit it.
+        rest: action that the first one of an episode is limited from; without it the first is free.
+        ranges: admissible values of entries of the observation, by name: (low, high), each a number or one a component.
+        deadline: longest wall-clock time from an action to the observation of what it did [s].
+        hold: time without a fault after which the policy acts again [s].
+        patience: time of uninterrupted fallback after which the episode is truncated [s].
+        log: file to which every event is appended, one JSON object a line.
+    """
+
+    interval: float
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
+    rates: tuple[float, ...] | None = None
+    rest: tuple[float, ...] | None = None
+    ranges: Mapping[str, Range] = field(default_factory=dict)
+    deadline: float = math.inf
+    hold: float = 0.0
+    patience: float = math.inf
+    log: Path | None = None
+
+    def __post_init__(self):
+        if not 0.0 < self.interval < math.inf:
+            raise ValueError(f"interval={self.interval} s must be positive and finite: the system's control interval.")
+
+
+class SafetyEvent(NamedTuple):
+    """One control interval in which the layer did something or saw a fault.
+
+    ``reasons`` are, with a detail each: ``range`` and ``rate`` for a limited action, ``asked`` for one that was not
+    finite, ``fallback`` where it acted; ``not finite``, ``out of range`` and ``late`` for the observation at the end of
+    the interval; ``truncated`` where that ended the episode.
+    """
+
+    episode: int
+    step: int
+    time: float  # start of the interval, from that of the episode [s]
+    reasons: dict[str, str]
+    asked: list[float]
+    applied: list[float]
+
+    def line(self) -> str:
+        """As JSON; what is no finite number is null."""
+        entry = self._asdict()
+        for key in ("asked", "applied"):
+            entry[key] = [value if math.isfinite(value) else None for value in entry[key]]
+        return json.dumps(entry)
+
+
+@dataclass
+class SafetyReport:
+    """Of one episode: its events, and how many intervals each reason was met in."""
+
+    events: list[SafetyEvent] = field(default_factory=list)
+    counts: Counter = field(default_factory=Counter)
+
+
+class SafetyLayer(EnvBase):
+    r"""Any environment with one continuous ``action``, with limits in front of it.
+
+    An action goes through range and rate, :math:`|a_k - a_{k-1}| \le r\,\Delta t`, both of which hold for the fallback
+    too, because they are the machine's. While the watchdog is tripped the fallback acts. Observations are passed on as
+    they are, but for values that are not finite: the last finite ones take their place, because a policy and a memory
+    make nothing of NaN; the event says so. Two entries are added:
+
+    ==================  ======  ======================================================================================
+    ``applied``         n_a     what was sent to the system; where the system has an entry of that name, its own is kept
+    ``tripped``         1       whether the watchdog is tripped by this observation or still holds
+    ==================  ======  ======================================================================================
+
+    What is to be learned from is ``("next", "applied")``, not the ``action`` that the policy asked for.
+
+    A shutdown truncates the episode, it does not terminate it: where rewards are negative costs, a return that ends
+    with the shutdown would make it the policy's goal. ``ReinforcementTwinning`` needs whole episodes: leave
+    ``patience`` at infinity there, and the fallback acts up to the horizon.
+
+    The layer runs in the process that steps the system: it notices a late observation when that arrives, and cannot end
+    a call that never returns. A machine needs its own protection behind it.
+
+    Args:
+        env: the real system, one at a time: batch size empty or 1.
+        config: see :class:`SafetyConfig`.
+        fallback: an action, or a controller that makes one from the TensorDict of the last observation.
+        clock: wall clock [s].
+
+    Raises:
+        ValueError: if there is more than one system or action entry, the action is not continuous, or a number does not
+            fit the actions.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        config: SafetyConfig,
+        *,
+        fallback: Fallback,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        if env.batch_size.numel() != 1:
+            raise ValueError(f"env has batch_size={tuple(env.batch_size)}; a safety layer guards one system.")
+        if list(env.action_keys) != ["action"] or not env.action_spec.dtype.is_floating_point:
+            raise ValueError(
+                f"env has the action entries {list(env.action_keys)} of {env.action_spec}; a safety layer guards one "
+                "continuous entry 'action'."
+            )
+        super().__init__(device=env.device, batch_size=env.batch_size)
+        self.env, self.config = env, config
+        self._clock, self.reports = clock, []
+        self.watchdog = Watchdog(config.ranges, deadline=config.deadline, hold=config.hold, patience=config.patience)
+        self._make_specs()
+        self.limits = ActionLimits(
+            env.action_spec, interval=config.interval, low=config.low, high=config.high, rates=config.rates
+        )
+        self._rest = None if config.rest is None else self.limits.constant("rest", config.rest)
+        self._fallback = fallback if callable(fallback) else self.limits.constant("fallback", fallback)
+        if config.log is not None:
+            config.log.parent.mkdir(parents=True, exist_ok=True)
+            config.log.touch()
+
+    def _make_specs(self) -> None:
+        observation, action = self.env.full_observation_spec.clone(), self.env.action_spec
+        unknown = set(self.config.ranges) - set(observation.keys())
+        if unknown:
+            raise ValueError(f"ranges has {sorted(unknown)}; the system observes {sorted(observation.keys())}.")
+        if "applied" not in observation:
+            observation["applied"] = Unbounded(shape=action.shape, dtype=action.dtype, device=self.device)
+        observation["tripped"] = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        self.observation_spec = observation
+        self.action_spec, self.reward_spec = action.clone(), self.env.reward_spec.clone()
+        done = self.env.full_done_spec.clone()
+        if "truncated" not in done:
+            done["truncated"] = done["done"].clone()
+        self.done_spec = done
+        self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
+
+    def __getattr__(self, name: str):
+        """What the layer does not have itself is the system's, such as ``plant``."""
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if name.startswith("_") or name == "env":
+                raise
+            return getattr(self.env, name)
+
+    @property
+    def report(self) -> SafetyReport:
+        """Of the present episode, or of the last one until the next begins."""
+        return self.reports[-1]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
+        found = self.env.reset(asked, **kwargs).exclude("_reset")
+        faults = self.watchdog.faults({key: found[key] for key in self._watched}, 0.0)
+        if faults:
+            raise ValueError(f"the system begins with a fault, {faults}: {found}; nothing was sent to it.")
+        self.watchdog.begin()
+        self._step_count, self._last, self._good = 0, self._rest, {}
+        self._remember(found)
+        if "applied" not in found:
+            found["applied"] = self.action_spec.zero() if self._rest is None else self._rest.clone()
+        found["tripped"] = self._flag(False)
+        found["truncated"] = found.get("truncated", self._flag(False))
+        return found
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._step_count == 0:
+            # Here, because a collector may reset more than once before it steps.
+            self.reports.append(SafetyReport())
+        t, end = (self.config.interval * k for k in (self._step_count, self._step_count + 1))
+        asked = tensordict["action"]
+        applied, reasons = self._chosen(t, tensordict)
+        start = self._clock()
+        found = self.env.step(tensordict.exclude("next", "tripped").set("action", applied.clone()))["next"]
+        faults = self.watchdog.faults({key: found[key] for key in self._entries()}, self._clock() - start)
+        self.watchdog.note(end, bool(faults))
+        found = self._remember(found.copy())
+        if "applied" not in self.env.full_observation_spec:
+            found["applied"] = applied.clone()
+        found["tripped"] = self._flag(self.watchdog.tripped(end))
+        reasons |= faults
+        found["truncated"] = found.get("truncated", self._flag(False))
+        if self.watchdog.exhausted(end):
+            reasons["truncated"] = f"tripped for {self.watchdog.patience:g} s"
+            found["truncated"], found["done"] = self._flag(True), self._flag(True)
+        self._note(t, reasons, asked, applied)
+        self._last, self._step_count = applied, self._step_count + 1
+        return found
+
+    def _chosen(self, t: float, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, str]]:
+        """What is sent to the system, and why it is not what was asked for."""
+        action, reasons = tensordict["action"].to(self.action_spec.dtype), {}
+        if not action.isfinite().all():
+            reasons["asked"] = "not finite"
+            self.watchdog.note(t, True)
+        if self.watchdog.tripped(t):
+            action = self._fallback(tensordict) if callable(self._fallback) else self._fallback
+            reasons["fallback"] = "watchdog tripped"
+            if action.shape != self.action_spec.shape or not action.isfinite().all():
+                raise ValueError(
+                    f"fallback gave {action} at t = {t:g} s; it must be finite, of shape {self.action_spec.shape}."
+                )
+        applied, held = self.limits(action, self._last)
+        return applied, reasons | held
+
+    def _remember(self, found: TensorDictBase) -> TensorDictBase:
+        """The last finite values in place of what is not finite; before the first reward that is zero."""
+        for key in self._entries(found):
+            value = found[key]
+            good = self._good.get(key, torch.zeros_like(value))
+            self._good[key] = torch.where(value.isfinite(), value, good)
+            found[key] = self._good[key]
+        return found
+
+    def _entries(self, found: TensorDictBase | None = None) -> list[str]:
+        return [*self._watched, "reward"] if found is None or "reward" in found else self._watched
+
+    def _note(self, t: float, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
+        if not reasons:
+            return
+        flat = (value.flatten().tolist() for value in (asked, applied))
+        event = SafetyEvent(len(self.reports) - 1, self._step_count, t, reasons, *flat)
+        self.report.events.append(event)
+        self.report.counts.update(reasons.keys())
+        if self.config.log is not None:
+            with self.config.log.open("a", encoding="utf-8") as file:
+                file.write(event.line() + "\n")
+
+    def _flag(self, value: bool) -> Tensor:
+        return torch.full((*self.batch_size, 1), value, dtype=torch.bool, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.env.set_seed(seed)
+
+    def state_dict(self, *args, **kwargs) -> dict:
+        """The system's; the layer itself has nothing that outlives an episode."""
+        return self.env.state_dict(*args, **kwargs)
+
+    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+        self.env.load_state_dict(state, *args, **kwargs)

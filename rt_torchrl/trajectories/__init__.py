@@ -1,0 +1,1 @@
+"""Trajectories of a plant and their gradients."""

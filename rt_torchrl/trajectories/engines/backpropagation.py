@@ -1,0 +1,22 @@
+"""Engine ``autograd``: plain backpropagation through the steps, the exact gradient of the discrete trajectory."""
+
+from torch import Tensor
+
+from rt_torchrl.trajectories.engines.compilation import compiled_if
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
+
+
+class Backpropagation:
+    """Tapes every operation of every step; memory and time grow with the number of steps.
+
+    Args:
+        compiled: run the recurrence and its reverse as one compiled scan.
+    """
+
+    def __init__(self, *, compiled: bool):
+        self._march = compiled_if(compiled, march_by_scan, march)
+
+    def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+        """States at the end of every interval, ``n batch n_s``, differentiable."""
+        return self._march(interval, initial_state, drive)

@@ -1,0 +1,56 @@
+"""Engine ``odeint_adjoint``: the paper's continuous adjoint (eqs. lambda_p and lambda_a), solved by torchdiffeq."""
+
+import torch
+from torch import Tensor, nn
+from torchdiffeq import odeint_adjoint
+
+from rt_torchrl.trajectories.engines.compilation import compiled_if
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+
+
+class ContinuousAdjoint:
+    r"""Chains :func:`torchdiffeq.odeint_adjoint` over the control intervals.
+
+    The applied action and the exogenous input are constant components of the integrated state, so that the co-state of
+    an action is :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, from which ordinary
+    backpropagation goes on into the policy. The co-state is integrated backwards with the step of the forward solution:
+    the gradient differs from the exact one of the discrete trajectory by the order of that step.
+
+    Args:
+        compiled: compile the vector field; the solver's loop stays in Python.
+    """
+
+    def __init__(self, *, compiled: bool):
+        self._compiled = compiled
+
+    def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+        """States at the end of every interval, ``n batch n_s``, differentiable."""
+        field = _HeldField(interval, initial_state.shape[-1], compiled=self._compiled)
+        weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
+        interval_span = torch.tensor([0.0, interval.plant.dt], dtype=torch.float64, device=drive.t.device)
+        state, states = initial_state, []
+        for k in range(drive.t.shape[0]):
+            now = Drive(drive.t[k], drive.exogenous[k], drive.command[k])
+            applied = interval.plant.actuate(state, interval.command(state, now))
+            held = torch.cat([state, applied, now.exogenous], -1)
+            # In absolute time: the field is evaluated again in the backward pass, long after this loop has moved on.
+            span = drive.t[k] + interval_span
+            end = odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1]
+            state = interval.plant.latch(end[..., : state.shape[-1]], applied)
+            states.append(state)
+        return torch.stack(states)
+
+
+class _HeldField(nn.Module):
+    """d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
+
+    def __init__(self, interval: Interval, n_states: int, *, compiled: bool):
+        super().__init__()
+        plant = interval.plant
+        self.closure, self.sizes = interval.closure, (n_states, len(plant.actions), len(plant.inputs))
+        self.vector_field = compiled_if(compiled, plant.vector_field)
+
+    def forward(self, t: Tensor, held: Tensor) -> Tensor:
+        state, action, exogenous = held.split(self.sizes, -1)
+        rate = self.vector_field(t, state, action, exogenous, self.closure)
+        return torch.cat([rate, torch.zeros_like(action), torch.zeros_like(exogenous)], -1)

@@ -1,0 +1,42 @@
+"""One control interval of a plant with its closure and, in the loop, its policy, as one differentiable map."""
+
+from typing import NamedTuple
+
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+
+
+class Drive(NamedTuple):
+    """What drives the intervals from outside, time first: t [s], exogenous input z, and commands if none is computed.
+
+    Shapes: ``t`` is ``n 1``, ``exogenous`` ``n batch n_z``, ``command`` ``n batch n_a`` (zero-width with a policy).
+    """
+
+    t: Tensor
+    exogenous: Tensor
+    command: Tensor
+
+
+class Interval(nn.Module):
+    r""":math:`s_{k+1} = \Phi(s_k, x_k; w)` with w the weights of the closure and, if there is one, of the policy.
+
+    Args:
+        plant: the physics; holds no trained weights.
+        closure: the true or the learned closure.
+        policy: computes the command from the observation; None to take the command from the drive.
+    """
+
+    def __init__(self, plant: Plant, closure: nn.Module, policy: nn.Module | None):
+        super().__init__()
+        self.plant, self.closure, self.policy = plant, closure, policy
+
+    def command(self, state: Tensor, drive: Drive) -> Tensor:
+        """What is asked of the actuators at the start of the interval."""
+        if self.policy is None:
+            return drive.command
+        return self.policy(self.plant.observe(drive.t, state, drive.exogenous))
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """The state at the end of the interval."""
+        return self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure).state

@@ -1,0 +1,72 @@
+"""The Jacobians of all intervals of all trajectories as one batched call."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from rt_torchrl.trajectories.engines.compilation import marked_dynamic
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+
+PIECE = 2048
+"""Intervals that are linearised at once. Forward mode ties a compiled graph to one number; with pieces of this there is
+one for all trajectories that are not shorter."""
+
+
+def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
+    """The intervals of all realisations as rows, ``n·batch`` of them.
+
+    What is asked of every interval at once does not care which trajectory it is of. One graph then serves every length
+    and every number of realisations, and its loops are over one dimension: those over time and realisations, of which t
+    has only the former, take the compiler of a drone's step a minute.
+    """
+    t = drive.t.expand(starts.shape[:2]).flatten()
+    rows = Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
+    return marked_dynamic(starts.flatten(0, 1), 0), Drive(*(marked_dynamic(x, 0) for x in rows))
+
+
+def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
+    """``function`` of every interval, ``n batch ...``, in pieces of :data:`PIECE`, of which the last may overlap."""
+    rows, driven = as_one_batch(starts, drive)
+    length = min(PIECE, len(rows))
+    firsts = [*range(0, len(rows) - length, length), len(rows) - length]
+    found = [function(rows[k : k + length], Drive(*(x[k : k + length] for x in driven))) for k in firsts]
+    found[-1] = found[-1][len(found) * length - len(rows) :]
+    return torch.cat(found).unflatten(0, starts.shape[:2])
+
+
+def linearise(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column.
+
+    Args:
+        interval: Φ.
+        names: those weights w of its closure; without one there is ∂Φ/∂s alone.
+        starts: states at the starts of the intervals, ``rows n_s``.
+        drive: times and inputs of the intervals.
+    """
+    weights = tuple(interval.closure.get_parameter(name) for name in names)
+    sizes = [starts.shape[-1], *(w.numel() for w in weights)]
+    basis = torch.eye(sum(sizes), dtype=starts.dtype, device=starts.device)
+
+    def end(state: Tensor, *values: Tensor) -> Tensor:
+        replaced = {f"closure.{name}": value for name, value in zip(names, values, strict=True)}
+        return torch.func.functional_call(interval, replaced, (state, drive))
+
+    def column(direction: Tensor) -> Tensor:
+        by_state, *by_weights = direction.split(sizes)
+        tangents = (part.reshape(w.shape) for part, w in zip(by_weights, weights, strict=True))
+        return torch.func.jvp(end, (starts, *weights), (by_state.expand_as(starts), *tangents))[1]
+
+    return torch.func.vmap(column, out_dims=-1)(basis)
+
+
+def linearise_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """The same by a reverse-mode product for each row, which is less work where n_w is far above n_s."""
+    weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
+
+    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
+        return torch.func.functional_call(interval, values, (state, Drive(*drive)))
+
+    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
+    by_state, by_weights = rows(weights, starts, *drive)
+    return torch.cat([by_state, *(jacobian.flatten(2) for jacobian in by_weights.values())], -1)

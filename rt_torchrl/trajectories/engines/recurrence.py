@@ -1,0 +1,42 @@
+"""The recurrence s_{k+1} = Φ(s_k, x_k) itself, as a Python loop or as one compiled scan."""
+
+import torch
+from hoptorch.scan import scan
+from torch import Tensor
+
+from rt_torchrl.trajectories.engines.compilation import compiled_if, plain
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+
+
+def march(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    """States at the end of every interval, ``n batch n_s``, by a loop."""
+    state, states = initial_state, []
+    for k in range(drive.t.shape[0]):
+        state = interval(state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
+        states.append(state)
+    return torch.stack(states)
+
+
+def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    """The same by one ``scan``, for the compiler."""
+
+    def body(state, x):
+        # The scan wants a carry that keeps its strides and an output that does not alias it.
+        state = interval(state, Drive(*x)).contiguous()
+        return state, state.clone()
+
+    return scan(body, plain(initial_state), tuple(drive))[1]
+
+
+def march_by_step(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    """The same by a loop over one compiled interval: slower than the scan, but compiled once for all lengths."""
+    step = compiled_if(True, _one_interval)
+    state, states = initial_state, []
+    for k in range(drive.t.shape[0]):
+        state = step(interval, state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
+        states.append(state)
+    return torch.stack(states)
+
+
+def _one_interval(interval: Interval, state: Tensor, drive: Drive) -> Tensor:
+    return interval(state, drive)

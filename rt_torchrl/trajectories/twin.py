@@ -1,0 +1,70 @@
+"""The digital twin: a plant's vector field and step under a learned closure."""
+
+import copy
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.sensitivity import Sensitivities
+from rt_torchrl.trajectories.trajectory import Engine, Rollout, Trajectory, control_cost
+
+
+class DigitalTwin:
+    """Flies virtual episodes of a plant whose true closure it does not know.
+
+    ``sensitivities`` gives replayed states with their derivatives by the closure's weights.
+
+    Args:
+        plant: shared with the real system in simulation; its own closure is never used here.
+        closure: the learned closure g(·; w_p).
+        engine: gradient engine, see :mod:`rt_torchrl.trajectories.trajectory`.
+        compiled: compile the engine.
+    """
+
+    def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "parallel", compiled: bool = False):
+        self.plant, self.closure = plant, closure
+        self._engine, self._compiled = engine, compiled
+        self._replay = self._rollout(closure, None)
+        self.sensitivities = Sensitivities(plant, closure, compiled=compiled)
+
+    def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
+        return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
+
+    def replay(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        actions: Float[Tensor, "batch n n_a"],
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
+    ) -> Trajectory:
+        """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
+        return self._replay(initial_state, exogenous, actions, start=start)
+
+    def control(
+        self,
+        policy: nn.Module,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
+    ) -> Trajectory:
+        """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
+
+        Differentiable by the policy's weights and the initial state; the closure is held constant.
+        """
+        return self._rollout(constant(self.closure), policy)(initial_state, exogenous, start=start)
+
+    def cost(
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+    ) -> Float[Tensor, ""]:
+        """Mean J_a of virtual episodes under a policy."""
+        return control_cost(self.plant, self.control(policy, initial_state, exogenous), exogenous).mean()
+
+
+def constant(module: nn.Module) -> nn.Module:
+    """The same module, sharing its weights, of which no gradient is asked."""
+    shared = {id(w): nn.Parameter(w.detach(), requires_grad=False) for w in module.parameters()}
+    shared |= {id(buffer): buffer for buffer in module.buffers()}
+    return copy.deepcopy(module, shared)

@@ -1,0 +1,242 @@
+"""Step 4: the closure is trained until the twin replays the record."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from rt_torchrl.identification.output_error import (
+    NOISE_TOLERANCE,
+    InitialStates,
+    Misfit,
+    compared,
+    discrepancy_derivatives,
+)
+from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.trajectories.trajectory import Record, Segment, identification_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.exogenous import ExogenousProcess
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssimilationConfig:
+    """Parameters of step 4.
+
+    Args:
+        iterations: n_G, gradients per episode.
+        stop_ratio: end the loop once J_p is below this share of its value at the start of the episode; 0 never does.
+        inputs: ``realisations`` replays the record under N_z samples of the exogenous process, as in the paper;
+            ``record`` under the exogenous input that was measured. Realisations keep a twin from fitting what is chance
+            in the input, but weights that move the states less than that chance are lost in it.
+        method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
+            forward sensitivities, for closures of some ten weights, and makes no use of ``descent``.
+        prior: ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in its unit, on the weights w of the closure's perceptrons
+            (:class:`BoundedPerceptron`); 0 for none. It leaves those where they started that no record shows, and so
+            the law what it was where nothing was visited.
+        segment: control intervals after which the replay starts again from the measured state (multiple shooting); 0
+            replays whole records, as in the paper. Over short segments the states are nearly linear in the weights,
+            which takes a closure of many of them to the record in a few steps; J_p of each is that of its mean segment.
+        initial: ``measured`` starts a replay from what the sensors read first, as in the paper; ``estimated`` takes the
+            components of that state that J_p compares as unknowns beside the weights, measured as the first sample
+            says. A plant that forgets slowly carries the error of a first sample through the whole record, and the
+            weights make up for it; needs ``levenberg_marquardt`` and the inputs of the ``record``.
+        descent: how the closure's weights descend J_p.
+    """
+
+    iterations: int = 15
+    stop_ratio: float = 0.0
+    inputs: Literal["realisations", "record"] = "realisations"
+    method: Literal["gradient", "levenberg_marquardt"] = "gradient"
+    prior: float = 0.0
+    segment: int = 0
+    initial: Literal["measured", "estimated"] = "measured"
+    descent: DescentConfig = field(default_factory=DescentConfig)
+
+    def __post_init__(self):
+        if self.iterations < 0:
+            raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
+        if not 0.0 <= self.stop_ratio < 1.0:
+            raise ValueError(f"stop_ratio={self.stop_ratio} must lie in [0, 1).")
+        if not self.prior >= 0.0:
+            raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
+        if self.segment < 0:
+            raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
+        if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
+            raise ValueError(
+                f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
+                f"are {self.method!r} and {self.inputs!r}."
+            )
+
+
+class Replay(NamedTuple):
+    """What the twin replays: inputs, measured states and actions, and the times of the first states [s]."""
+
+    exogenous: Float[Tensor, "batch n n_z"]
+    measured: Float[Tensor, "batch n+1 n_s"]
+    actions: Float[Tensor, "batch n n_a"]
+    start: float | Float[Tensor, " batch"] = 0.0
+
+    def cut(self, segment: int, dt: float) -> "Replay":
+        """In segments of that many intervals of length ``dt``, in the order of time; what is left over is dropped."""
+        exogenous, measured, actions, _ = self
+        batch, whole = len(exogenous), exogenous.shape[1] // segment
+        n = whole * segment
+        starts = torch.stack([measured[:, k * segment : (k + 1) * segment + 1] for k in range(whole)], 1)
+        time = dt * segment * torch.arange(whole, dtype=torch.float64, device=exogenous.device)
+        return Replay(
+            exogenous[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
+            starts.flatten(0, 1),
+            actions[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
+            time.repeat(batch),
+        )
+
+
+class Assimilation:
+    r"""Minimises :math:`J_p = \mathbb E\int L_p(s, \check s)\,dt` over the closure's weights (paper, eq. J_p).
+
+    The expectation is over the records in D_S and, for each, realisations of its exogenous process; all are driven by
+    the *stored* actions.
+
+    Note: the paper replays from what the sensors read first; ``initial="estimated"`` finds that state too.
+
+    Args:
+        twin: its closure is updated in place, and holds the best weights seen, w_p*, afterwards.
+        config: see :class:`AssimilationConfig`.
+    """
+
+    def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
+        if config.segment > twin.plant.n_steps:
+            raise ValueError(
+                f"segment={config.segment} of the assimilation exceeds the {twin.plant.n_steps} control intervals of "
+                f"an episode of plant {twin.plant.name!r}; 0 replays whole records."
+            )
+        self.twin, self.config = twin, config
+        self.descent = Descent(twin.closure, config.descent)
+        self.second_order = LevenbergMarquardt(twin.closure)
+        self._start = self._weights().detach().clone()
+        self._stiffness = self._prior_stiffness()
+
+    def update(
+        self, records: Sequence[Record], processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
+    ) -> Descended:
+        """One episode's gradient steps; reported is J_p of the whole records, without the prior.
+
+        Args:
+            records: D_S.
+            processes: the exogenous process of each record.
+            count: N_z, realisations of each.
+            generator: source of the realisations.
+        """
+        if self.config.inputs == "record":
+            count, exogenous = 1, torch.stack([record.exogenous for record in records])
+        else:
+            exogenous = torch.cat([process.sample(count, generator) for process in processes])
+        measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
+        actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
+        whole = Replay(exogenous, measured, actions)
+        if not self.config.segment:
+            return self._descend(whole)
+        before = self._cost_of(whole)
+        found = self._descend(whole.cut(self.config.segment, self.twin.plant.dt))
+        return found._replace(start=before, best=self._cost_of(whole))
+
+    def _descend(self, replayed: Replay) -> Descended:
+        def equations() -> NormalEquations:
+            return self._with_prior(self.normal_equations(*replayed))
+
+        def cost() -> Tensor:
+            return self._identification_cost(replayed) + self._prior_cost()
+
+        before = self._prior_cost().item()
+        method, function = self.descent, cost
+        if self.config.initial == "estimated":
+            misfit = self._misfit(replayed)
+            method = LevenbergMarquardt(misfit.unknowns, tolerance=NOISE_TOLERANCE)
+            function = partial(self._mean_equations, misfit)
+        elif self.config.method == "levenberg_marquardt":
+            method, function = self.second_order, equations
+        found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
+        return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
+
+    def _identification_cost(self, replayed: Replay) -> Tensor:
+        exogenous, measured, actions, start = replayed
+        flown = self.twin.replay(measured[:, 0], exogenous, actions, start=start)
+        return identification_cost(self.twin.plant, flown, measured).mean()
+
+    @torch.no_grad()
+    def _cost_of(self, whole: Replay) -> float:
+        """J_p of whole records; infinite where a closure that was found on their segments diverges."""
+        try:
+            if self.config.initial == "measured":
+                return self._identification_cost(whole).item()
+            misfit = self._misfit(whole, weights=False)
+            misfit.fit_initial_states()
+            return misfit.normal_equations().cost.item() / len(whole.measured)
+        except FloatingPointError:
+            return float("inf")
+
+    def _misfit(self, replayed: Replay, *, weights: bool = True) -> Misfit:
+        """J_p with unknown first states."""
+        exogenous, measured, actions, start = replayed
+        starts = torch.as_tensor(start, dtype=torch.float64).expand(len(measured)).tolist()
+        records = map(Record, measured, exogenous, actions)
+        segments = [Segment(*pair) for pair in zip(starts, records, strict=True)]
+        twin = self.twin
+        free = compared(discrepancy_derivatives(twin.plant, measured, measured)[1]).nonzero().flatten().tolist()
+        initial = InitialStates.estimated(twin, segments, free, twin.sensitivities)
+        return Misfit(twin, segments, initial, weights=weights)
+
+    def _mean_equations(self, misfit: Misfit) -> NormalEquations:
+        found = misfit.normal_equations()
+        return self._with_prior(NormalEquations(*(part / len(misfit.segments) for part in found)))
+
+    def _weights(self) -> Tensor:
+        trained = [w.flatten() for w in self.twin.closure.parameters() if w.requires_grad]
+        return torch.cat(trained) if trained else torch.empty(0, dtype=torch.float64)
+
+    def _prior_cost(self) -> Tensor:
+        return 0.5 * (self._stiffness * (self._weights() - self._start).square()).sum()
+
+    def _prior_stiffness(self) -> Tensor:
+        """ρ of every trained weight, in the order of :meth:`_weights`."""
+        closure, rho = self.twin.closure, self.config.prior
+        held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
+        trained = [w for w in closure.parameters() if w.requires_grad]
+        each = [torch.full_like(w.detach().flatten(), rho if id(w) in held else 0.0) for w in trained]
+        return torch.cat(each) if each else torch.empty(0, dtype=torch.float64)
+
+    def _with_prior(self, found: NormalEquations) -> NormalEquations:
+        if not self.config.prior:
+            return found
+        n = len(found.gradient) - len(self._start)  # further unknowns, the last ones: initial states
+        pull = pad(self._stiffness * (self._weights() - self._start), (0, n))
+        matrix = found.matrix + torch.diag(pad(self._stiffness, (0, n)))
+        return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
+
+    def normal_equations(
+        self,
+        exogenous: Float[Tensor, "batch n n_z"],
+        measured: Float[Tensor, "batch samples n_s"],
+        actions: Float[Tensor, "batch n n_a"],
+        start: float | Float[Tensor, " batch"] = 0.0,
+    ) -> NormalEquations:
+        """J_p, its gradient and its Gauss-Newton matrix with respect to the closure's weights."""
+        states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions, start=start)
+        plant, target = self.twin.plant, measured[:, 1:]
+        share = plant.dt / len(measured)
+        g, H = discrepancy_derivatives(plant, states, target)
+        # The products below are most of the work for a closure of many weights.
+        seen = compared(H)
+        H, S_seen = H[..., seen, :][..., seen], S[:, :, seen]
+        return NormalEquations(
+            share * plant.discrepancy(states, target).sum(),
+            share * torch.einsum("bki,bkiw->w", g, S),
+            share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
+        )

@@ -1,0 +1,168 @@
+r"""A clone of another architecture: the live policy is imitated by the idle one, whose weights it cannot be given.
+
+The imitation is behaviour cloning of the actions, as shares of their ranges, on the observations that the real system
+and the twin have shown:
+
+.. math:: \min_w \mathbb E_e\,\Big\|\frac{\pi(e; w) - \pi_{live}(e)}{a_{hi} - a_{lo}}\Big\|^2
+"""
+
+import copy
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.objectives import BCLoss
+
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.model_based import VirtualEpisodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillationConfig:
+    """Parameters of a clone between two architectures; between policies of the same one, weights are copied.
+
+    Args:
+        iterations: gradients of the imitation loss in each round (L-BFGS on all observations at once).
+        rounds: number of rounds; from the second on, the observations of virtual episodes that the clone itself flies
+            are added, so that it also learns what to do where its own errors lead (DAgger, Ross et al. 2011).
+        samples: greatest number of observations of each source (real system, and every set of virtual episodes);
+            of more, every so many-th is taken.
+    """
+
+    iterations: int = 200
+    rounds: int = 2
+    samples: int = 5000
+
+    def __post_init__(self):
+        for argument in ("iterations", "rounds", "samples"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the distillation must be at least 1.")
+
+
+class Distilled(NamedTuple):
+    """How good a clone is, and whether it was kept.
+
+    ``error`` is the RMS difference of the actions on all observations, as a share of their ranges; ``cost`` the clone's
+    mean J_a on the twin.
+    """
+
+    error: float
+    cost: float
+    accepted: bool
+
+
+class Distillation:
+    """Makes the idle policy imitate the live one.
+
+    Args:
+        twin: on which the policies are flown.
+        config: see :class:`DistillationConfig`.
+    """
+
+    def __init__(self, twin: DigitalTwin, config: DistillationConfig):
+        self.twin, self.config = twin, config
+
+    def clone(
+        self,
+        live: nn.Module,
+        idle: nn.Module,
+        *,
+        seen: Float[Tensor, "n n_o"],
+        draw: Callable[[], VirtualEpisodes],
+        judged_on: VirtualEpisodes,
+        to_beat: float,
+    ) -> Distilled:
+        """Train ``idle`` in place; it keeps its weights if the clone would be worse than it is.
+
+        Args:
+            live: the teacher, not changed.
+            idle: the student; it starts from the weights it has.
+            seen: observations of the real system.
+            draw: initial states and disturbances of other virtual episodes than it is judged on.
+            judged_on: virtual episodes on which the clone is compared.
+            to_beat: mean J_a on them of the policy that would be replaced; a clone of the same cost is taken.
+        """
+        before = copy.deepcopy(idle.state_dict())
+        observations = [self._thinned(seen), self._thinned(self._observed(live, draw()))]
+        for number in range(self.config.rounds):
+            if number:
+                observations.append(self._thinned(self._observed(idle, draw())))
+            error = imitate(self.twin.plant, live, idle, torch.cat(observations), self.config.iterations)
+        with torch.no_grad():
+            cost = self.twin.cost(idle, *judged_on).item()
+        accepted = cost <= to_beat
+        if not accepted:
+            idle.load_state_dict(before)
+        return Distilled(error, cost, accepted)
+
+    @torch.no_grad()
+    def _observed(self, policy: nn.Module, episodes: VirtualEpisodes) -> Float[Tensor, "n n_o"]:
+        plant, exogenous = self.twin.plant, episodes.exogenous
+        flown = self.twin.control(policy, *episodes)
+        t = plant.dt * torch.arange(exogenous.shape[1], dtype=torch.float64, device=exogenous.device)
+        return plant.observe(t, flown.states[:, :-1], exogenous).flatten(0, 1)
+
+    def _thinned(self, observations: Float[Tensor, "n n_o"]) -> Float[Tensor, "m n_o"]:
+        return observations[:: -(-len(observations) // self.config.samples)]
+
+
+def imitate(
+    plant: Plant, teacher: nn.Module, student: nn.Module, observations: Float[Tensor, "n n_o"], iterations: int
+) -> float:
+    """Fit the student's actions to the teacher's in place, by TorchRL's behaviour-cloning loss.
+
+    Args:
+        plant: gives the ranges of the actions.
+        teacher: not changed.
+        student: its weights are trained from where they are.
+        observations: on which they are to agree.
+        iterations: gradients, of the loss on all observations.
+
+    Returns:
+        RMS difference of the actions as a share of their ranges.
+    """
+    with torch.no_grad():
+        wanted = ShareOfRange(plant, teacher)(observations)
+    expert = TensorDict({"observation": observations, "action": wanted}, batch_size=observations.shape[:1])
+    actor = TensorDictModule(ShareOfRange(plant, student), in_keys=["observation"], out_keys=["action"])
+    with warnings.catch_warnings():
+        # BCLoss has no target network; TorchRL warns that its class does not declare one.
+        warnings.filterwarnings("ignore", message="The name target_actor_network_params", category=UserWarning)
+        loss = BCLoss(actor, loss_function="l2")
+    descent = Descent(student, DescentConfig(optimiser="lbfgs", rate=1.0))
+    return descent.run(lambda: loss(expert)["loss_bc"], iterations).best ** 0.5
+
+
+class ShareOfRange(nn.Module):
+    """A policy whose actions are shares of their ranges, 0 at the low and 1 at the high end.
+
+    Args:
+        plant: gives the ranges.
+        policy: in physical units.
+    """
+
+    def __init__(self, plant: Plant, policy: nn.Module):
+        super().__init__()
+        low, high = bounds(plant.actions)
+        self.policy = policy
+        self.register_buffer("low", low)
+        self.register_buffer("range", high - low)
+
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        action = self.policy(observation)
+        return (action - self.low.to(action)) / self.range.to(action)
+
+
+def same_architecture(first: nn.Module, second: nn.Module) -> bool:
+    """Whether the weights of one fit the other: same names and shapes."""
+    shapes = [{name: value.shape for name, value in module.state_dict().items()} for module in (first, second)]
+    return shapes[0] == shapes[1]

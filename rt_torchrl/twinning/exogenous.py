@@ -1,0 +1,131 @@
+"""Step 3: what else the exogenous input could have been, as a Gaussian process around its large scale."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from sklearn.svm import SVR
+from torch import Tensor
+
+from rt_torchrl.plants.signal import Signal, bounds
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExogenousConfig:
+    """Parameters of step 3.
+
+    Args:
+        knots: points of the decimated record that the regression sees; its cost grows with their square.
+        kernel_width: standard deviation of the Gaussian kernel κ, in knot spacings; sets what counts as large scale.
+        penalty: C of the support vector regression, for a record scaled to unit standard deviation.
+        tube: ε of the regression, in standard deviations of the record.
+    """
+
+    knots: int = 300
+    kernel_width: float = 2.0
+    penalty: float = 10.0
+    tube: float = 0.05
+
+    def __post_init__(self):
+        if self.knots < 8:
+            raise ValueError(f"knots={self.knots} must be at least 8 for a regression of the large scale.")
+        for argument in ("kernel_width", "penalty", "tube"):
+            if not getattr(self, argument) > 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+
+
+class ExogenousProcess:
+    r"""Gaussian process of one recorded episode, :math:`\mathcal N_z(\tilde d(t), \Sigma_\varepsilon)` per component.
+
+    The large scale d̃ is a support vector regression with a Gaussian kernel (paper, eq. svr), fitted to block means of
+    the record. The residual z − d̃ is taken as stationary; its covariance is the sample autocovariance under a Parzen
+    window, which keeps it positive semi-definite, and is sampled exactly by circulant embedding.
+
+    Args:
+        record: z at every control interval.
+        dt: control interval [s].
+        signals: the inputs, which may be none; samples are held within their physical ranges.
+        config: see :class:`ExogenousConfig`.
+
+    Raises:
+        ValueError: if the record holds NaN, or fewer samples than a regression needs.
+
+    Source: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088, for the sampling.
+    """
+
+    def __init__(
+        self,
+        record: Float[Tensor, "n n_z"],
+        *,
+        dt: float,
+        signals: Sequence[Signal],
+        config: ExogenousConfig | None = None,
+    ):
+        if not record.isfinite().all():
+            k = (~record.isfinite().all(-1)).nonzero()[0].item()
+            raise ValueError(f"record of the exogenous input is not finite at sample {k}, t = {k * dt:g} s; repair it.")
+        if len(record) < 8:
+            raise ValueError(f"record has {len(record)} samples; at least 8 are needed to separate its scales.")
+        config = config or ExogenousConfig()
+        like = {"dtype": record.dtype, "device": record.device}
+        self._low, self._high = bounds(signals, **like)
+        # Columns are written in place: a plant without inputs has none to stack.
+        values = record.cpu().numpy()
+        large, covariance = np.empty_like(values), np.empty_like(values)
+        for k, column in enumerate(values.T):
+            large[:, k] = _large_scale(column, config)
+            covariance[:, k] = _windowed_autocovariance(column - large[:, k])
+        self.mean: Float[Tensor, "n n_z"] = torch.as_tensor(large, **like)
+        self.covariance: Float[Tensor, "n n_z"] = torch.as_tensor(covariance, **like)
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
+        """Realisations of the input, within the physical ranges of the signals."""
+        n, n_z = self.mean.shape
+        # A covariance of finite support embeds exactly in a circulant twice as long, whose eigenvalues are its FFT.
+        circulant = torch.cat([self.covariance, torch.zeros_like(self.covariance[:1]), self.covariance[1:].flip(0)])
+        spectrum = torch.fft.fft(circulant, dim=0).real.clamp_min(0.0)  # rounding only: see the Parzen window
+        shape = (count, 2 * n, n_z)
+        noise = torch.complex(
+            *(torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device) for _ in range(2))
+        )
+        small = torch.fft.fft((spectrum / (2 * n)).sqrt() * noise, dim=1).real[:, :n]
+        return (self.mean + small).clamp(self._low, self._high)
+
+
+def sample_experience(
+    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
+) -> Float[Tensor, "{count} n n_z"]:
+    """Realisations drawn from the processes of several episodes: each episode once, at random, before any again."""
+    rounds = -(-count // len(processes))
+    order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
+    chosen = torch.cat(order)[:count].tolist()
+    return torch.cat([processes[k].sample(1, generator) for k in chosen])
+
+
+def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
+    """d̃ at every sample, from a regression on block means; time is counted in knot spacings."""
+    spread = values.std()
+    if spread == 0.0:
+        return values.copy()
+    block = max(1, -(-len(values) // config.knots))
+    blocks = [values[k : k + block] for k in range(0, len(values), block)]
+    middles = np.array([k * block + (len(part) - 1) / 2 for k, part in enumerate(blocks)]) / block
+    means = np.array([part.mean() for part in blocks])
+    regression = SVR(
+        kernel="rbf", gamma=0.5 / config.kernel_width**2, C=config.penalty, epsilon=config.tube, cache_size=50
+    )
+    centre = values.mean()
+    regression.fit(middles[:, None], (means - centre) / spread)
+    return centre + spread * regression.predict(np.arange(len(values))[:, None] / block)
+
+
+def _windowed_autocovariance(residual: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Biased sample autocovariance times Parzen's window over a quarter of the record."""
+    n = len(residual)
+    spectrum = np.fft.rfft(residual - residual.mean(), 2 * n)
+    covariance = np.fft.irfft(np.abs(spectrum) ** 2, 2 * n)[:n] / n
+    u = np.arange(n) / max(1, n // 4)
+    window = np.where(u <= 0.5, 1.0 - 6.0 * u**2 * (1.0 - u), 2.0 * np.clip(1.0 - u, 0.0, None) ** 3)
+    return covariance * window

@@ -1,0 +1,166 @@
+"""What step 1 stores: transitions for the critic in the long term, trajectories for the twin in the short term."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplayBuffer, Writer
+
+AT_ONCE = 100
+"""Batches drawn in one call: enough for its overhead not to matter, and few enough for their copies to be small."""
+
+
+class ShortTermMemory(deque):
+    """D_S: the records of the last ``capacity`` real episodes, oldest first."""
+
+    def __init__(self, capacity: int):
+        if capacity < 1:
+            raise ValueError(f"capacity={capacity} of the short-term memory (n_S) must be at least 1.")
+        super().__init__(maxlen=capacity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LongTermMemoryConfig:
+    """Parameters of D_L.
+
+    Args:
+        capacity: transitions kept, n_L.
+        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
+        correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
+        offset: tol, added to every |δ|.
+    """
+
+    capacity: int = 100_000
+    prioritisation: float = 0.6
+    correction: float = 0.4
+    offset: float = 1e-3
+
+    def __post_init__(self):
+        if self.capacity < 1:
+            raise ValueError(f"capacity={self.capacity} of the long-term memory must be at least 1.")
+        for argument in ("prioritisation", "correction"):
+            if not 0.0 <= getattr(self, argument) <= 1.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must lie in [0, 1].")
+        if not self.offset > 0:
+            raise ValueError(f"offset={self.offset} must be positive, or a transition could never be sampled.")
+
+
+class LongTermMemory:
+    r"""D_L, sampled by priority: :math:`P(i) = (|\delta_i| + tol)^{\alpha^*} / \sum_k(|\delta_k| + tol)^{\alpha^*}`.
+
+    When it is full, new transitions replace those with the least probability of being sampled (paper, section 4.3).
+
+    Args:
+        config: see :class:`LongTermMemoryConfig`.
+        generator: source of the samples.
+    """
+
+    def __init__(self, config: LongTermMemoryConfig, *, generator: torch.Generator):
+        self.sampler = PriorityReader(
+            config.capacity, alpha=config.prioritisation, beta=config.correction, eps=config.offset
+        )
+        self._buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(config.capacity, device=generator.device),
+            sampler=self.sampler,
+            writer=LeastPriorityWriter(self.sampler),
+        )
+        self._generator = generator
+        self._buffer.set_rng(generator)
+
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+    def store(self, transitions: TensorDictBase, td_errors: Float[Tensor, " n"]) -> None:
+        """Add transitions, a TensorDict of batch size n, with their TD errors δ."""
+        index = self._buffer.extend(transitions)
+        self.refresh(index, td_errors)
+
+    def sample(self, batch_size: int) -> TensorDict:
+        """Transitions with ``index`` (for :meth:`refresh`) and the importance weight ``priority_weight``."""
+        return self._buffer.sample(batch_size)
+
+    def samples(self, batch_size: int, count: int) -> Iterator[TensorDict]:
+        """The same as ``count`` calls of :meth:`sample` while no priority changes.
+
+        Many are drawn in one call, because a single one takes half as long as a gradient of the policy.
+        """
+        for left in range(count, 0, -AT_ONCE):
+            yield from self.sample(min(left, AT_ONCE) * batch_size).split(batch_size)
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """Those of all transitions, in no particular order."""
+        return self._buffer[:]["observation"]
+
+    def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
+        """Give sampled transitions their new TD errors δ."""
+        # Single precision, because the sampler draws in it when it is given a generator.
+        self.sampler.update_priority(index, td_errors.detach().abs().float())
+
+    def state_dict(self) -> dict[str, Any]:
+        return self._buffer.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._buffer.load_state_dict(state)
+        # Loading gives the buffer a generator of its own; the shared one has its own place in a checkpoint.
+        self._buffer.set_rng(self._generator)
+
+
+class PriorityReader(PrioritizedSampler):
+    """A prioritised sampler that tells the priorities it samples by."""
+
+    def priorities(self, count: int) -> Float[Tensor, " {count}"]:
+        """(|δ_i| + tol)^α* of the first ``count`` transitions."""
+        # The tree answers for a single one with a scalar.
+        return torch.as_tensor(self._sum_tree[torch.arange(count)]).reshape(count)
+
+
+class LeastPriorityWriter(Writer):
+    """Fills the storage in order, then overwrites the transitions of least current priority.
+
+    TorchRL's ``TensorDictMaxValueWriter`` ranks by the value at writing time; the paper ranks by the sampling
+    probability, which changes with every critic update.
+
+    Args:
+        sampler: holds the current priorities.
+    """
+
+    def __init__(self, sampler: PriorityReader):
+        super().__init__()
+        self._sampler = sampler
+
+    def add(self, data: TensorDictBase) -> int:
+        return int(self.extend(data.unsqueeze(0))[0])
+
+    def extend(self, data: TensorDictBase) -> Int[Tensor, " n"]:
+        stored, capacity, n = len(self._storage), self._storage.max_size, len(data)
+        if n > capacity:
+            raise ValueError(
+                f"{n} transitions at once do not fit a long-term memory of {capacity}; raise capacity to at least one "
+                "episode."
+            )
+        free = torch.arange(stored, min(stored + n, capacity))
+        evicted = self._sampler.priorities(stored).argsort(stable=True)[: n - len(free)]
+        index = torch.cat([free, evicted])
+        data.set("index", index)
+        self._storage.set(index, data)
+        return index
+
+    def _empty(self, empty_write_count: bool = True) -> None:
+        """Nothing to forget: the storage knows its length, the sampler its priorities."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing to restore, as in :meth:`_empty`."""
+
+    def dumps(self, path) -> None:
+        """Nothing to write, as in :meth:`_empty`."""
+
+    def loads(self, path) -> None:
+        """Nothing to read, as in :meth:`_empty`."""
