@@ -11,7 +11,8 @@ import torch
 
 from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.shipped_plants import plants
-from rt_torchrl.trajectories.trajectory import Engine, Rollout, control_cost
+from rt_torchrl.trajectories.rollout import Engine, Rollout
+from rt_torchrl.trajectories.trajectory import control_cost
 
 REFERENCE: Engine = "odeint_adjoint"
 
@@ -60,7 +61,7 @@ def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
     weights = [*closure.parameters(), *policy.parameters()]
 
     def compute() -> torch.Tensor:
-        cost = control_cost(plant, rollout(initial_state, exogenous), exogenous).mean()
+        cost = control_cost(plant, rollout(initial_state, exogenous)).mean()
         return torch.cat([part.flatten() for part in torch.autograd.grad(cost, weights)])
 
     return compute

@@ -5,7 +5,8 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
-from rt_torchrl.trajectories.trajectory import DivergenceError, Rollout, Trajectory, control_cost, identification_cost
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
 

@@ -7,7 +7,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.trajectories.trajectory import Record, Rollout
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapshot:
@@ -25,7 +26,7 @@ def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapsh
         initial_closure=plant.make_closure(generator),
         policies=policies,
         live="model_based",
-        record=Record(flown.states[0], exogenous[0], flown.actions[0]),
+        record=Trajectory(flown.states[0], flown.actions[0], exogenous[0]),
         replay=replayed.states[0],
         large_scale=exogenous[0] + shift,
         realisations=exogenous if realisations else None,

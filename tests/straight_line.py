@@ -6,7 +6,8 @@ from torch import nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.trajectories.trajectory import Record, Rollout, Segment
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class Slope(nn.Module):
@@ -44,9 +45,8 @@ class Line(Plant):
 def line_segment(values, wind=0.0, start=0.0):
     n = len(values) - 1
     exogenous = torch.full((n, 1), wind, dtype=torch.float64)
-    return Segment(
-        start, Record(torch.as_tensor(values).reshape(-1, 1).double(), exogenous, torch.zeros(n, 1).double())
-    )
+    states = torch.as_tensor(values).reshape(-1, 1).double()
+    return Trajectory(states, torch.zeros(n, 1).double(), exogenous, start)
 
 
 def noise_of(n, seed, *, smooth=False):
@@ -64,7 +64,6 @@ def flown(plant, generator, lengths):
         found = Rollout(plant, plant.closure)(start, exogenous, low + share * (high - low))
     segments, k = [], 0
     for n in lengths:
-        record = Record(found.states[0, k : k + n + 1], exogenous[0, k : k + n], found.actions[0, k : k + n])
-        segments.append(Segment(k * plant.dt, record))
+        segments.append(found.each()[0].part(k, k + n, plant.dt))
         k += n
     return segments

@@ -14,7 +14,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.trajectory import DivergenceError
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig

@@ -65,7 +65,7 @@ def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
     affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
     judged = judge(unseen, dict.fromkeys(ROLES, unseen.fly(affine)), {"PD": PD(plant)})["PD"]
     own = PD(plant).fly(unseen.initial_state, unseen.exogenous, worn)
-    assert torch.equal(judged.control_costs, control_cost(plant, own, unseen.exogenous))
+    assert torch.equal(judged.control_costs, control_cost(plant, own))
 
 
 COMPARISON = """
@@ -95,10 +95,10 @@ def test_tuning_finds_the_riccati_gain():
     state, exogenous = episodes(plant)
     controller, best = PD(plant), PD(plant, tuple(optimal_gain(1.0)[0].tolist()))
     found = tune(controller, state, exogenous, evaluations=120)
-    least = control_cost(plant, best.fly(state, exogenous), exogenous).mean().item()
+    least = control_cost(plant, best.fly(state, exogenous)).mean().item()
     assert found.best == pytest.approx(least, rel=1e-3) and found.best < 0.9 * found.start
     flown = controller.fly(state, exogenous)
-    assert control_cost(plant, flown, exogenous).mean().item() == pytest.approx(found.best, rel=1e-12)
+    assert control_cost(plant, flown).mean().item() == pytest.approx(found.best, rel=1e-12)
     # The simplex ends within 1 % of each gain; the cost is flat beyond that.
     assert controller.log_gains.tolist() == pytest.approx(best.log_gains.tolist(), abs=0.05)
 

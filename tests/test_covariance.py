@@ -13,7 +13,6 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.identification.covariance import covariance, named_values, newey_west, standard_errors
 from rt_torchrl.identification.identification import Identification, IdentificationConfig
 from rt_torchrl.identification.output_error import InitialStates, Misfit
-from rt_torchrl.trajectories.trajectory import Segment
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -40,10 +39,10 @@ def test_standard_errors_are_those_of_regression(smooth):
     for seed in range(10):
         segment = line_segment(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=smooth))
         misfit = slope_misfit([segment])
-        slope, first = np.polyfit(0.1 * np.arange(n), segment.record.states[:, 0].numpy(), 1)
+        slope, first = np.polyfit(0.1 * np.arange(n), segment.states[:, 0].numpy(), 1)
         with torch.no_grad():
             misfit.twin.closure.w[0] = slope
-            misfit.initial.offsets[:] = first - segment.record.states[0]
+            misfit.initial.offsets[:] = first - segment.states[0]
         found.append(covariance(misfit)[0, 0].item())
     expected = regression_error(n, 0.1, smooth=smooth)
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
@@ -58,8 +57,8 @@ def test_scatter_over_logs_is_the_standard_error():
     estimates, errors = [], []
     for seed in range(12):
         generator = torch.Generator().manual_seed(100 + seed)
-        noise = 0.02 * torch.randn(clean.record.states.shape, generator=generator, dtype=torch.float64)
-        segment = Segment(0.0, clean.record._replace(states=clean.record.states + noise))
+        noise = 0.02 * torch.randn(clean.states.shape, generator=generator, dtype=torch.float64)
+        segment = clean._replace(states=clean.states + noise, start=0.0)
         closure = LinearClosure(plant.true_closure)
         task = Identification(plant, closure, free=(0, 1), config=config)
         task._descend(misfit := task._misfit([segment], (0, 1)))
@@ -84,7 +83,7 @@ def test_named_errors_follow_from_those_of_the_logarithms():
     segments = flown(plant, torch.Generator().manual_seed(0), (60,))
     closure = QuasiSteadyPolar.true().requires_grad_(True)
     noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    noisy = [Segment(0.0, segments[0].record._replace(states=segments[0].record.states + noise))]
+    noisy = [segments[0]._replace(states=segments[0].states + noise, start=0.0)]
     misfit = Misfit(DigitalTwin(plant, closure), noisy, InitialStates(noisy, (), torch.ones(4).double()))
     expected = closure.coefficients.detach() * covariance(misfit).diagonal().sqrt()
     found = standard_errors(misfit)

@@ -22,7 +22,7 @@ from torch import nn
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.plants.policies import mlp
-from rt_torchrl.trajectories.trajectory import DivergenceError, Rollout
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 
 
 @pytest.fixture(scope="module")

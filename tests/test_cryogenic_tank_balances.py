@@ -22,7 +22,7 @@ from cryogenic_tank_reference import (
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 
 
 @pytest.fixture(scope="module")

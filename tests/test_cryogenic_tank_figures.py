@@ -12,7 +12,7 @@ from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.trajectories.trajectory import Record
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 FOUND = {"U_s": [8.0, 46.0], "U_HX": [12.0, 70.0], "K_JT": [90e9, 480e9]}
 TRUE = {"U_s": 50.0, "U_HX": 75.0, "K_JT": 500e9}
@@ -75,9 +75,9 @@ def test_long_records_are_thinned_to_mean_and_range(snapshot):
     # Twice the six hours and a bit: groups of three, the last with one sample.
     record = snapshot.record
     n = 2 * len(record.actions) + 1
-    repeated = [torch.cat([values[:720]] * 2 + [values[:1]]) for values in (record.states, *record[1:])]
+    repeated = [torch.cat([values[:720]] * 2 + [values[:1]]) for values in record[:3]]
     states = torch.cat([repeated[0], repeated[0][-1:]])
-    record = Record(states, *repeated[1:])
+    record = Trajectory(states, *repeated[1:])
     long = replace(snapshot, record=record, replay=states, large_scale=repeated[1], realisations=None)
     figure = figures.tank(long)
     load, values = panel(figure, "heat load"), repeated[1][:, 0].numpy()

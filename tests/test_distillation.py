@@ -7,10 +7,10 @@ from test_algorithm import STEPS, twinning, weights
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig, ShareOfRange, imitate, same_architecture
-from rt_torchrl.twinning.model_based import VirtualEpisodes
 from rt_torchrl.twinning.switching import SwitchConfig
 
 PLANT = LinearQuadratic(horizon=2.0)
@@ -33,7 +33,7 @@ def perceptron(seed=1):
 
 def draw(count=5, seed=2):
     generator = seeded(seed)
-    return VirtualEpisodes(PLANT.draw_initial_state(count, generator), PLANT.draw_exogenous(count, generator))
+    return Scenario(PLANT.draw_initial_state(count, generator), PLANT.draw_exogenous(count, generator))
 
 
 def distilled(live, idle, *, to_beat, judged_on=None, **options):

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import DivergenceError
+from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 def act(env, found, action):

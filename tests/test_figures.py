@@ -19,7 +19,6 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import Record
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
@@ -99,7 +98,7 @@ def test_states_are_record_and_replay_with_units_and_residual(name, request):
 def test_time_axis_suits_the_horizon(oscillator, horizon, unit):
     # Twelve intervals, however long: the figure knows the plant's dt alone.
     plant, record = LinearQuadratic(dt=horizon / 12, horizon=horizon), oscillator.record
-    short = Record(record.states[:13], record.exogenous[:12], record.actions[:12])
+    short = record.part(0, 12, plant.dt)
     figure = figures.actions(replace(oscillator, plant=plant, record=short))
     assert figure.axes[-1].get_xlabel() == f"time [{unit}]"
     length = {"s": 1.0, "min": 60.0, "h": 3600.0}[unit]

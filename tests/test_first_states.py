@@ -128,7 +128,7 @@ def test_noise_of_the_first_sample_is_no_error_of_the_weights():
     errors = {"measured": 0.0, "estimated": 0.0}
     for seed in range(10):
         noise = 0.05 * torch.randn(51, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-        record = segment.record._replace(states=segment.record.states + noise)
+        record = segment._replace(states=segment.states + noise)
         for initial in errors:
             closure = LinearClosure(plant.true_closure)
             assimilation(plant, closure, initial=initial).update([record], [], 1, torch.Generator())

@@ -13,7 +13,7 @@ from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.plants.policies import mlp
-from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 
 MASS, GRAVITY, RHO, FREQUENCY = 3e-3, 9.81, 1.225, 20.0
 WEIGHT = MASS * GRAVITY

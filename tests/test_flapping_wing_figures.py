@@ -15,7 +15,7 @@ from rt_torchrl.envs.flapping_wing.animation import FRAMES, RATE, save_animation
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.trajectories.trajectory import Record
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 SAMPLES_PER_BEAT = 100  # 20 Hz at dt = 0.5 ms
 
@@ -120,7 +120,7 @@ def test_visited_angles_are_those_of_the_kinematics(snapshot):
     # from the chord's pitch 45 sin(2 pi f t) deg and the direction of the stroke.
     record = snapshot.record
     still = replace(
-        snapshot, record=Record(torch.zeros_like(record.states), torch.zeros_like(record.exogenous), record.actions)
+        snapshot, record=Trajectory(torch.zeros_like(record.states), record.actions, torch.zeros_like(record.exogenous))
     )
     sine, cosine = figures.visited_features(still).T.numpy()
     phase = 2 * math.pi * 20.0 * 5e-4 * np.arange(len(record.actions))

@@ -8,7 +8,7 @@ from rt_torchrl.runs.shipped_plants import plants
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.trajectory import DivergenceError
+from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 def system(plant, batch=1, **options):

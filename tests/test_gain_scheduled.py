@@ -8,7 +8,8 @@ from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.trajectory import Rollout, control_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import control_cost
 
 
 def generator(seed=0):
@@ -98,7 +99,7 @@ def test_the_exact_gradient_of_the_gains_is_that_of_finite_differences():
     rollout = Rollout(plant, plant.closure, policy)
 
     def cost():
-        return control_cost(plant, rollout(state, wind), wind).mean()
+        return control_cost(plant, rollout(state, wind)).mean()
 
     (gradient,) = torch.autograd.grad(cost(), policy.weights)
     for k in range(len(gradient)):

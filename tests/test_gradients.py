@@ -16,7 +16,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP, mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
-from rt_torchrl.trajectories.trajectory import Rollout, control_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import control_cost
 
 PLANTS = {
     "linear_quadratic": lambda: LinearQuadratic(dt=0.1, horizon=4.0),
@@ -91,7 +92,7 @@ class Case:
         flown = rollout(self.initial_state, self.exogenous, self.command, start=3.0)
         projected = (self.state_weights * flown.states / self.state_scale).sum()
         projected = projected + (self.action_weights * flown.actions / self.action_scale).sum()
-        return control_cost(self.plant, flown, self.exogenous, start=3.0).sum() + projected / self.plant.n_steps
+        return control_cost(self.plant, flown).sum() + projected / self.plant.n_steps
 
     def leaves(self):
         """Everything a gradient can be asked for, by name, with the size of a typical change."""

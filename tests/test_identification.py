@@ -26,7 +26,8 @@ from rt_torchrl.identification.output_error import InitialStates, Misfit
 from rt_torchrl.identification.resampling import hold_out, resample
 from rt_torchrl.identification.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
-from rt_torchrl.trajectories.trajectory import DivergenceError, Record, Segment
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -55,7 +56,7 @@ def test_a_segment_is_replayed_on_the_plants_clock():
     _, second = flown(plant, torch.Generator().manual_seed(0), (33, 60))
     errors = []
     for start in (second.start, 0.0):
-        segment = Segment(start, second.record)
+        segment = second._replace(start=start)
         misfit = Misfit(
             DigitalTwin(plant, QuasiSteadyPolar.true().requires_grad_(True)),
             [segment],
@@ -123,10 +124,10 @@ def test_figures_show_the_log_the_twin_and_what_was_held_out(identified):
     logged = [line for line in ax.lines if line.get_label() == "log"]
     assert len(logged) == 3
     drawn = np.concatenate([line.get_ydata() for line in logged])
-    expected = torch.cat([s.record.states[:, 0] for s in (*training, *held_out)]).numpy()
+    expected = torch.cat([s.states[:, 0] for s in (*training, *held_out)]).numpy()
     assert np.array_equal(drawn, expected)
     shaded = ax.patches[0].get_extents().transformed(ax.transData.inverted())
-    end = held_out[0].start + plant.dt * len(held_out[0].record.actions)
+    end = held_out[0].start + plant.dt * len(held_out[0].actions)
     assert (shaded.x0, shaded.x1) == pytest.approx((held_out[0].start, end))
     bars = charts.weights(found).axes[0]
     assert [label.get_text() for label in bars.get_xticklabels()] == list(found.weights)
@@ -137,7 +138,7 @@ def test_measured_initial_states_are_kept_when_asked_for():
     config = IdentificationConfig(initial="measured")
     found = Identification(Line(), Slope(), free=(0,), config=config).run(segments, segments)
     for judged in (*found.training, *found.held_out):
-        assert judged.states[0][0] == segments[0].record.states[0]
+        assert judged.states[0][0] == segments[0].states[0]
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
@@ -145,7 +146,7 @@ def test_first_order_optimisers_reach_the_same_line(optimiser):
     segments = [line_segment(1.0 + 0.2 * np.arange(40) * 0.1 + 0.1 * noise_of(40, 0), wind=1.0)]
     config = IdentificationConfig(optimiser=optimiser, iterations=30, rate=0.05 if optimiser == "adam" else 1.0)
     found = Identification(Line(), Slope(), free=(0,), config=config).run(segments, segments)
-    slope = np.polyfit(0.1 * np.arange(40), segments[0].record.states[:, 0].numpy(), 1)[0]
+    slope = np.polyfit(0.1 * np.arange(40), segments[0].states[:, 0].numpy(), 1)[0]
     total = sum(entry["after"] for entry in found.weights.values())
     # Their sum is what the record shows; 30 steps of Adam leave some per cent of it.
     assert total == pytest.approx(slope, abs=0.02)
@@ -161,7 +162,7 @@ def test_actions_that_the_actuators_would_not_apply_are_told():
     jump[20:, 1] += 10.0
     # The states remember what was applied before: the pitch may move by 4 deg, and only at step 20 it moved by more;
     # later the remembered pitch is 10 deg behind in every interval.
-    share = held_back(plant, [Segment(0.0, Record(states, exogenous, jump))])
+    share = held_back(plant, [Trajectory(states, jump, exogenous)])
     assert share["generator_torque"] == 0.0 and share["blade_pitch"] == pytest.approx(0.5, abs=0.13)
 
 

@@ -13,7 +13,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.identification.resampling import hold_means, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, Log, checked, logged_signals, read_log
 from rt_torchrl.identification.simulated_log import policy_law, recorded
-from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 
 pytest.importorskip("pandas")
 PLANT = LinearQuadratic(dt=0.1)
@@ -127,7 +127,7 @@ def test_bad_rows_become_gaps_on_demand():
     assert len(log.times) == 95
     parts = resample(log, PLANT)
     # Four rows make a pause of 0.5 s, longer than three intervals; one row a pause of 0.2 s, which is bridged.
-    assert [len(segment.record.actions) for segment in parts.segments] == [29, 65]
+    assert [len(segment.actions) for segment in parts.segments] == [29, 65]
     assert parts.gaps == [(pytest.approx(2.9), pytest.approx(3.4))]
 
 
@@ -136,9 +136,9 @@ def test_instantaneous_signals_are_interpolated():
     times = jittered(200)
     log = signals(times, position=2.0 - 0.3 * times, velocity=np.sin(times))
     (segment,) = resample(log, PLANT).segments
-    t = torch.arange(len(segment.record.states), dtype=torch.float64) * PLANT.dt
-    torch.testing.assert_close(segment.record.states[:, 0], 2.0 - 0.3 * t, rtol=0, atol=1e-12)
-    error = (segment.record.states[:, 1] - t.sin()).abs().max().item()
+    t = torch.arange(len(segment.states), dtype=torch.float64) * PLANT.dt
+    torch.testing.assert_close(segment.states[:, 0], 2.0 - 0.3 * t, rtol=0, atol=1e-12)
+    error = (segment.states[:, 1] - t.sin()).abs().max().item()
     bound = np.diff(times).max() ** 2 / 8.0
     assert 0.2 * bound < error < bound
 
@@ -164,20 +164,20 @@ def test_a_regular_log_is_taken_as_it_is():
     (segment,) = resample(log, PLANT).segments
     assert segment.start == 5.0
     # Rounding of the times.
-    np.testing.assert_allclose(segment.record.states[:, 0].numpy(), values[0], atol=1e-11)
-    np.testing.assert_allclose(segment.record.actions[:, 0].numpy(), values[1, :-1], atol=1e-11)
+    np.testing.assert_allclose(segment.states[:, 0].numpy(), values[0], atol=1e-11)
+    np.testing.assert_allclose(segment.actions[:, 0].numpy(), values[1, :-1], atol=1e-11)
 
 
 def test_gaps_split_and_short_parts_are_left_out_and_told():
     times = np.concatenate([np.arange(0, 50), np.arange(60, 63), np.arange(80, 130)]) * 0.1
     parts = resample(signals(times), PLANT)
-    assert [(round(s.start, 9), len(s.record.actions)) for s in parts.segments] == [(0.0, 49), (8.0, 49)]
+    assert [(round(s.start, 9), len(s.actions)) for s in parts.segments] == [(0.0, 49), (8.0, 49)]
     assert np.allclose(parts.gaps, [(4.9, 6.0), (6.2, 8.0)]) and np.allclose(parts.too_short, [(6.0, 6.2)])
     assert (parts.interval, parts.gap) == (pytest.approx(0.1), pytest.approx(0.3))
     assert parts.jitter < 1e-9
     # A longer limit bridges the first gap, a still longer one both.
-    assert [len(s.record.actions) for s in resample(signals(times), PLANT, gap=1.2).segments] == [62, 49]
-    assert [len(s.record.actions) for s in resample(signals(times), PLANT, gap=2.0).segments] == [129]
+    assert [len(s.actions) for s in resample(signals(times), PLANT, gap=1.2).segments] == [62, 49]
+    assert [len(s.actions) for s in resample(signals(times), PLANT, gap=2.0).segments] == [129]
 
 
 @pytest.mark.parametrize(
@@ -193,12 +193,12 @@ def test_the_end_is_held_out():
     times = np.concatenate([np.arange(0, 51), np.arange(100, 151)]) * 0.1
     segments = resample(signals(times, position=times), PLANT).segments
     training, held_out = hold_out(segments, PLANT.dt, 0.25)
-    lengths = [[len(s.record.actions) for s in part] for part in (training, held_out)]
+    lengths = [[len(s.actions) for s in part] for part in (training, held_out)]
     assert lengths == [[50, 25], [25]]
     assert held_out[0].start == pytest.approx(12.5)
-    assert held_out[0].record.states[0, 0] == training[1].record.states[-1, 0] == pytest.approx(12.5)
+    assert held_out[0].states[0, 0] == training[1].states[-1, 0] == pytest.approx(12.5)
     # A cut that would leave five intervals moves to the end of the segment.
-    assert [len(s.record.actions) for s in hold_out(segments, PLANT.dt, 0.45)[0]] == [50]
+    assert [len(s.actions) for s in hold_out(segments, PLANT.dt, 0.45)[0]] == [50]
     for share in (0.0, 1.0, math.nan):
         with pytest.raises(ValueError, match="between 0 and 1"):
             hold_out(segments, PLANT.dt, share)

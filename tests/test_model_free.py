@@ -9,7 +9,7 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 from tensordict import TensorDict
 
-from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.twinning.memory import LongTermMemory, LongTermMemoryConfig
 from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
 

@@ -19,7 +19,7 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.run import main_of
 from rt_torchrl.trajectories.engines.interval import Interval
 from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, linearise_by_rows
-from rt_torchrl.trajectories.trajectory import Record, drive_of
+from rt_torchrl.trajectories.rollout import drive_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
@@ -115,7 +115,7 @@ def test_segments_start_from_the_record(plant):
     assimilation, seen = Assimilation(twin, config), []
     equations = assimilation.normal_equations
     assimilation.normal_equations = lambda *arguments: seen.append(equations(*arguments)) or seen[-1]
-    records = [Record(*parts) for parts in zip(flown.states, exogenous, flown.actions, strict=True)]
+    records = flown.each()
     costs, n = [], plant.n_steps // 8 * 8
     with torch.no_grad():
         for record in records:
@@ -137,7 +137,7 @@ def test_what_is_reported_for_segments_is_the_whole_record():
     for segment in (0, 10):
         twin, flown, exogenous = recorded(plant, batch=1)
         config = AssimilationConfig(segment=segment, inputs="record", method="levenberg_marquardt")
-        record = Record(flown.states[0], exogenous[0], flown.actions[0])
+        record = flown.each()[0]
         results.append(Assimilation(twin, config).update([record], [], 1, seeded()))
         # A noise-free record: both find the true matrix.
         torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-7)
@@ -166,10 +166,10 @@ def test_a_prior_pulls_the_perceptron_against_the_record():
         start = parameters_to_vector(twin.closure.correction.parameters()).detach()
         config = AssimilationConfig(prior=prior, inputs="record", method="levenberg_marquardt", iterations=40)
         assimilation = Assimilation(twin, config)
-        assimilation.update([Record(flown.states[0], exogenous[0], flown.actions[0])], [], 1, seeded())
+        assimilation.update([flown.each()[0]], [], 1, seeded())
         away = parameters_to_vector(twin.closure.correction.parameters()).detach() - start
         moved.append(away.norm().item())
-        found = assimilation.normal_equations(exogenous, flown.states, flown.actions)
+        found = assimilation.normal_equations(flown)
         # At the minimum of both the gradient of J_p is the pull of the prior; the steps end where 1e-4 of the cost is
         # left to gain, some hundredths of the gradient.
         assert (found.gradient + prior * away).norm() <= 0.1 * found.gradient.norm()
@@ -181,7 +181,7 @@ def test_a_prior_leaves_the_law_free():
     twin, flown, exogenous = recorded(plant, batch=1)
     twin = DigitalTwin(plant, Corrected(twin.closure))
     config = AssimilationConfig(prior=1e6, inputs="record", method="levenberg_marquardt", iterations=30)
-    Assimilation(twin, config).update([Record(flown.states[0], exogenous[0], flown.actions[0])], [], 1, seeded())
+    Assimilation(twin, config).update([flown.each()[0]], [], 1, seeded())
     # With the perceptron held, the law finds the true matrix as it does alone.
     torch.testing.assert_close(twin.closure.law.matrix, plant.closure.matrix, rtol=0, atol=1e-4)
 
@@ -194,7 +194,7 @@ def test_wrong_options_are_refused(option, message):
 
 def test_a_segment_longer_than_the_record_is_refused():
     twin, flown, exogenous = recorded(LinearQuadratic(horizon=2.0), batch=1)
-    record = Record(flown.states[0], exogenous[0], flown.actions[0])
+    record = flown.each()[0]
     with pytest.raises(ValueError, match="segment=21 of the assimilation exceeds the 20 control"):
         Assimilation(twin, AssimilationConfig(segment=21, inputs="record")).update([record], [], 1, seeded())
 
@@ -203,7 +203,7 @@ def test_the_error_where_visited_is_that_of_the_coefficients():
     """On the turbine, where the features are known: λ = ωR/u and the pitch."""
     plant = PLANTS[0]
     _, flown, exogenous = recorded(plant, batch=1)
-    record = Record(flown.states[0], exogenous[0], flown.actions[0])
+    record = flown.each()[0]
     features = visited_features(plant, record)
     lam = 63.0 * record.states[:-1, 0] / record.exogenous[:, 0]
     torch.testing.assert_close(features, torch.stack([lam, record.actions[:, 1]], -1), rtol=1e-14, atol=0)

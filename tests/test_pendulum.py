@@ -16,7 +16,8 @@ from rt_torchrl.envs.pendulum.models import UniformRod
 from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.trajectory import Record, Rollout, control_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
@@ -107,7 +108,7 @@ def a_record(plant, seed):
     system = gymnasium_pendulum(plant, seed=seed)
     episode = system.rollout(plant.n_steps, TensorDictModule(actor, ["observation"], ["action"]))[0]
     states = torch.cat([episode["state"], episode["next", "state"][-1:]])
-    return Record(states, episode["exogenous"], episode["next", "applied"])
+    return Trajectory(states, episode["next", "applied"], episode["exogenous"])
 
 
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (1.5, 1.5), (0.5, 1.5), (1.5, 0.5)])
@@ -148,7 +149,7 @@ def test_engines_agree_without_inputs():
         policy, closure = plant.make_policy(seeded(1)), plant.make_closure(seeded())
         flown = Rollout(plant, closure, policy, engine=engine)(state, nothing)
         weights = [*closure.parameters(), *policy.parameters()]
-        found = torch.autograd.grad(control_cost(plant, flown, nothing).mean(), weights)
+        found = torch.autograd.grad(control_cost(plant, flown).mean(), weights)
         gradients.append(torch.cat([part.flatten() for part in found]))
     torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)  # rounding
 

@@ -100,7 +100,7 @@ def test_twin_with_the_true_closure_is_the_real_system(kind, unchecked):
             # The same operations on other batch shapes: rounding, damped by stable plants.
             assert ((flown.states - states).abs() / scale).max() < 1e-12, name
             torch.testing.assert_close(flown.actions, episode["next", "applied"], rtol=1e-12, atol=1e-12)
-        cost = control_cost(plant, flights["policy"], exogenous)
+        cost = control_cost(plant, flights["policy"])
     torch.testing.assert_close(cost, -episode["next", "reward"][..., 0].mean(-1), rtol=1e-12, atol=0)
 
 

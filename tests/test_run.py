@@ -12,7 +12,8 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.trajectory import Rollout, identification_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import identification_cost
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.memory import LongTermMemoryConfig

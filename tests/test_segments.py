@@ -4,10 +4,11 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
+from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
-from rt_torchrl.trajectories.trajectory import Record, Rollout, identification_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig, Replay
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.exogenous import ExogenousProcess
 
 
@@ -24,7 +25,7 @@ def flight(plant, seed=0):
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     command = 2.0 * torch.rand(1, plant.n_steps, 1, generator=generator, dtype=torch.float64) - 1.0
     flown = Rollout(plant, plant.closure)(state, exogenous, command)
-    return Record(flown.states[0].detach(), exogenous[0], command[0])
+    return Trajectory(flown.states[0].detach(), command[0], exogenous[0])
 
 
 def assimilation(plant, closure, **options):
@@ -33,7 +34,7 @@ def assimilation(plant, closure, **options):
 
 
 def replayed(*records):
-    return Replay(*(torch.stack(x) for x in zip(*((r.exogenous, r.states, r.actions) for r in records), strict=True)))
+    return Trajectory(*(torch.stack(x) for x in zip(*(r[:3] for r in records), strict=True)))
 
 
 def test_segments_start_at_their_own_time_and_state():
@@ -49,26 +50,26 @@ def test_segments_start_at_their_own_time_and_state():
                 piece[:, 0], record.exogenous[None, part], record.actions[None, part], start=first * plant.dt
             )
             expected.append(identification_cost(plant, flown, piece).item())
-    segments = replayed(*records).cut(12, plant.dt)
-    found = assimilation(plant, closure).normal_equations(*segments).cost.item()
-    assert len(segments.measured) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
+    segments = replayed(*records).segments(12, plant.dt)
+    found = assimilation(plant, closure).normal_equations(segments).cost.item()
+    assert len(segments.states) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
 
 
 def test_the_truth_has_no_cost_in_segments():
     plant = Seasonal()
-    segments = replayed(flight(plant)).cut(7, plant.dt)
-    assert assimilation(plant, plant.closure).normal_equations(*segments).cost < 1e-28
+    segments = replayed(flight(plant)).segments(7, plant.dt)
+    assert assimilation(plant, plant.closure).normal_equations(segments).cost < 1e-28
 
 
 @pytest.mark.parametrize("method", ["gradient", "levenberg_marquardt"])
 def test_what_is_reported_is_the_cost_of_whole_records(method):
     plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
     record = flight(plant)
-    before = assimilation(plant, closure).normal_equations(*replayed(record)).cost.item()
+    before = assimilation(plant, closure).normal_equations(replayed(record)).cost.item()
     found = assimilation(plant, closure, segment=12, method=method, iterations=3)
     found = found.update([record], [], 1, torch.Generator())
     assert found.start == pytest.approx(before, rel=1e-12)  # two ways to sum
-    assert found.best == pytest.approx(assimilation(plant, closure).normal_equations(*replayed(record)).cost.item())
+    assert found.best == pytest.approx(assimilation(plant, closure).normal_equations(replayed(record)).cost.item())
 
 
 def test_sensitivities_start_at_their_own_time():

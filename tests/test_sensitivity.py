@@ -8,7 +8,8 @@ from rt_torchrl.contract.calls import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.trajectories.engines import linearisation
-from rt_torchrl.trajectories.trajectory import Rollout, identification_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
@@ -29,7 +30,7 @@ def recorded(plant, batch=3, seed=0):
 def test_gradient_and_states_are_those_of_backpropagation(plant, piece, monkeypatch):
     monkeypatch.setattr(linearisation, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
     twin, flown, exogenous = recorded(plant)
-    found = Assimilation(twin, AssimilationConfig()).normal_equations(exogenous, flown.states, flown.actions)
+    found = Assimilation(twin, AssimilationConfig()).normal_equations(flown)
     rollout = Rollout(plant, twin.closure, engine="autograd")
     cost = identification_cost(plant, rollout(flown.states[:, 0], exogenous, flown.actions), flown.states).mean()
     gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, list(twin.closure.parameters()))])
@@ -44,14 +45,14 @@ def test_matrix_is_the_hessian_where_the_residual_vanishes():
     twin, flown, exogenous = recorded(plant)
     twin.closure.load_state_dict(plant.closure.state_dict())
     assimilation, weight = Assimilation(twin, AssimilationConfig()), twin.closure.matrix
-    found = assimilation.normal_equations(exogenous, flown.states, flown.actions)
+    found = assimilation.normal_equations(flown)
     columns, step = [], 1e-5
     for k in range(weight.numel()):
         gradients = []
         for sign in (1.0, -1.0):
             with torch.no_grad():
                 weight.view(-1)[k] += sign * step
-                gradients.append(assimilation.normal_equations(exogenous, flown.states, flown.actions).gradient)
+                gradients.append(assimilation.normal_equations(flown).gradient)
                 weight.view(-1)[k] -= sign * step
         columns.append((gradients[0] - gradients[1]) / (2.0 * step))
     # step² of the central difference and the rounding 1e-16/1e-5, both about 1e-10 of the matrix.
@@ -63,7 +64,7 @@ def test_levenberg_marquardt_identifies_the_closure_to_rounding():
     twin, flown, exogenous = recorded(plant)
     assimilation = Assimilation(twin, AssimilationConfig(method="levenberg_marquardt"))
     assimilation.second_order.run(
-        lambda: assimilation.normal_equations(exogenous, flown.states, flown.actions), iterations=15
+        lambda: assimilation.normal_equations(flown), iterations=15
     )
     # The record is noise-free and J_p quadratic at its minimum: Newton's convergence ends in rounding.
     torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-8)

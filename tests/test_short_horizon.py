@@ -8,9 +8,9 @@ import torch
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
-from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
+from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig
 from rt_torchrl.twinning.short_horizon import ShortHorizon, ShortHorizonConfig
 
 CONFIG = ShortHorizonConfig(window=10, critic_hidden=(32, 32))
@@ -21,7 +21,7 @@ def seeded(seed=0):
 
 
 def episodes(plant, count, seed):
-    return VirtualEpisodes(plant.draw_initial_state(count, seeded(seed)), plant.draw_exogenous(count, seeded(seed)))
+    return Scenario(plant.draw_initial_state(count, seeded(seed)), plant.draw_exogenous(count, seeded(seed)))
 
 
 def planner(plant, config=CONFIG, **kind):
@@ -67,7 +67,7 @@ def test_it_comes_near_the_best_policy():
     plan, unseen = planner(plant, dataclasses.replace(CONFIG, policy_rate=2e-2)), episodes(plant, 50, 99)
 
     def cost(policy):
-        return control_cost(plant, plan.twin.control(policy, *unseen), unseen.exogenous).mean()
+        return control_cost(plant, plan.twin.control(policy, *unseen)).mean()
 
     before, best = cost(plan.policy).item(), copy.deepcopy(plan.policy)
     optimum = Descent(best, DescentConfig(optimiser="lbfgs", rate=1.0)).run(lambda: cost(best), 30).best

@@ -9,7 +9,8 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from torch import nn
 
-from rt_torchrl.trajectories.trajectory import DivergenceError, Rollout, Trajectory, control_cost, identification_cost
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 ENGINES = ("parallel", "odeint_adjoint", "autograd")
@@ -101,7 +102,7 @@ def test_time_and_inputs_reach_the_policy_and_the_cost(engine):
     t = 3.0 + 0.25 * torch.arange(8, dtype=torch.float64)
     torch.testing.assert_close(flown.actions[..., 0], t + exogenous[..., 0], rtol=1e-15, atol=1e-15)
     # Mean of 3, 3.25, ..., 4.75.
-    torch.testing.assert_close(control_cost(plant, flown, exogenous, start=3.0), t.new_full((2,), 3.875))
+    torch.testing.assert_close(control_cost(plant, flown), t.new_full((2,), 3.875))
 
 
 def test_control_cost_of_a_decaying_state():
@@ -109,10 +110,10 @@ def test_control_cost_of_a_decaying_state():
     plant, n, h = LinearQuadratic(dt=0.1, horizon=4.0), 40, 0.1
     t = h * torch.arange(n + 1, dtype=torch.float64)
     states = torch.stack([torch.exp(-t), torch.zeros(n + 1)], -1).double().unsqueeze(0)
-    flown = Trajectory(states, 2.0 * states[:, :-1, :1])
+    flown = Trajectory(states, 2.0 * states[:, :-1, :1], torch.zeros(1, n, 1, dtype=torch.float64))
     ratio = math.exp(-2 * h)
     expected = (1.0 + 4.0 * 0.1) * (1 - ratio**n) / (1 - ratio) / n
-    cost = control_cost(plant, flown, torch.zeros(1, n, 1, dtype=torch.float64))
+    cost = control_cost(plant, flown)
     assert cost.item() == pytest.approx(expected, rel=1e-13)  # 40 roundings
 
 
@@ -122,7 +123,7 @@ def test_identification_cost_of_a_growing_error():
     states = torch.randn(2, n + 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     error = torch.stack([h * torch.arange(n + 1), torch.zeros(n + 1)], -1).double()
     error[0] = 7.0
-    cost = identification_cost(plant, Trajectory(states, states[:, :-1, :1]), states + error)
+    cost = identification_cost(plant, Trajectory(states, states[:, :-1, :1], states[:, :-1, :1]), states + error)
     expected = 0.5 * h**3 * n * (n + 1) * (2 * n + 1) / 6
     # Differences of numbers of order four: 1e-15 of them; dt in single precision would give 1e-8.
     torch.testing.assert_close(cost, torch.full((2,), expected, dtype=torch.float64), rtol=1e-6, atol=0)

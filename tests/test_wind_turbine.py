@@ -16,7 +16,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import HUB_INERTIA, WindTurbine
 from rt_torchrl.plants.policies import SmoothClip
-from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 
 R, RHO, N_G, J = 63.0, 1.225, 97.0, 38_759_228.0 + 534.116 * 97**2
 OMEGA_RATED = 1.26711

@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.real_episodes import Flown, RealController
+from rt_torchrl.evaluation.real_episodes import RealController
 from rt_torchrl.systems.calling_simulator import CallingSimulator, Controller
 from rt_torchrl.systems.real_system import Reading, RealSystem, episode_seed
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 STEP = 0.1
 """Time step of ROSCO's simulator, which integrates the rotor by Euler's method [s]."""
@@ -230,13 +231,11 @@ class RoscoController(RealController):
     start of it. For its arguments see :class:`RealController`.
     """
 
-    def fly_real(self, count: int, *, seed: int) -> Flown:
+    def fly_real(self, count: int, *, seed: int) -> Trajectory:
         """The episodes that :func:`rosco_turbine` runs from the same seed."""
         found = [self._episode(episode_seed(seed, number)) for number in range(count)]
         states, applied, wind = (torch.stack(part) for part in zip(*found, strict=True))
-        flown = Flown(states, applied)
-        flown.exogenous = wind.unsqueeze(-1)
-        return flown
+        return Trajectory(states, applied, wind.unsqueeze(-1))
 
     def _episode(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
         """States, applied actions and wind at every control interval."""

@@ -11,7 +11,8 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
-from rt_torchrl.trajectories.trajectory import Trajectory, drive_of
+from rt_torchrl.trajectories.rollout import drive_of
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class ClassicalController(nn.Module, ABC):
@@ -77,7 +78,7 @@ class ClassicalController(nn.Module, ABC):
         carries = torch.cat([start.unsqueeze(0), self._march(loop, start, drive)])
         states = carries[..., :n_s].transpose(0, 1)
         command = loop.commanded(carries[:-1].flatten(0, 1))[0].unflatten(0, carries[:-1].shape[:2])
-        return Trajectory(states, self.plant.actuate(states[:, :-1], command.transpose(0, 1)))
+        return Trajectory(states, self.plant.actuate(states[:, :-1], command.transpose(0, 1)), exogenous)
 
 
 class ControlledInterval(Interval):

@@ -49,7 +49,7 @@ def tune(
     @torch.no_grad()
     def cost(log_gains: np.ndarray) -> float:
         controller.log_gains.copy_(torch.from_numpy(log_gains))
-        value = control_cost(controller.plant, controller.fly(initial_state, exogenous), exogenous).mean().item()
+        value = control_cost(controller.plant, controller.fly(initial_state, exogenous)).mean().item()
         # A flight that leaves the finite numbers is worse than any other.
         return value if np.isfinite(value) else np.inf
 

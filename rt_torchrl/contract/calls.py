@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from rt_torchrl.contract.draws import seeded
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.trajectory import Rollout
+from rt_torchrl.trajectories.rollout import Rollout
 
 Arguments = dict[str, Tensor]
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.trajectory import Record
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class Probe(nn.Module):
@@ -25,7 +25,7 @@ class Probe(nn.Module):
 
 
 @torch.no_grad()
-def visited_features(plant: Plant, record: Record) -> Float[Tensor, "n *elements n_f"]:
+def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elements n_f"]:
     """What the vector field asks its closure in every sample of a real episode.
 
     Args:

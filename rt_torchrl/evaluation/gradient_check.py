@@ -4,7 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.trajectories.trajectory import Engine, Rollout, control_cost
+from rt_torchrl.trajectories.rollout import Engine, Rollout
+from rt_torchrl.trajectories.trajectory import control_cost
 
 STEPS = 40
 
@@ -24,5 +25,5 @@ def _gradient(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes, eng
     initial_state, exogenous = unseen.initial_state[:2], unseen.exogenous[:2, :STEPS]
     flown = Rollout(unseen.plant, closure, policy, engine=engine)(initial_state, exogenous)
     weights = [*closure.parameters(), *policy.parameters()]
-    gradient = torch.autograd.grad(control_cost(unseen.plant, flown, exogenous).mean(), weights)
+    gradient = torch.autograd.grad(control_cost(unseen.plant, flown).mean(), weights)
     return torch.cat([part.flatten() for part in gradient])

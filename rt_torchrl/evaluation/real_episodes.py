@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
@@ -12,12 +12,6 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
-
-
-class Flown(Trajectory):
-    """A trajectory as measured, with the exogenous input that acted in it."""
-
-    exogenous: Float[Tensor, "count n n_z"]
 
 
 class RealController(nn.Module, ABC):
@@ -33,7 +27,7 @@ class RealController(nn.Module, ABC):
         self.plant = plant
 
     @abstractmethod
-    def fly_real(self, count: int, *, seed: int) -> Flown:
+    def fly_real(self, count: int, *, seed: int) -> Trajectory:
         """As many episodes of the sequence that belongs to a seed."""
 
 
@@ -58,18 +52,18 @@ class RealEpisodes(UnseenEpisodes):
         self.closure = None
         self._system, self._count = system, count
 
-    def fly(self, policy: nn.Module) -> Flown:
+    def fly(self, policy: nn.Module) -> Trajectory:
         return self._flown(policy, self._count)
 
     def untrained_cost(self, policy: nn.Module) -> float:
         """J_a of one episode: that of a random policy is a matter of its order of size."""
         return self.judge(self._flown(policy, 1)).control_costs.mean().item()
 
-    def fly_baseline(self, law: RealController) -> Flown:
+    def fly_baseline(self, law: RealController) -> Trajectory:
         return law.fly_real(self._count, seed=UNSEEN_SEED)
 
     @torch.no_grad()
-    def _flown(self, policy: nn.Module, count: int) -> Flown:
+    def _flown(self, policy: nn.Module, count: int) -> Trajectory:
         actor = TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
         kept = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
@@ -78,12 +72,7 @@ class RealEpisodes(UnseenEpisodes):
         finally:
             self._system.load_state_dict(kept)
         states = torch.cat([found["state"], found["next", "state"][:, -1:]], 1)
-        flown = Flown(states, found["next", "applied"])
-        flown.exogenous = found["exogenous"]
-        return flown
-
-    def exogenous_of(self, flown: Flown) -> Float[Tensor, "count n n_z"]:
-        return flown.exogenous
+        return Trajectory(states, found["next", "applied"], found["exogenous"])
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
         """None: what acts from outside need not be the same each time."""

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.trajectory import Rollout, Trajectory, control_cost, identification_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 
 UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
@@ -58,14 +59,9 @@ class UnseenEpisodes:
         """The episodes under a classical controller, on the system as it is."""
         return law.fly(self.initial_state, self.exogenous, self.closure)
 
-    def exogenous_of(self, flown: Trajectory) -> Float[Tensor, "count n n_z"]:
-        """What acted from outside in the episodes as flown."""
-        return self.exogenous
-
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
         """J_a of each episode."""
-        flown = self.fly(policy)
-        return control_cost(self.plant, flown, self.exogenous_of(flown))
+        return control_cost(self.plant, self.fly(policy))
 
     def untrained_cost(self, policy: nn.Module) -> float:
         """Mean J_a of one of many random initial policies."""
@@ -73,9 +69,8 @@ class UnseenEpisodes:
 
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities of the episodes as flown."""
-        exogenous = self.exogenous_of(flown)
-        costs = control_cost(self.plant, flown, exogenous)
-        return Judged(costs, self.plant.merit(flown.states, flown.actions, exogenous))
+        costs = control_cost(self.plant, flown)
+        return Judged(costs, self.plant.merit(flown.states, flown.actions, flown.exogenous))
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
         """The kinds of episodes that this plant's results are also shown apart for."""
@@ -91,7 +86,7 @@ class UnseenEpisodes:
             flown: the episodes on the real system.
         """
         rollout = Rollout(physics, closure, compiled=self._compiled)
-        replayed = rollout(flown.states[:, 0], self.exogenous_of(flown), flown.actions)
+        replayed = rollout(flown.states[:, 0], flown.exogenous, flown.actions)
         return identification_cost(self.plant, replayed, flown.states)
 
 
@@ -172,7 +167,7 @@ def exact_optimum(
         state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
 
         def cost() -> Tensor:
-            return control_cost(unseen.plant, rollout(state, exogenous), exogenous).mean()
+            return control_cost(unseen.plant, rollout(state, exogenous)).mean()
 
         return Descent(policy, DescentConfig(optimiser="lbfgs", rate=1.0)).run(cost, iterations).best
 

@@ -9,30 +9,30 @@ from matplotlib.figure import Figure
 from rt_torchrl.figures.style import LIMITS, REAL, TWIN, array, caption, legend_below, panels, time_unit, with_unit
 from rt_torchrl.identification.identification import Identified, Judgement
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.trajectory import Segment
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 def twin_and_log(
     plant: Plant,
     shown: Sequence[int],
-    training: Sequence[Segment],
-    held_out: Sequence[Segment],
+    training: Sequence[Trajectory],
+    held_out: Sequence[Trajectory],
     found: Identified,
 ) -> Figure:
     """Every logged state over time, as logged and as the twin replays it before and after; held-out time is shaded.
 
     The notes are the root mean square errors on what was held out.
     """
-    unit, length = time_unit(held_out[-1].start + plant.dt * len(held_out[-1].record.actions) - training[0].start)
+    unit, length = time_unit(held_out[-1].start + plant.dt * len(held_out[-1].actions) - training[0].start)
     figure, axes = panels(len(shown), title="Twin and log", size=(9.0, 1.2 + 2.2 * len(shown)), sharex=True)
     for ax, k in zip(axes.flat, shown, strict=True):
         parts = ((training, found.training), (held_out, found.held_out))
         for segments, (before, after) in parts:
             _draw(ax, plant, k, segments, before, after, length)
         for segment in held_out:
-            ends = segment.start, segment.start + plant.dt * len(segment.record.actions)
+            ends = segment.start, segment.start + plant.dt * len(segment.actions)
             ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
-        log = np.concatenate([array(s.record.states[:, k]) for s in (*training, *held_out)])
+        log = np.concatenate([array(s.states[:, k]) for s in (*training, *held_out)])
         margin = 0.1 * np.ptp(log) or 1.0
         # A twin that is far off before must not flatten what is compared.
         ax.set_ylim(log.min() - margin, log.max() + margin)
@@ -67,13 +67,13 @@ def _draw(
     ax: Axes,
     plant: Plant,
     k: int,
-    segments: Sequence[Segment],
+    segments: Sequence[Trajectory],
     before: Judgement,
     after: Judgement,
     length: float,
 ) -> None:
     for segment, first, last in zip(segments, before.states, after.states, strict=True):
-        time = (segment.start + plant.dt * np.arange(len(segment.record.states))) / length
-        ax.plot(time, array(segment.record.states[:, k]), color=REAL, linewidth=1.4, label="log")
+        time = (segment.start + plant.dt * np.arange(len(segment.states))) / length
+        ax.plot(time, array(segment.states[:, k]), color=REAL, linewidth=1.4, label="log")
         ax.plot(time, array(first[:, k]), color=LIMITS, linewidth=1.0, linestyle=":", label="twin before")
         ax.plot(time, array(last[:, k]), color=TWIN, linewidth=1.0, label="twin after")

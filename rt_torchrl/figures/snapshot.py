@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.trajectory import Record
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.switching import Role
 
@@ -37,7 +37,7 @@ class Snapshot:
     initial_closure: nn.Module
     policies: dict[Role, nn.Module]
     live: Role
-    record: Record
+    record: Trajectory
     replay: Float[Tensor, "samples n_s"]
     large_scale: Float[Tensor, "n n_z"] | None
     realisations: Float[Tensor, "k n n_z"] | None

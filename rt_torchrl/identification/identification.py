@@ -16,7 +16,7 @@ from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.sensitivity import Sensitivities
-from rt_torchrl.trajectories.trajectory import Segment
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 Optimiser = Literal["levenberg_marquardt", "adam", "lbfgs"]
@@ -96,7 +96,7 @@ class Identification:
         self.free = tuple(free) if config.initial == "estimated" else ()
         self._sensitivities = Sensitivities(plant, closure, compiled_step=compiled)
 
-    def run(self, training: Sequence[Segment], held_out: Sequence[Segment]) -> Identified:
+    def run(self, training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> Identified:
         """Train on some segments and judge on others; the initial states of both are treated the same way.
 
         Raises:
@@ -115,24 +115,24 @@ class Identification:
         autocorrelation = lag_one(training, after[0].states)
         return Identified(weights, *zip(before, after, strict=True), autocorrelation, done)
 
-    def judge(self, segments: Sequence[Segment]) -> Judgement:
+    def judge(self, segments: Sequence[Trajectory]) -> Judgement:
         """The twin with its present weights, from the initial states that suit it best, or from the measured ones."""
         plant = self.twin.plant
         misfit = self._misfit(segments, self.free, weights=False)
         if self.free:
             misfit.fit_initial_states()
         states = [replayed.states for replayed in misfit.replays()]
-        measured = [segment.record.states for segment in segments]
+        measured = [segment.states for segment in segments]
         J_p = sum(plant.dt * plant.discrepancy(s, m).sum().item() for s, m in zip(states, measured, strict=True))
         error = torch.cat(states) - torch.cat(measured)
         seconds = plant.dt * sum(len(m) for m in measured)
         return Judgement(J_p, seconds, (error**2).mean(0).sqrt(), states)
 
-    def _misfit(self, segments: Sequence[Segment], free: Sequence[int], *, weights: bool = True) -> Misfit:
+    def _misfit(self, segments: Sequence[Trajectory], free: Sequence[int], *, weights: bool = True) -> Misfit:
         initial = InitialStates.estimated(self.twin, segments, free, self._sensitivities)
         return Misfit(self.twin, segments, initial, weights=weights, sensitivities=self._sensitivities)
 
-    def _train(self, segments: Sequence[Segment]) -> tuple[Misfit, int]:
+    def _train(self, segments: Sequence[Trajectory]) -> tuple[Misfit, int]:
         """The misfit at its minimum, and the trial steps taken; both ways where initial states are unknown."""
         closure = self.twin.closure
         start = copy.deepcopy(closure.state_dict())
@@ -170,20 +170,20 @@ def coefficients(closure: nn.Module) -> dict[str, float]:
     return {name: value.item() for name, value in named_values(closure).items()}
 
 
-def lag_one(segments: Sequence[Segment], states: Sequence[Tensor]) -> Float[Tensor, " n_s"]:
+def lag_one(segments: Sequence[Trajectory], states: Sequence[Tensor]) -> Float[Tensor, " n_s"]:
     """Correlation of the residuals of neighbouring samples; nan for a state without residuals."""
-    residuals = [s - segment.record.states for s, segment in zip(states, segments, strict=True)]
+    residuals = [s - segment.states for s, segment in zip(states, segments, strict=True)]
     products = sum((r[1:] * r[:-1]).sum(0) for r in residuals)
     return products / sum((r**2).sum(0) for r in residuals)
 
 
-def held_back(plant: Plant, segments: Sequence[Segment]) -> dict[str, float]:
+def held_back(plant: Plant, segments: Sequence[Trajectory]) -> dict[str, float]:
     """Share of the control intervals in which the plant's actuators would not have applied the logged action.
 
     The twin is then driven by what they allow: a sign of wrong rate limits, units or columns.
     """
     found = []
-    for _, record in segments:
-        allowed = plant.actuate(record.states[:-1], record.actions)
-        found.append((allowed - record.actions).abs() > 1e-6 * record.actions.abs().amax(0).clamp_min(1e-12))
+    for segment in segments:
+        allowed = plant.actuate(segment.states[:-1], segment.actions)
+        found.append((allowed - segment.actions).abs() > 1e-6 * segment.actions.abs().amax(0).clamp_min(1e-12))
     return dict(zip((a.name for a in plant.actions), torch.cat(found).double().mean(0).tolist(), strict=True))

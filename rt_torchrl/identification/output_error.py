@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.sensitivity import Sensitivities
-from rt_torchrl.trajectories.trajectory import Segment, require_finite
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 NOISE_TOLERANCE = 1e-8
@@ -36,9 +37,9 @@ class InitialStates(nn.Module):
         scale: unit of the offsets, by state; about the noise, so that a step of one is neither long nor short.
     """
 
-    def __init__(self, segments: Sequence[Segment], free: Sequence[int], scale: Float[Tensor, " n_s"]):
+    def __init__(self, segments: Sequence[Trajectory], free: Sequence[int], scale: Float[Tensor, " n_s"]):
         super().__init__()
-        self.register_buffer("measured", torch.stack([segment.record.states[0] for segment in segments]))
+        self.register_buffer("measured", torch.stack([segment.states[0] for segment in segments]))
         self.register_buffer("unit", torch.diag(scale)[list(free)])
         self.free = tuple(free)
         self.offsets = nn.Parameter(scale.new_zeros(len(segments), len(self.free)))
@@ -47,19 +48,19 @@ class InitialStates(nn.Module):
         return self.measured + self.offsets @ self.unit
 
     @classmethod
-    def as_measured(cls, segments: Sequence[Segment]) -> "InitialStates":
+    def as_measured(cls, segments: Sequence[Trajectory]) -> "InitialStates":
         """Without offsets."""
-        return cls(segments, (), torch.ones_like(segments[0].record.states[0]))
+        return cls(segments, (), torch.ones_like(segments[0].states[0]))
 
     @classmethod
     def estimated(
-        cls, twin: DigitalTwin, segments: Sequence[Segment], free: Sequence[int], sensitivities: Sensitivities
+        cls, twin: DigitalTwin, segments: Sequence[Trajectory], free: Sequence[int], sensitivities: Sensitivities
     ) -> "InitialStates":
         """Offsets in units of the twin's present residual, so that no step leaves what the sensors allow by much."""
         if not free:
             return cls.as_measured(segments)
         fixed = Misfit(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
-        measured = torch.cat([segment.record.states for segment in segments])
+        measured = torch.cat([segment.states for segment in segments])
         residual = (torch.cat([replayed.states for replayed in fixed.replays()]) - measured).square().mean(0).sqrt()
         # A residual of zero would leave no unit to measure an offset in.
         return cls(segments, free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
@@ -93,7 +94,7 @@ class Misfit:
     def __init__(
         self,
         twin: DigitalTwin,
-        segments: Sequence[Segment],
+        segments: Sequence[Trajectory],
         initial: InitialStates,
         *,
         weights: bool = True,
@@ -112,9 +113,9 @@ class Misfit:
     def cost(self) -> Tensor:
         """J_p, differentiable by the adjoint of the twin's engine."""
         total = 0.0
-        for (start, record), first in zip(self.segments, self.initial(), strict=True):
-            flown = self.twin.replay(first[None], record.exogenous[None], record.actions[None], start=start)
-            total = total + self.plant.dt * self.plant.discrepancy(flown.states[0], record.states).sum()
+        for (states, actions, exogenous, start), first in zip(self.segments, self.initial(), strict=True):
+            flown = self.twin.replay(first[None], exogenous[None], actions[None], start=start)
+            total = total + self.plant.dt * self.plant.discrepancy(flown.states[0], states).sum()
         return total
 
     @torch.no_grad()
@@ -126,17 +127,15 @@ class Misfit:
         """
         return [self._replay(*numbered) for numbered in enumerate(zip(self.segments, self.initial(), strict=True))]
 
-    def _replay(self, number: int, given: tuple[Segment, Tensor]) -> Replayed:
-        (start, record), first = given
-        ends, S = self._sensitivities(
-            first[None], record.exogenous[None], record.actions[None], start=start, initial=True
-        )
+    def _replay(self, number: int, given: tuple[Trajectory, Tensor]) -> Replayed:
+        (measured, actions, exogenous, start), first = given
+        ends, S = self._sensitivities(first[None], exogenous[None], actions[None], start=start, initial=True)
         require_finite(self.plant, ends[0, :, None], first[None], [self.twin.closure], start=start, remedy=REMEDY)
         states = torch.cat([first[None], ends[0]])
         at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
         S = torch.cat([at_start[None], S[0]])
         by_initial = S[..., self.weight_count :] @ self.initial.unit.T
-        g, H = discrepancy_derivatives(self.plant, states[None], record.states[None])
+        g, H = discrepancy_derivatives(self.plant, states[None], measured[None])
         return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
 
     @torch.no_grad()
@@ -147,7 +146,7 @@ class Misfit:
         cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
         for replayed, segment in zip(replays or self.replays(), self.segments, strict=True):
             S, i = replayed.sensitivity, replayed.index
-            cost = cost + dt * self.plant.discrepancy(replayed.states, segment.record.states).sum()
+            cost = cost + dt * self.plant.discrepancy(replayed.states, segment.states).sum()
             gradient[i] += dt * torch.einsum("ki,kiw->w", replayed.gradient, S)
             matrix[i[:, None], i] += dt * torch.einsum("kiv,kiw->vw", S, replayed.curvature @ S)
         return NormalEquations(cost, gradient, matrix)

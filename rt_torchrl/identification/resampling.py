@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from rt_torchrl.identification.sensor_log import Log, logged_states
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.trajectory import Record, Segment
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 GAP_INTERVALS = 3.0
 """Sampling intervals after which a pause counts as a gap, unless a limit is stated."""
@@ -25,7 +25,7 @@ ROUNDING = 1e-6
 class Resampled(NamedTuple):
     """Segments of a log, in order, and what became of the rest; times in s."""
 
-    segments: list[Segment]
+    segments: list[Trajectory]
     interval: float  # median sampling interval
     jitter: float  # standard deviation of the intervals within the segments, over their median
     gap: float  # limit that was used
@@ -73,7 +73,7 @@ def resample(log: Log, plant: Plant, *, gap: float | None = None, shortest: int 
     return Resampled(segments, interval, float(within.std() / interval), float(limit), gaps, too_short)
 
 
-def hold_out(segments: Sequence[Segment], dt: float, share: float, *, shortest: int = 10) -> tuple[list, list]:
+def hold_out(segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10) -> tuple[list, list]:
     """Segments to train on and, last in time, segments to judge by; the one in which the cut falls is divided.
 
     Args:
@@ -87,17 +87,17 @@ def hold_out(segments: Sequence[Segment], dt: float, share: float, *, shortest: 
     """
     if not 0.0 < share < 1.0:
         raise ValueError(f"held_out={share} must lie between 0 and 1, a share of the log.")
-    total = sum(len(segment.record.actions) for segment in segments)
+    total = sum(len(segment.actions) for segment in segments)
     wanted = total - round(share * total)  # intervals to train on
     training, held_out, seen = [], [], 0
     for segment in segments:
-        n = len(segment.record.actions)
+        n = len(segment.actions)
         cut = min(max(wanted - seen, 0), n)
         cut = 0 if cut < shortest else n if n - cut < shortest else cut
         if cut:
-            training.append(_part(segment, 0, cut, dt))
+            training.append(segment.part(0, cut, dt))
         if cut < n:
-            held_out.append(_part(segment, cut, n, dt))
+            held_out.append(segment.part(cut, n, dt))
         seen += n
     if not (training and held_out):
         raise ValueError(
@@ -119,7 +119,7 @@ def _steps(first: float, last: float, dt: float) -> int:
     return int((last - first) / dt + ROUNDING)
 
 
-def _segment(log: Log, rows: slice, steps: int, plant: Plant) -> Segment:
+def _segment(log: Log, rows: slice, steps: int, plant: Plant) -> Trajectory:
     times = log.times[rows]
     grid = times[0] + plant.dt * np.arange(steps + 1)
 
@@ -133,10 +133,4 @@ def _segment(log: Log, rows: slice, steps: int, plant: Plant) -> Segment:
         if state.name in log.columns
     }
     states = plant.complete_states(measured, exogenous, actions)
-    return Segment(float(times[0]), Record(states, exogenous, actions))
-
-
-def _part(segment: Segment, first: int, last: int, dt: float) -> Segment:
-    states, exogenous, actions = segment.record
-    record = Record(states[first : last + 1], exogenous[first:last], actions[first:last])
-    return Segment(segment.start + first * dt, record)
+    return Trajectory(states, actions, exogenous, float(times[0]))

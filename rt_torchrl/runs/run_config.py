@@ -12,7 +12,7 @@ from torch import nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
-from rt_torchrl.trajectories.trajectory import Engine
+from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.algorithm import TwinningConfig
 from rt_torchrl.twinning.switching import Role
 

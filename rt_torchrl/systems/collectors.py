@@ -14,7 +14,7 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.engines.compilation import compiled_if
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
-from rt_torchrl.trajectories.trajectory import drive_of, require_finite
+from rt_torchrl.trajectories.rollout import drive_of, require_finite
 
 
 class ExploringInterval(Interval):

@@ -21,7 +21,7 @@ from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dyna
 from rt_torchrl.trajectories.engines.interval import Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise, linearise_by_rows, over_all
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan, march_by_step
-from rt_torchrl.trajectories.trajectory import drive_of
+from rt_torchrl.trajectories.rollout import drive_of
 
 WIDE = 4
 """Weights for each state from which on a reverse-mode product for each state is quicker than one for each weight."""

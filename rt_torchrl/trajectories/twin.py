@@ -6,8 +6,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.rollout import Engine, Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
-from rt_torchrl.trajectories.trajectory import Engine, Rollout, Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 
 class DigitalTwin:
@@ -18,7 +19,7 @@ class DigitalTwin:
     Args:
         plant: shared with the real system in simulation; its own closure is never used here.
         closure: the learned closure g(·; w_p).
-        engine: gradient engine, see :mod:`rt_torchrl.trajectories.trajectory`.
+        engine: gradient engine, see :mod:`rt_torchrl.trajectories.rollout`.
         compiled: compile the engine.
     """
 
@@ -60,7 +61,7 @@ class DigitalTwin:
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
-        return control_cost(self.plant, self.control(policy, initial_state, exogenous), exogenous).mean()
+        return control_cost(self.plant, self.control(policy, initial_state, exogenous)).mean()
 
 
 def constant(module: nn.Module) -> nn.Module:

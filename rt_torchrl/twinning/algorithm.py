@@ -19,13 +19,14 @@ from torchrl.envs import EnvBase
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.trajectory import DivergenceError, Record
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig, same_architecture
 from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.twinning.memory import LongTermMemory, LongTermMemoryConfig, ShortTermMemory
-from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig, VirtualEpisodes
+from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig
 from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
 from rt_torchrl.twinning.switching import PolicySwitch, Role, SwitchConfig
 
@@ -137,7 +138,7 @@ class ReinforcementTwinning:
         transitions = self.model_free.transitions(episode)
         self.long_term.store(transitions, self.model_free.td_errors(transitions))
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
-        self.short_term.append(Record(states, episode["exogenous"], episode["action"]))
+        self.short_term.append(Trajectory(states, episode["action"], episode["exogenous"]))
         reward = episode["next", "reward"].mean()
         return findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
 
@@ -197,7 +198,7 @@ class ReinforcementTwinning:
             plan_accepted=float(accepted),
         )
 
-    def draw_virtual_episodes(self, count: int) -> VirtualEpisodes:
+    def draw_virtual_episodes(self, count: int) -> Scenario:
         """Random initial states, and exogenous inputs from the processes of the episodes so far.
 
         Note: the paper plans from the initial state and with the disturbances of the last episode alone; here from
@@ -205,7 +206,7 @@ class ReinforcementTwinning:
         lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in one wind of twenty.
         """
         initial_state = self.twin.plant.draw_initial_state(count, self.generator)
-        return VirtualEpisodes(initial_state, sample_experience(self.processes, count, self.generator))
+        return Scenario(initial_state, sample_experience(self.processes, count, self.generator))
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
@@ -220,11 +221,11 @@ class ReinforcementTwinning:
         report.set_non_tensor("event", event)
         return report.update(self.clone(costs, judged_on)) if event == "clone" else report
 
-    def virtual_costs(self, episodes: VirtualEpisodes) -> dict[Role, Tensor]:
+    def virtual_costs(self, episodes: Scenario) -> dict[Role, Tensor]:
         """Mean J_a of each policy over virtual episodes."""
         return {role: self.twin.cost(policy, *episodes) for role, policy in self.policies.items()}
 
-    def clone(self, costs: dict[Role, Tensor], judged_on: VirtualEpisodes) -> TensorDict:
+    def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
         """The live policy into the idle one: a copy of its weights, or a distillation into another architecture.
 
         Args:

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -20,7 +19,7 @@ from rt_torchrl.identification.output_error import (
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.closures import BoundedPerceptron
-from rt_torchrl.trajectories.trajectory import Record, Segment, identification_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
 
@@ -75,29 +74,6 @@ class AssimilationConfig:
             )
 
 
-class Replay(NamedTuple):
-    """What the twin replays: inputs, measured states and actions, and the times of the first states [s]."""
-
-    exogenous: Float[Tensor, "batch n n_z"]
-    measured: Float[Tensor, "batch n+1 n_s"]
-    actions: Float[Tensor, "batch n n_a"]
-    start: float | Float[Tensor, " batch"] = 0.0
-
-    def cut(self, segment: int, dt: float) -> "Replay":
-        """In segments of that many intervals of length ``dt``, in the order of time; what is left over is dropped."""
-        exogenous, measured, actions, _ = self
-        batch, whole = len(exogenous), exogenous.shape[1] // segment
-        n = whole * segment
-        starts = torch.stack([measured[:, k * segment : (k + 1) * segment + 1] for k in range(whole)], 1)
-        time = dt * segment * torch.arange(whole, dtype=torch.float64, device=exogenous.device)
-        return Replay(
-            exogenous[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
-            starts.flatten(0, 1),
-            actions[:, :n].unflatten(1, (whole, segment)).flatten(0, 1),
-            time.repeat(batch),
-        )
-
-
 class Assimilation:
     r"""Minimises :math:`J_p = \mathbb E\int L_p(s, \check s)\,dt` over the closure's weights (paper, eq. J_p).
 
@@ -124,7 +100,11 @@ class Assimilation:
         self._stiffness = self._prior_stiffness()
 
     def update(
-        self, records: Sequence[Record], processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
+        self,
+        records: Sequence[Trajectory],
+        processes: Sequence[ExogenousProcess],
+        count: int,
+        generator: torch.Generator,
     ) -> Descended:
         """One episode's gradient steps; reported is J_p of the whole records, without the prior.
 
@@ -140,16 +120,16 @@ class Assimilation:
             exogenous = torch.cat([process.sample(count, generator) for process in processes])
         measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
         actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
-        whole = Replay(exogenous, measured, actions)
+        whole = Trajectory(measured, actions, exogenous)
         if not self.config.segment:
             return self._descend(whole)
         before = self._cost_of(whole)
-        found = self._descend(whole.cut(self.config.segment, self.twin.plant.dt))
+        found = self._descend(whole.segments(self.config.segment, self.twin.plant.dt))
         return found._replace(start=before, best=self._cost_of(whole))
 
-    def _descend(self, replayed: Replay) -> Descended:
+    def _descend(self, replayed: Trajectory) -> Descended:
         def equations() -> NormalEquations:
-            return self._with_prior(self.normal_equations(*replayed))
+            return self._with_prior(self.normal_equations(replayed))
 
         def cost() -> Tensor:
             return self._identification_cost(replayed) + self._prior_cost()
@@ -165,30 +145,26 @@ class Assimilation:
         found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
         return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
 
-    def _identification_cost(self, replayed: Replay) -> Tensor:
-        exogenous, measured, actions, start = replayed
+    def _identification_cost(self, replayed: Trajectory) -> Tensor:
+        measured, actions, exogenous, start = replayed
         flown = self.twin.replay(measured[:, 0], exogenous, actions, start=start)
         return identification_cost(self.twin.plant, flown, measured).mean()
 
     @torch.no_grad()
-    def _cost_of(self, whole: Replay) -> float:
+    def _cost_of(self, whole: Trajectory) -> float:
         """J_p of whole records; infinite where a closure that was found on their segments diverges."""
         try:
             if self.config.initial == "measured":
                 return self._identification_cost(whole).item()
             misfit = self._misfit(whole, weights=False)
             misfit.fit_initial_states()
-            return misfit.normal_equations().cost.item() / len(whole.measured)
+            return misfit.normal_equations().cost.item() / len(whole.states)
         except FloatingPointError:
             return float("inf")
 
-    def _misfit(self, replayed: Replay, *, weights: bool = True) -> Misfit:
+    def _misfit(self, replayed: Trajectory, *, weights: bool = True) -> Misfit:
         """J_p with unknown first states."""
-        exogenous, measured, actions, start = replayed
-        starts = torch.as_tensor(start, dtype=torch.float64).expand(len(measured)).tolist()
-        records = map(Record, measured, exogenous, actions)
-        segments = [Segment(*pair) for pair in zip(starts, records, strict=True)]
-        twin = self.twin
+        segments, measured, twin = replayed.each(), replayed.states, self.twin
         free = compared(discrepancy_derivatives(twin.plant, measured, measured)[1]).nonzero().flatten().tolist()
         initial = InitialStates.estimated(twin, segments, free, twin.sensitivities)
         return Misfit(twin, segments, initial, weights=weights)
@@ -220,14 +196,9 @@ class Assimilation:
         matrix = found.matrix + torch.diag(pad(self._stiffness, (0, n)))
         return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
 
-    def normal_equations(
-        self,
-        exogenous: Float[Tensor, "batch n n_z"],
-        measured: Float[Tensor, "batch samples n_s"],
-        actions: Float[Tensor, "batch n n_a"],
-        start: float | Float[Tensor, " batch"] = 0.0,
-    ) -> NormalEquations:
+    def normal_equations(self, replayed: Trajectory) -> NormalEquations:
         """J_p, its gradient and its Gauss-Newton matrix with respect to the closure's weights."""
+        measured, actions, exogenous, start = replayed
         states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions, start=start)
         plant, target = self.twin.plant, measured[:, 1:]
         share = plant.dt / len(measured)

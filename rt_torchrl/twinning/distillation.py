@@ -22,8 +22,8 @@ from torchrl.objectives import BCLoss
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.model_based import VirtualEpisodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +77,8 @@ class Distillation:
         idle: nn.Module,
         *,
         seen: Float[Tensor, "n n_o"],
-        draw: Callable[[], VirtualEpisodes],
-        judged_on: VirtualEpisodes,
+        draw: Callable[[], Scenario],
+        judged_on: Scenario,
         to_beat: float,
     ) -> Distilled:
         """Train ``idle`` in place; it keeps its weights if the clone would be worse than it is.
@@ -105,7 +105,7 @@ class Distillation:
         return Distilled(error, cost, accepted)
 
     @torch.no_grad()
-    def _observed(self, policy: nn.Module, episodes: VirtualEpisodes) -> Float[Tensor, "n n_o"]:
+    def _observed(self, policy: nn.Module, episodes: Scenario) -> Float[Tensor, "n n_o"]:
         plant, exogenous = self.twin.plant, episodes.exogenous
         flown = self.twin.control(policy, *episodes)
         t = plant.dt * torch.arange(exogenous.shape[1], dtype=torch.float64, device=exogenous.device)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
+from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.short_horizon import ShortHorizon, ShortHorizonConfig
 
@@ -41,13 +41,6 @@ class ModelBasedConfig:
             raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")
 
 
-class VirtualEpisodes(NamedTuple):
-    """Initial states and exogenous inputs to fly on the twin."""
-
-    initial_state: Float[Tensor, "batch n_s"]
-    exogenous: Float[Tensor, "batch n n_z"]
-
-
 class Plan(NamedTuple):
     """What the gradient steps found, and whether it was kept."""
 
@@ -77,7 +70,7 @@ class ModelBased:
         """Forget the state of the optimiser, because the policy's weights have jumped."""
         self.descent.restart()
 
-    def update(self, planned_on: VirtualEpisodes, judged_on: VirtualEpisodes) -> Plan:
+    def update(self, planned_on: Scenario, judged_on: Scenario) -> Plan:
         """One episode's gradient steps; the new plan is kept only if it is better on episodes it was not made on.
 
         Note: the paper keeps every plan; here a plan made on N_z winds is compared with the one before on N others,
@@ -95,7 +88,7 @@ class ModelBased:
                 self.restart()
         return Plan(descended, accepted)
 
-    def _descend(self, planned_on: VirtualEpisodes) -> Descended:
+    def _descend(self, planned_on: Scenario) -> Descended:
         if isinstance(self.descent, Descent):
             return self.descent.run(lambda: self._cost(planned_on), self.config.iterations)
         with torch.no_grad():
@@ -106,5 +99,5 @@ class ModelBased:
             end = self._cost(planned_on).item()
         return Descended(start, end, gradients[0] if gradients else float("nan"), len(gradients))
 
-    def _cost(self, episodes: VirtualEpisodes) -> Tensor:
+    def _cost(self, episodes: Scenario) -> Tensor:
         return self.twin.cost(self.policy, *episodes)

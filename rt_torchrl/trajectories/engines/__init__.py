@@ -1,4 +1,4 @@
-"""Three gradient engines for one trajectory: see :mod:`rt_torchrl.trajectories.trajectory`."""
+"""Three gradient engines for one trajectory: see :mod:`rt_torchrl.trajectories.rollout`."""
 
 from rt_torchrl.trajectories.engines.backpropagation import Backpropagation
 from rt_torchrl.trajectories.engines.continuous_adjoint import ContinuousAdjoint

@@ -1,0 +1,187 @@
+r"""Trajectories :math:`s_{k+1} = \Phi(s_k, x_k; w)` and their gradients, by three engines behind one call.
+
+=================  ==================================================  ======================================
+engine             gradient                                            for
+=================  ==================================================  ======================================
+``parallel``       exact discrete adjoint, parallel over time          training
+``odeint_adjoint`` continuous adjoint by torchdiffeq, order of the dt  reference, the paper's method
+``autograd``       backpropagation through every step, exact           short horizons, double-checking
+=================  ==================================================  ======================================
+"""
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.engines import Backpropagation, ContinuousAdjoint, ParallelAdjoint
+from rt_torchrl.trajectories.engines.compilation import marked_dynamic, plain
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+Engine = Literal["parallel", "odeint_adjoint", "autograd"]
+ENGINES = {"parallel": ParallelAdjoint, "odeint_adjoint": ContinuousAdjoint, "autograd": Backpropagation}
+
+
+class DivergenceError(FloatingPointError):
+    """A trajectory left the finite numbers."""
+
+
+class Rollout:
+    """Rolls a plant out under a closure, with held commands from a record or with a policy in the loop.
+
+    Args:
+        plant: the physics.
+        closure: the plant's own closure for the real system, a learned one for its twin.
+        policy: acts on the observation at each interval; None if commands are given at each call.
+        engine: how gradients with respect to the weights, the initial state and the drive are computed.
+        compiled: compile with torch.compile; eager is quicker for short horizons.
+
+    Raises:
+        ValueError: if the engine does not exist, does not know the plant's own scheme, or a module is not in double
+            precision.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        closure: nn.Module,
+        policy: nn.Module | None = None,
+        *,
+        engine: Engine = "parallel",
+        compiled: bool = False,
+    ):
+        if engine not in ENGINES:
+            raise ValueError(f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}.")
+        if engine == "odeint_adjoint" and plant.own_scheme:
+            raise ValueError(
+                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} steps by a scheme of "
+                "its own; use parallel or autograd."
+            )
+        for role, module in (("closure", closure), ("policy", policy)):
+            require_double(role, module)
+        self.plant = plant
+        self.interval = Interval(plant, closure, policy)
+        self._engine = ENGINES[engine](compiled=compiled)
+
+    def __call__(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        command: Float[Tensor, "batch n n_a"] | None = None,
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
+    ) -> Trajectory:
+        """The trajectory of ``n`` intervals.
+
+        Args:
+            initial_state: s_0 of each realisation.
+            exogenous: z, held over each interval.
+            command: actions from a record; None with a policy.
+            start: time of s_0 [s], one for all realisations or one for each; ``odeint_adjoint`` takes only the former.
+
+        Raises:
+            ValueError: if shapes do not fit the plant and each other, commands are given beside a policy, or the engine
+                does not take a start for each realisation.
+            DivergenceError: if a state is not finite; says which plant, realisation, time and state.
+        """
+        self._validate(initial_state, exogenous, command)
+        if isinstance(start, Tensor) and isinstance(self._engine, ContinuousAdjoint):
+            raise ValueError(
+                "engine='odeint_adjoint' integrates all realisations over the same span and takes no start for each; "
+                "use parallel or autograd, or whole records (segment=0)."
+            )
+        drive = drive_of(self.plant, exogenous, command, start=start)
+        ends = self._engine.end_states(self.interval, marked_dynamic(plain(initial_state), 0), drive)
+        require_finite(self.plant, ends, initial_state, [self.interval.closure, self.interval.policy], start=start)
+        states = torch.cat([initial_state.unsqueeze(0), ends])
+        # A function of the states, so that every engine differentiates the actions the same way.
+        applied = self.plant.actuate(states[:-1], self.interval.command(states[:-1], drive))
+        return Trajectory(states.transpose(0, 1), applied.transpose(0, 1), exogenous, start)
+
+    def _validate(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None) -> None:
+        plant, batch, n = self.plant, initial_state.shape[0], exogenous.shape[1] if exogenous.ndim == 3 else -1
+        expected = {
+            "initial_state": (initial_state, (batch, len(plant.states))),
+            "exogenous": (exogenous, (batch, n, len(plant.inputs))),
+        }
+        if (command is None) == (self.interval.policy is None):
+            raise ValueError(
+                f"plant {plant.name!r} is rolled out "
+                + ("without a policy: pass command." if command is None else "with a policy: pass no command.")
+            )
+        if command is not None:
+            expected["command"] = (command, (batch, n, len(plant.actions)))
+        for argument, (value, shape) in expected.items():
+            if tuple(value.shape) != shape or value.dtype != torch.float64:
+                raise ValueError(
+                    f"{argument} has shape {tuple(value.shape)} and dtype {value.dtype}; plant {plant.name!r} "
+                    f"needs shape {shape} (batch, steps, signals) in torch.float64."
+                )
+            if not value.isfinite().all():
+                raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
+
+
+def require_finite(
+    plant: Plant,
+    ends: Float[Tensor, "n batch n_s"],
+    initial_state: Float[Tensor, "batch n_s"],
+    modules: Sequence[nn.Module | None],
+    *,
+    start: float | Float[Tensor, " batch"] = 0.0,
+    remedy: str = "Use a smaller dt, or weights nearer to ones that are known to work.",
+) -> None:
+    """Refuse a trajectory that has left the finite numbers.
+
+    Args:
+        plant: the physics.
+        ends: states at the end of every interval.
+        initial_state: s_0.
+        modules: closure and policy it was computed with, for the message.
+        start: time of s_0 [s], one for all or one for each realisation.
+        remedy: what the user can do, for the message.
+
+    Raises:
+        DivergenceError: with plant, realisation, time and the last state that was finite.
+    """
+    if ends.isfinite().all():
+        return
+    k, realisation, component = (~ends.isfinite()).nonzero()[0].tolist()
+    began = float(start[realisation]) if isinstance(start, Tensor) else start
+    last = (ends[k - 1] if k else initial_state)[realisation].tolist()
+    weights = [type(module).__name__ for module in modules if module is not None]
+    raise DivergenceError(
+        f"plant {plant.name!r} diverged in realisation {realisation} at t = {began + (k + 1) * plant.dt:g} s: "
+        f"{plant.states[component].name} is not finite; the state before was {last}, the weights those of "
+        f"{' and '.join(weights)}. {remedy}"
+    )
+
+
+def drive_of(
+    plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Float[Tensor, " batch"] = 0.0
+) -> Drive:
+    """The drive, time first, of inputs and commands that come batch first; ``start`` as in :class:`Rollout`."""
+    batch, n = exogenous.shape[:2]
+    t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
+    commands = exogenous.new_empty(n, batch, 0) if command is None else plain(command.transpose(0, 1))
+    drive = Drive(t, plain(exogenous.transpose(0, 1)), commands)
+    for tensor in drive if isinstance(start, Tensor) else drive[1:]:
+        marked_dynamic(tensor, 1)  # one compiled graph for all batch sizes
+    return drive
+
+
+def require_double(role: str, module: nn.Module | None) -> None:
+    """Refuse modules that would mix single with double precision.
+
+    Raises:
+        ValueError: naming the first parameter that is not float64.
+    """
+    for name, weight in module.named_parameters() if module is not None else ():
+        if weight.dtype != torch.float64:
+            raise ValueError(
+                f"{role} {type(module).__name__} has {name} in {weight.dtype}; trajectories are integrated in "
+                f"torch.float64. Call {role}.double()."
+            )
