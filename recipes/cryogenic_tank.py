@@ -16,19 +16,19 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.run import Run, main_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.algorithm import TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.switching import SwitchConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.referees import RefereeConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.
     # The pressure moves over days: noise that lasts a period of the load, returns over 17 h and a discount over 42 h.
     realisations=1,
     exploration=ExplorationConfig(correlation_time=5400.0),
-    model_free=ModelFreeConfig(
+    learner=LearnerConfig(
         critic_iterations=1000,
         actor_iterations=1000,
         discount=0.9998,
@@ -41,8 +41,8 @@ PAPER = TwinningConfig(
     # Ten per cent of U_HX move the pressure by 50 Pa, another draw of the load's noise by 200 Pa.
     assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
     # Starting pressures differ by 25 kPa: a plan for one of them is not one for the others.
-    model_based=ModelBasedConfig(iterations=5, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-    switch=SwitchConfig(patience=4, clone_patience=20),
+    planner=PlannerConfig(iterations=5, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    referee=RefereeConfig(patience=4, clone_patience=20),
 )
 NEURAL = dataclasses.replace(
     PAPER,

@@ -13,19 +13,19 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.run import Run, main_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.algorithm import TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.switching import SwitchConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.referees import RefereeConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T2; N_z, T_J and T_w are the library's defaults.
     # A flight is decided over seconds and moved by whole wing beats: noise that lasts a beat, returns over half a
     # second and a discount over one. With the paper's 0.998 and targets of one interval the policy flies off.
     exploration=ExplorationConfig(correlation_time=0.05),
-    model_free=ModelFreeConfig(
+    learner=LearnerConfig(
         critic_iterations=1000,
         actor_iterations=1000,
         discount=0.9995,
@@ -37,8 +37,8 @@ PAPER = TwinningConfig(
     # tube of 2e-4 leave 1e-4 m/s.
     exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
-    model_based=ModelBasedConfig(iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5)),
-    switch=SwitchConfig(patience=4, clone_patience=4),
+    planner=PlannerConfig(iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5)),
+    referee=RefereeConfig(patience=4, clone_patience=4),
 )
 NEURAL = dataclasses.replace(
     PAPER,

@@ -8,21 +8,20 @@ from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.runs.run import Run, main_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.algorithm import TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.short_horizon import ShortHorizonConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 
 SWING_UP = TwinningConfig(
     # Half of the torque's range, for about as long as a swing takes: white noise hardly moves the rod.
     exploration=ExplorationConfig(spread=0.5, correlation_time=0.3),
     # Costs are up to 16; values of the order of ten are within a perceptron's reach.
-    model_free=ModelFreeConfig(reward_scale=0.1, actor_rate=1e-3),
+    learner=LearnerConfig(reward_scale=0.1, actor_rate=1e-3),
     # Ten seconds are some six swings, whose number depends on the length: a whole replay has a minimum for each.
     assimilation=AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
     # Whether a swing reaches the top hangs on a hair: over whole episodes descent stops in the next local minimum.
-    model_based=ModelBasedConfig(iterations=10, realisations=64, short_horizon=ShortHorizonConfig(window=25)),
+    planner=PlannerConfig(iterations=10, realisations=64, short_horizon=ShortHorizonConfig(window=25)),
 )
 
 

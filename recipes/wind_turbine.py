@@ -20,16 +20,16 @@ from rt_torchrl.envs.wind_turbine.wear import worn_table
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.run import Run, main_of
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.twinning.algorithm import TwinningConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.
     # Targets over 5 s: an action of 0.5 s moves a rotor of 16 s too little to tell from the critic's error.
-    model_free=ModelFreeConfig(return_steps=10),
-    model_based=ModelBasedConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    learner=LearnerConfig(return_steps=10),
+    planner=PlannerConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
 )
 NEURAL = dataclasses.replace(
     PAPER,

@@ -1,6 +1,7 @@
 """Reinforcement Twinning: a digital twin and two controllers, trained while the real system runs."""
 
 from rt_torchrl.contract import PlantContractError, check_plant
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import PlantEnv
@@ -8,10 +9,12 @@ from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.config import TwinningConfig
 
 __all__ = [
     "Actuation",
+    "Descended",
     "DigitalTwin",
     "DivergenceError",
     "Plant",

@@ -16,11 +16,12 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.switching import SwitchConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.referees import RefereeConfig
 
 STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "plan", "switch_policies"]
 
@@ -32,9 +33,9 @@ def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
         **{
             "realisations": 2,
             "virtual_episodes": 3,
-            "model_free": ModelFreeConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
+            "learner": LearnerConfig(critic_iterations=3, actor_iterations=2, batch_size=16, critic_hidden=(8,)),
             "assimilation": AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
-            "model_based": ModelBasedConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+            "planner": PlannerConfig(iterations=2, descent=DescentConfig(rate=0.01)),
             **options,
         }
     )
@@ -54,8 +55,8 @@ def weights(module):
 
 def scripted(found, live, idle):
     """Let step 6 see these costs."""
-    costs = {found.switch.live: live, found.switch.idle: idle}
-    found.virtual_costs = lambda episodes: {role: torch.tensor(cost) for role, cost in costs.items()}
+    costs = {found.referee.live: live, found.referee.idle: idle}
+    found.virtual_costs = lambda *arguments: {role: torch.tensor(cost) for role, cost in costs.items()}
 
 
 @pytest.mark.parametrize(
@@ -79,14 +80,14 @@ def test_arms_touch_their_own_half_alone():
     for arm, moved in (("model_free", "model_free"), ("model_based", "model_based")):
         found = twinning(arm=arm)
         before = {role: weights(policy) for role, policy in found.policies.items()}
-        closure, critic = weights(found.twin.closure), weights(found.model_free.critic)
+        closure, critic = weights(found.twin.closure), weights(found.learner.critic)
         for _ in range(2):
             found.episode()
-        assert found.switch.live == arm and found.actor.policy is found.policies[arm]
+        assert found.referee.live == arm and found.actor.policy is found.policies[arm]
         for role, policy in found.policies.items():
             assert torch.equal(before[role], weights(policy)) == (role != moved)
         assert torch.equal(closure, weights(found.twin.closure)) == (arm == "model_free")
-        assert torch.equal(critic, weights(found.model_free.critic)) == (arm == "model_based")
+        assert torch.equal(critic, weights(found.learner.critic)) == (arm == "model_based")
 
 
 def test_what_is_stored_is_what_was_applied():
@@ -98,7 +99,7 @@ def test_what_is_stored_is_what_was_applied():
     found.interact()
     (record,) = found.short_term
     (commands,) = flown[-1]["action"]
-    stored = found.long_term._buffer[:60]
+    stored = found.learner.memory._buffer[:60]
     # The plant latches the applied action into the state at the end of the interval.
     assert torch.equal(record.actions, record.states[1:, 4:])
     assert torch.equal(stored["action"], record.actions)
@@ -118,9 +119,9 @@ def test_the_true_twin_replays_the_record_exactly_under_the_measured_input_only(
 
 
 def test_step_five_may_plan_on_a_number_of_its_own():
-    found, drawn = twinning(model_based=ModelBasedConfig(iterations=1, realisations=7)), []
-    draw = found.draw_virtual_episodes
-    found.draw_virtual_episodes = lambda count: drawn.append(count) or draw(count)
+    found, drawn = twinning(planner=PlannerConfig(iterations=1, realisations=7)), []
+    draw = found.virtual.draw
+    found.virtual.draw = lambda count: drawn.append(count) or draw(count)
     found.episode()
     # Planned on, judged on, compared on.
     assert drawn == [7, 3, 3]
@@ -130,8 +131,8 @@ def test_record_and_transitions_are_those_of_the_episode():
     found = twinning(records=2)
     for _ in range(3):
         report = found.interact()
-    assert len(found.short_term) == 2 and len(found.long_term) == 60
-    record, last = found.short_term[-1], found.long_term._buffer[40:60]
+    assert len(found.short_term) == 2 and len(found.learner.memory) == 60
+    record, last = found.short_term[-1], found.learner.memory._buffer[40:60]
     # On this plant the observation is the state.
     assert torch.equal(last["observation"], record.states[:-1])
     assert torch.equal(last["next", "observation"], record.states[1:])
@@ -142,7 +143,7 @@ def test_record_and_transitions_are_those_of_the_episode():
 
 def test_live_starts_model_free_and_explores_less_and_less():
     found = twinning(arm="model_free", exploration=ExplorationConfig(spread=0.2, episodes=4))
-    assert found.switch.live == "model_free" and found.actor.policy is found.policies["model_free"]
+    assert found.referee.live == "model_free" and found.actor.policy is found.policies["model_free"]
     strengths = [found.episode()["exploration"] for _ in range(6)]
     assert strengths == pytest.approx([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
 
@@ -169,7 +170,7 @@ def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step):
     earlier = weights(found.twin.closure)
     unsound(found, monkeypatch, {1})
     # Compared with an algorithm whose step 4 finds nothing new, and whose planning begins afresh.
-    sound.model_based.restart()
+    sound.planner.restart()
     sound.assimilation.config = dataclasses.replace(sound.assimilation.config, iterations=0)
     if step == "switch_policies":
         for algorithm in (found, sound):
@@ -191,13 +192,63 @@ def test_a_twin_that_diverges_with_the_earlier_closure_too_ends_the_training(mon
         found.episode()
 
 
+def flying(found, monkeypatch, diverging):
+    """Let the twin diverge under the policies of these modules, wherever virtual episodes are flown."""
+    cost = found.twin.cost
+
+    def checked(policy, *episodes):
+        if any(policy is module for module in diverging):
+            raise DivergenceError("plant 'linear_quadratic' diverged")
+        return cost(policy, *episodes)
+
+    monkeypatch.setattr(found.twin, "cost", checked)
+
+
+@pytest.mark.parametrize("live, idle", [("model_free", "model_based"), ("model_based", "model_free")])
+def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch, live, idle):
+    """The closure that was just found stays, the training goes on, and the live policy stays live."""
+    found = twinning(referee=RefereeConfig(patience=0))
+    found.referee.live = live
+    flying(found, monkeypatch, [found.policies[idle]])
+    report = found.episode()
+    assert report["closure_refused"] == 0.0 and found.referee.live == live
+    assert report[f"J_a_{idle}"].isinf() and report[f"J_a_{live}"].isfinite()
+    assert f"{idle} diverges on the twin" in report["reason"]
+    assert report["plan_accepted"] == 0.0 or idle == "model_free"
+
+
+def test_a_plan_that_diverges_is_refused_and_the_policy_before_stays(monkeypatch):
+    found, before = twinning(), {}
+    plan = found.planner.plan
+
+    def wild(episodes):
+        before["weights"] = weights(found.policies["model_based"])
+        descended = plan(episodes)
+        with torch.no_grad():
+            found.policies["model_based"].gain.fill_(1e9)  # finite weights under which the states overflow
+        return descended
+
+    monkeypatch.setattr(found.planner, "plan", wild)
+    report = found.episode()
+    assert report["plan_accepted"] == 0.0 and report["closure_refused"] == 0.0
+    assert torch.equal(weights(found.policies["model_based"]), before["weights"])
+    assert report["J_a_model_based"].isfinite()
+
+
+def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch):
+    found = twinning()
+    monkeypatch.setattr(found.referee, "worse", lambda cost, than: True)
+    report = found.episode()
+    assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
+
+
 def test_swap_changes_who_acts_and_copies_nothing():
-    found = twinning(switch=SwitchConfig(patience=0))
+    found = twinning(referee=RefereeConfig(patience=0))
     found.interact(), found.update_model_free(), found.fit_exogenous()
     before = {role: weights(policy) for role, policy in found.policies.items()}
     scripted(found, live=2.0, idle=1.0)
     assert found.switch_policies()["event"] == "swap"
-    assert found.switch.live == "model_based"
+    assert found.referee.live == "model_based"
     found.interact()
     assert found.actor.policy is found.policies["model_based"]
     assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
@@ -205,21 +256,21 @@ def test_swap_changes_who_acts_and_copies_nothing():
 
 @pytest.mark.parametrize("live", ["model_free", "model_based"])
 def test_clone_copies_the_live_weights_and_restarts_the_idle_optimiser(live):
-    found = twinning(switch=SwitchConfig(clone_patience=0, stall=1e9))
-    found.switch.live = live
+    found = twinning(referee=RefereeConfig(clone_patience=0, stall=1e9))
+    found.referee.live = live
     for step in STEPS[:-1]:
         getattr(found, step)()
     optimisers = {
-        "model_free": lambda: found.model_free.actor_optimiser.state,
-        "model_based": lambda: found.model_based.descent._optimiser.state,
+        "model_free": lambda: found.learner.actor_optimiser.state,
+        "model_based": lambda: found.planner.descent._optimiser.state,
     }
-    idle, before = found.switch.idle, weights(found.policies[live])
+    idle, before = found.referee.idle, weights(found.policies[live])
     assert all(state() for state in optimisers.values())
     assert not torch.equal(weights(found.policies[idle]), before)
     scripted(found, live=1.0, idle=2.0)
     assert found.switch_policies()["event"] == "clone"
     assert torch.equal(weights(found.policies[idle]), before) and torch.equal(weights(found.policies[live]), before)
-    assert found.policies[idle] is not found.policies[live] and found.switch.live == live
+    assert found.policies[idle] is not found.policies[live] and found.referee.live == live
     assert not optimisers[idle]() and optimisers[live]()
 
 
@@ -238,7 +289,7 @@ def test_same_seeds_repeat_and_others_do_not():
         torch.manual_seed(np.random.default_rng().integers(2**31))
         found = twinning(**seeds)
         costs = [found.episode()["real_cost"] for _ in range(3)]
-        modules = [found.twin.closure, *found.policies.values(), found.model_free.critic]
+        modules = [found.twin.closure, *found.policies.values(), found.learner.critic]
         return torch.cat([torch.stack(costs), *map(weights, modules)])
 
     first = run(seed=1, env_seed=1)
@@ -271,7 +322,7 @@ def test_planning_finds_the_optimal_gain():
         closure=LinearClosure(LinearQuadratic.true_closure),
         arm="model_based",
         realisations=8,
-        model_based=ModelBasedConfig(iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+        planner=PlannerConfig(iterations=40, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     )
     found.interact(), found.fit_exogenous()
     report = found.plan()
@@ -289,7 +340,7 @@ def test_virtual_costs_are_from_the_same_draws():
     found.fit_exogenous()
     found.policies["model_based"].load_state_dict(found.policies["model_free"].state_dict())
     with torch.no_grad():
-        first, second = (found.virtual_costs(found.draw_virtual_episodes(4)) for _ in range(2))
+        first, second = (found.virtual_costs(found.virtual.draw(4)) for _ in range(2))
     assert first["model_free"] == first["model_based"] and first["model_free"] != second["model_free"]
 
 

@@ -10,8 +10,14 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.distillation import Distillation, DistillationConfig, ShareOfRange, imitate, same_architecture
-from rt_torchrl.twinning.switching import SwitchConfig
+from rt_torchrl.twinning.distillation import (
+    Distillation,
+    DistillationConfig,
+    ShareOfRange,
+    match_actions,
+    same_architecture,
+)
+from rt_torchrl.twinning.referees import RefereeConfig
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -36,26 +42,25 @@ def draw(count=5, seed=2):
     return Scenario(PLANT.draw_initial_state(count, generator), PLANT.draw_exogenous(count, generator))
 
 
-def distilled(live, idle, *, to_beat, judged_on=None, **options):
+def distilled(live, idle, **options):
     distillation = Distillation(DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), DistillationConfig(**options))
     seen = torch.randn(300, 2, generator=seeded(3), dtype=torch.float64)
-    return distillation.clone(live, idle, seen=seen, draw=draw, judged_on=judged_on or draw(seed=4), to_beat=to_beat)
+    return distillation.imitate(live, idle, seen=seen, draw=draw)
 
 
 def test_a_perceptron_learns_an_affine_law():
     """On observations it has not been shown, and at the cost of the teacher."""
     live, idle = affine([-0.8, -1.1]), perceptron()
     before = weights(live)
-    found = distilled(live, idle, to_beat=torch.inf)
+    found = distilled(live, idle)
     points = torch.randn(500, 2, generator=seeded(5), dtype=torch.float64)
     # By hand, as a share of the range of 4 N: the library's own error is on other points.
     error = ((live(points) - idle(points)) / 4.0).square().mean().sqrt().item()
     # The law is a perceptron of one unit; sixteen of them come within some thousandths of it in 400 gradients.
-    assert found.accepted and found.error < 5e-3 and error < 1e-2, (found, error)
+    assert found < 5e-3 and error < 1e-2, (found, error)
     assert torch.equal(before, weights(live))
     twin = DigitalTwin(PLANT, PLANT.closure)
     costs = [twin.cost(policy, *draw(seed=4)).item() for policy in (live, idle)]
-    assert found.cost == pytest.approx(costs[1], rel=1e-12)
     # J_a is stationary nowhere near this law, so that a difference of the actions of 0.2 % of 4 N shows as such.
     assert costs[1] == pytest.approx(costs[0], rel=1e-2)
 
@@ -66,7 +71,7 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
     with torch.no_grad():
         live.network[-1].weight.mul_(20.0)
     points = torch.randn(400, 2, generator=seeded(8), dtype=torch.float64)
-    error = imitate(PLANT, live, idle, points, 200)
+    error = match_actions(PLANT, live, idle, points, 200)
     teacher = ShareOfRange(PLANT, live)(points)
 
     def loss():
@@ -83,26 +88,18 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
                     weight.view(-1)[k] -= step
 
 
-def test_a_clone_that_is_worse_is_refused_and_leaves_no_trace():
-    live, idle = affine([-0.8, -1.1]), perceptron()
-    before = weights(idle)
-    found = distilled(live, idle, to_beat=0.0, iterations=5, rounds=1)
-    assert not found.accepted and torch.equal(before, weights(idle))
-    assert found.cost > 0.0 and found.error > 0.0
-
-
 def test_what_the_clone_shows_itself_is_added_from_the_second_round_on():
     distillation = Distillation(DigitalTwin(PLANT, PLANT.closure), DistillationConfig(iterations=1, rounds=3))
     live, idle, flown = affine([-0.8, -1.1]), perceptron(), []
     observed = distillation._observed
     distillation._observed = lambda policy, episodes: flown.append(policy) or observed(policy, episodes)
     seen = torch.zeros(1, 2, dtype=torch.float64)
-    distillation.clone(live, idle, seen=seen, draw=draw, judged_on=draw(seed=4), to_beat=torch.inf)
+    distillation.imitate(live, idle, seen=seen, draw=draw)
     assert flown == [live, idle, idle]
 
 
 def two_architectures(**options):
-    found = twinning(PLANT, switch=SwitchConfig(patience=0, clone_patience=0, stall=1e9), **options)
+    found = twinning(PLANT, referee=RefereeConfig(patience=0, clone_patience=0, stall=1e9), **options)
     return ReinforcementTwinning(
         PlantEnv(PLANT, seed=0),
         DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)),
@@ -116,10 +113,10 @@ def two_architectures(**options):
 @pytest.mark.parametrize("live", ["model_free", "model_based"])
 def test_a_clone_event_distils(live):
     found = two_architectures()
-    found.switch.live = live
+    found.referee.live = live
     for step in STEPS[:-1]:
         getattr(found, step)()
-    idle = found.switch.idle
+    idle = found.referee.idle
     costs = {live: torch.tensor(0.0), idle: torch.tensor(1e9)}
     virtual_costs, before = found.virtual_costs, weights(found.policies[live])
     found.virtual_costs = lambda episodes: costs | {live: virtual_costs(episodes)[live]}
@@ -128,13 +125,13 @@ def test_a_clone_event_distils(live):
     assert 0.0 < report["distillation_error"] < 0.05
     # The clone costs what the live policy does, within what an action of 5 % of the range can change.
     assert report["distillation_cost_ratio"] == pytest.approx(1.0, rel=0.1)
-    fresh = found.model_free.actor_optimiser if idle == "model_free" else found.model_based.descent._optimiser
+    fresh = found.learner.actor_optimiser if idle == "model_free" else found.planner.descent._optimiser
     assert not fresh.state
 
 
 def test_a_refused_clone_is_no_event_and_says_why():
     found = two_architectures()
-    found.switch.live = "model_based"
+    found.referee.live = "model_based"
     for step in STEPS[:-1]:
         getattr(found, step)()
     before = {role: weights(policy) for role, policy in found.policies.items()}
@@ -142,7 +139,7 @@ def test_a_refused_clone_is_no_event_and_says_why():
     report = found.switch_policies()
     assert report["event"] == "keep" and "clone refused" in report["reason"]
     assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
-    assert found.switch.stall_count == 0
+    assert found.referee.stall_count == 0
 
 
 def test_policies_of_two_architectures_train_and_clone_in_a_short_run():
@@ -156,3 +153,23 @@ def test_policies_of_two_architectures_train_and_clone_in_a_short_run():
 def test_wrong_counts_are_refused(argument):
     with pytest.raises(ValueError, match=f"{argument}=0 of the distillation must be at least 1"):
         DistillationConfig(**{argument: 0})
+
+
+def test_a_copy_of_weights_is_no_clone_of_another_activation():
+    """Same names and shapes, other functions: copied weights would make another policy."""
+
+    def network(activation, generator_seed=0):
+        torch.manual_seed(generator_seed)
+        return torch.nn.Sequential(torch.nn.Linear(2, 4), activation, torch.nn.Linear(4, 1)).double()
+
+    assert same_architecture(network(torch.nn.Tanh()), network(torch.nn.Tanh(), 1))
+    assert not same_architecture(network(torch.nn.Tanh()), network(torch.nn.SiLU()))
+    assert not same_architecture(network(torch.nn.LeakyReLU(0.1)), network(torch.nn.LeakyReLU(0.2)))
+
+    class Scaled(torch.nn.Module):
+        def __init__(self, factor):
+            super().__init__()
+            self.factor, self.layer = factor, torch.nn.Linear(2, 1)
+
+    assert same_architecture(Scaled(1.0), Scaled(1.0)) and not same_architecture(Scaled(1.0), Scaled(2.0))
+    assert not same_architecture(affine([-0.8, -1.1]), perceptron())

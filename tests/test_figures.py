@@ -20,10 +20,11 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
 
 EVERYWHERE = {"states", "actions", "policy_contours", "learning_curves", "seconds"}
 
@@ -37,14 +38,14 @@ def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
         arm=arm,
         realisations=2,
         virtual_episodes=2,
-        model_free=ModelFreeConfig(critic_iterations=2, actor_iterations=2, batch_size=8),
+        learner=LearnerConfig(critic_iterations=2, actor_iterations=2, batch_size=8),
         assimilation=AssimilationConfig(iterations=2),
-        model_based=ModelBasedConfig(iterations=1),
+        planner=PlannerConfig(iterations=1),
     )
     policies = {"model_free": policy, "model_based": copy.deepcopy(policy)}
     twinning = ReinforcementTwinning(PlantEnv(plant), twin, **policies, config=config, generator=generator)
     for _ in range(episodes):
-        live = twinning.switch.live
+        live = twinning.referee.live
         reports.append(episode_record(twinning.episode(), episode=len(reports), live=live))
     return Snapshot.take(twinning, initial, reports)
 

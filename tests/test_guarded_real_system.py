@@ -11,10 +11,11 @@ from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
 
 RATE = 5.0
 APPLIED = Reading(keys=("applied",), scale=2.0)
@@ -88,9 +89,9 @@ def test_twinning_identifies_a_machine_behind_its_layer(tmp_path):
     generator = torch.Generator().manual_seed(0)
     config = TwinningConfig(
         exploration=ExplorationConfig(spread=1.0),
-        model_free=ModelFreeConfig(critic_iterations=2, actor_iterations=2),
+        learner=LearnerConfig(critic_iterations=2, actor_iterations=2),
         assimilation=AssimilationConfig(iterations=20, inputs="record", method="levenberg_marquardt"),
-        model_based=ModelBasedConfig(iterations=0),
+        planner=PlannerConfig(iterations=0),
     )
     policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = DigitalTwin(plant, plant.make_closure(generator))

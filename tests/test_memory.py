@@ -7,7 +7,8 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from rt_torchrl.twinning.memory import AT_ONCE, LongTermMemory, LongTermMemoryConfig, ShortTermMemory
+from rt_torchrl.twinning.long_term_memory import AT_ONCE, LongTermMemory, LongTermMemoryConfig
+from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 
 
 def memory(capacity=10, seed=0, **options):

@@ -10,8 +10,8 @@ from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 from tensordict import TensorDict
 
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.twinning.memory import LongTermMemory, LongTermMemoryConfig
-from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
+from rt_torchrl.twinning.learners import DDPG, LearnerConfig
+from rt_torchrl.twinning.long_term_memory import LongTermMemory, LongTermMemoryConfig
 
 GAMMA = 0.9
 GAMMA_IN_TORCHRL = torch.tensor(GAMMA, dtype=torch.float32).item()  # DDPGLoss keeps it in single precision
@@ -24,7 +24,7 @@ def seeded(seed=0):
 def learner(seed=0, **options):
     plant = LinearQuadratic()
     options = {"discount": GAMMA, "critic_hidden": (16,), "batch_size": 32, **options}
-    return ModelFree(plant, LinearGain([[0.2, 0.1]]), ModelFreeConfig(**options), generator=seeded(seed))
+    return DDPG(plant, LinearGain([[0.2, 0.1]]), LearnerConfig(**options), generator=seeded(seed))
 
 
 def explored(count, seed=0, spread=1.5):
@@ -45,10 +45,11 @@ def transitions(observation, action, reward, following, done=False):
     return TensorDict({"observation": observation, "action": action, "next": next_}, batch_size=reward.shape[:-1])
 
 
-def filled(data, found, seed=1):
-    memory = LongTermMemory(LongTermMemoryConfig(capacity=len(data)), generator=seeded(seed))
-    memory.store(data, found.td_errors(data))
-    return memory
+def filled(data, found, seed=1, **options):
+    """The learner's memory with just these transitions."""
+    found.memory = LongTermMemory(LongTermMemoryConfig(capacity=len(data), **options), generator=seeded(seed))
+    found.memory.store(data, found.td_errors(data))
+    return found.memory
 
 
 def gradients(module):
@@ -82,7 +83,8 @@ def test_td_error_is_that_of_the_target_critic_and_bootstraps_through_truncation
     """|r + γ q′(e′, π(e′)) − q(e, a)| by hand; the end of an episode (done, not terminated) is no end of the return."""
     found, data = learner(target_rate=0.3), explored(10)
     earlier = copy.deepcopy(found.critic)
-    found.update(filled(data, found), 32)
+    filled(data, found)
+    found.update()
     first = data[:6].clone()
     first["next", "done"].fill_(done)
     target = copy.deepcopy(found.critic)
@@ -103,7 +105,8 @@ def test_target_follows_at_its_rate():
     """After one critic iteration: w′ = (1 − τ) w_0 + τ w_1."""
     found, data = learner(target_rate=0.3, critic_iterations=1, actor_iterations=0), explored(10)
     before = {name: w.detach().clone() for name, w in found.critic.named_parameters()}
-    found.update(filled(data, found), 32)
+    filled(data, found)
+    found.update()
     weights = found.loss.target_value_network_params.flatten_keys(".")
     for name, after in found.critic.named_parameters():
         assert not torch.equal(after, before[name])
@@ -111,7 +114,7 @@ def test_target_follows_at_its_rate():
 
 
 def test_critic_iterations_come_first_and_are_counted(monkeypatch):
-    found, calls, sizes = learner(critic_iterations=7, actor_iterations=4, batch_size=32), [], []
+    found, calls, sizes = learner(critic_iterations=7, actor_iterations=4, batch_size=64), [], []
     memory = filled(explored(10), found)
     for optimiser, label in ((found.critic_optimiser, "q"), (found.actor_optimiser, "a")):
         step = optimiser.step
@@ -119,10 +122,10 @@ def test_critic_iterations_come_first_and_are_counted(monkeypatch):
     sample = memory.sample
     monkeypatch.setattr(memory, "sample", lambda size: sizes.append(size) or sample(size))
     gain = found.policy.gain.detach().clone()
-    found.update(memory, 20)
+    found.update()
     assert calls == ["q"] * 7 + ["a"] * 4
-    # n_b = 32, but at most n_t = 20; those of the four policy iterations are drawn in one call.
-    assert sizes == [20] * 7 + [80]
+    # n_b = 64, but at most n_t = 50; those of the four policy iterations are drawn in one call.
+    assert sizes == [50] * 7 + [200]
     assert not torch.equal(gain, found.policy.gain)
 
 
@@ -131,7 +134,7 @@ def test_sampled_errors_are_refreshed():
     memory = filled(data, found)
     before = memory.sampler.priorities(len(data)).clone()
     memory.refresh(torch.arange(len(data)), torch.full((len(data),), 100.0))
-    found.update(memory, 32)
+    found.update()
     after = memory.sampler.priorities(len(data))
     changed = after < 10.0
     # δ is that of the critic before its step, which is the one they were stored with.
@@ -141,14 +144,14 @@ def test_sampled_errors_are_refreshed():
 
 def test_restart_forgets_the_moments_of_the_policys_optimiser():
     found, data = learner(critic_iterations=0, actor_iterations=3, actor_rate=0.01), explored(10)
-    memory = filled(data, found)
-    found.update(memory, 32)
+    filled(data, found)
+    found.update()
     assert len(found.actor_optimiser.state) == 1
     found.restart()
     assert len(found.actor_optimiser.state) == 0
     before = found.policy.gain.detach().clone()
-    found.config = ModelFreeConfig(critic_iterations=0, actor_iterations=1, batch_size=32)
-    found.update(memory, 32)
+    found.config = LearnerConfig(critic_iterations=0, actor_iterations=1, batch_size=32)
+    found.update()
     # Adam's first step has the length of the rate in each direction, up to ε = 1e-8 over the gradient.
     torch.testing.assert_close((found.policy.gain - before).abs(), torch.full((1, 2), 0.01).double(), rtol=1e-4, atol=0)
 
@@ -189,10 +192,9 @@ def test_policy_finds_the_optimal_gain(unchecked):
         actor_rate=0.02,
     )
     start, data = found.policy.gain.detach().numpy().copy(), explored(1000, spread=1.0)
-    memory = LongTermMemory(LongTermMemoryConfig(capacity=len(data), prioritisation=0.0), generator=seeded(1))
-    memory.store(data, found.td_errors(data))
+    filled(data, found, prioritisation=0.0)
     for _ in range(45):
-        found.update(memory, 500)
+        found.update()
     gain = found.policy.gain.detach().numpy()
     # ‖K − K*‖/‖K*‖ from 0.87. The critic is a perceptron, no quadratic form, fitted to 5000 transitions, and wanders
     # with Adam's steps: measured 0.07 to 0.09 at the end. The cost is flat at its minimum.

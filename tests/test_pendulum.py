@@ -156,8 +156,8 @@ def test_engines_agree_without_inputs():
 
 def test_the_recipe_trains_on_gymnasium(tmp_path):
     small = ["--episodes", "1", "--unseen", "2", "--horizon", "2.0", "--compiled", "False", "--figures-every", "0"]
-    small += ["--twinning.model-free.critic-iterations", "2", "--twinning.model-free.actor-iterations", "2"]
-    small += ["--twinning.model-based.iterations", "1", "--twinning.virtual-episodes", "2"]
+    small += ["--twinning.learner.critic-iterations", "2", "--twinning.learner.actor-iterations", "2"]
+    small += ["--twinning.planner.iterations", "1", "--twinning.virtual-episodes", "2"]
     command = [sys.executable, str(RECIPE), *small, "--log-dir", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]

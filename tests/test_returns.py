@@ -5,7 +5,7 @@ import torch
 from linear_quadratic import LinearQuadratic
 from tensordict import TensorDict
 
-from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
+from rt_torchrl.twinning.learners import DDPG, LearnerConfig
 
 
 def episode(n):
@@ -24,8 +24,8 @@ def episode(n):
 
 def learner(return_steps, discount=0.5, **options):
     plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
-    config = ModelFreeConfig(return_steps=return_steps, discount=discount, critic_hidden=(8,), **options)
-    return ModelFree(plant, plant.make_policy(generator), config, generator=generator)
+    config = LearnerConfig(return_steps=return_steps, discount=discount, critic_hidden=(8,), **options)
+    return DDPG(plant, plant.make_policy(generator), config, generator=generator)
 
 
 def test_one_step_is_the_transition_itself():

@@ -14,20 +14,26 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.memory import LongTermMemoryConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.switching import SwitchConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.long_term_memory import LongTermMemoryConfig
+from rt_torchrl.twinning.referees import RefereeConfig
 
 SMALL = TwinningConfig(
     realisations=2,
     virtual_episodes=2,
     exploration=ExplorationConfig(episodes=2),
-    long_term=LongTermMemoryConfig(capacity=500),
-    model_free=ModelFreeConfig(critic_iterations=3, actor_iterations=3, batch_size=8, critic_hidden=(8,)),
+    learner=LearnerConfig(
+        critic_iterations=3,
+        actor_iterations=3,
+        batch_size=8,
+        critic_hidden=(8,),
+        memory=LongTermMemoryConfig(capacity=500),
+    ),
     # No patience, so that swaps and clones happen within the few episodes of a test.
-    switch=SwitchConfig(patience=0, clone_patience=0, stall=10.0),
+    referee=RefereeConfig(patience=0, clone_patience=0, stall=10.0),
 )
 
 
@@ -214,7 +220,7 @@ def test_an_interrupt_keeps_the_episodes_done(tmp_path, monkeypatch):
 
 def test_quick_is_a_small_run(tmp_path):
     effective = RunConfig(quick=True, log_dir=tmp_path).effective()
-    assert (effective.episodes, effective.unseen, effective.twinning.model_free.critic_iterations) == (3, 5, 200)
+    assert (effective.episodes, effective.unseen, effective.twinning.learner.critic_iterations) == (3, 5, 200)
     assert RunConfig(quick=True, episodes=2).effective().episodes == 2
 
 
@@ -244,7 +250,7 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
 
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
     small_run(tmp_path, episodes=1).train()
-    wider = dataclasses.replace(SMALL, model_free=dataclasses.replace(SMALL.model_free, critic_hidden=(9,)))
+    wider = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, critic_hidden=(9,)))
     with pytest.raises(ValueError, match="weights do not fit"):
         Run(RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
 

@@ -10,8 +10,7 @@ from linear_quadratic import LinearQuadratic
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig
-from rt_torchrl.twinning.short_horizon import ShortHorizon, ShortHorizonConfig
+from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizon, ShortHorizonConfig, make_planner
 
 CONFIG = ShortHorizonConfig(window=10, critic_hidden=(32, 32))
 
@@ -26,7 +25,8 @@ def episodes(plant, count, seed):
 
 def planner(plant, config=CONFIG, **kind):
     policy = plant.make_policy(seeded(3))
-    return ShortHorizon(DigitalTwin(plant, plant.closure), policy, config, generator=seeded(1), **kind)
+    twin, planning = DigitalTwin(plant, plant.closure), PlannerConfig(short_horizon=config)
+    return ShortHorizon(twin, policy, planning, generator=seeded(1), **kind)
 
 
 def test_targets_are_discounted_sums():
@@ -78,19 +78,21 @@ def test_it_comes_near_the_best_policy():
     assert torch.equal(plan.policy.gain, plant.make_policy(seeded(3)).gain)
 
 
-def test_a_plan_is_kept_only_where_it_is_better():
+def test_what_was_learned_goes_on_after_a_plan_is_refused():
     plant = LinearQuadratic()
     policy = plant.make_policy(seeded(3))
     twin = DigitalTwin(plant, plant.closure)
-    config = ModelBasedConfig(iterations=1, short_horizon=dataclasses.replace(CONFIG, policy_rate=100.0))
-    model_based = ModelBased(twin, policy, config, generator=seeded(1))
+    config = PlannerConfig(iterations=1, short_horizon=dataclasses.replace(CONFIG, policy_rate=100.0))
+    found = make_planner(twin, policy, config, generator=seeded(1))
     before = copy.deepcopy(policy)
-    plan = model_based.update(episodes(plant, 8, 0), episodes(plant, 8, 1))
-    # A step of 100 in a gain of 0.1 is a wild one; what was learned goes on, and π_mb stays.
-    assert not plan.accepted and torch.equal(policy.gain, before.gain)
-    assert not torch.equal(model_based.descent.learner.gain, before.gain)
-    model_based.restart()
-    assert torch.equal(model_based.descent.learner.gain, before.gain)
+    plan = found.plan(episodes(plant, 8, 0))
+    # A step of 100 in a gain of 0.1 is a wild one.
+    assert plan.best > plan.start and torch.equal(policy.gain, found.learner.gain)
+    policy.load_state_dict(before.state_dict())
+    found.refuse()
+    assert not torch.equal(found.learner.gain, before.gain)
+    found.restart()
+    assert torch.equal(found.learner.gain, before.gain)
 
 
 def test_its_state_is_all_it_goes_on_from():

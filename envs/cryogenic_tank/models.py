@@ -58,7 +58,7 @@ class CubicVentLaw(nn.Module):
         super().__init__()
         first = torch.randn(3, generator=generator, dtype=torch.float64, device=generator.device)
         self.scaled = nn.Parameter(weight_scale * first)
-        self.clip = SmoothClip((action,))
+        self.clip = SmoothClip((action,), device=generator.device)
 
     @property
     def weights(self) -> Float[Tensor, "3"]:

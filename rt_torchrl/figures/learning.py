@@ -24,7 +24,7 @@ from rt_torchrl.figures.style import (
     role_name,
 )
 from rt_torchrl.plants.closures import named_weights
-from rt_torchrl.twinning.switching import Role
+from rt_torchrl.twinning.referees import Role
 
 CONTROL = {
     "real_cost": {"color": REAL, "marker": "o", "label": "real system, live"},

@@ -14,7 +14,7 @@ from torch import Tensor
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES, array, caption, last_episode, legend_below, limits, panels, role_name
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.twinning.switching import Role
+from rt_torchrl.twinning.referees import Role
 
 RESOLUTION = 81
 """Points along each observation."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.switching import Role
+from rt_torchrl.twinning.referees import Role
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Snapshot:
         """Of an algorithm after an episode; draws its realisations from a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
         replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None])
-        process = algorithm.processes[-1] if algorithm.processes else None
+        process = algorithm.virtual.processes[-1] if algorithm.virtual.processes else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(
             plant=twin.plant,
@@ -59,7 +59,7 @@ class Snapshot:
             closure=twin.closure,
             initial_closure=initial_closure,
             policies=algorithm.policies,
-            live=algorithm.switch.live,
+            live=algorithm.referee.live,
             record=record,
             replay=replay.states[0],
             large_scale=process and process.mean,

@@ -85,7 +85,7 @@ class BoundedPerceptron(nn.Module):
         bound = torch.tensor(bounds, dtype=torch.float64, device=generator.device)
         if not (low < high).all() or not (bound > 0.0).all():
             raise ValueError(f"ranges={ranges} must each go from low to high, and bounds={bounds} must be positive.")
-        self.network = mlp(len(ranges), hidden, len(bounds), generator=generator).to(generator.device)
+        self.network = mlp(len(ranges), hidden, len(bounds), generator=generator)
         nn.init.zeros_(self.network[-1].weight)
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("half_range", 0.5 * (high - low))

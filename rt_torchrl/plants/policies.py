@@ -20,12 +20,13 @@ class SmoothClip(nn.Module):
 
     Args:
         actions: the actions, each with a finite range.
+        device: where the ranges are kept; torch's default if None.
 
     Raises:
         ValueError: if an action has no finite range.
     """
 
-    def __init__(self, actions: Sequence[Signal]):
+    def __init__(self, actions: Sequence[Signal], *, device: torch.device | None = None):
         super().__init__()
         for action in actions:
             if not (math.isfinite(action.low) and math.isfinite(action.high)):
@@ -33,7 +34,7 @@ class SmoothClip(nn.Module):
                     f"action {action.name!r} has range [{action.low}, {action.high}] {action.unit}; "
                     "a saturated policy needs finite bounds: give the Signal a low and a high."
                 )
-        low, high = bounds(actions)
+        low, high = bounds(actions, device=device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
 
@@ -62,12 +63,12 @@ class SaturatedAffine(nn.Module):
         generator: torch.Generator,
     ):
         super().__init__()
-        self.linear = nn.Linear(n_observations, len(actions), bias=bias, dtype=torch.float64)
+        self.linear = nn.Linear(n_observations, len(actions), bias=bias, dtype=torch.float64, device=generator.device)
         with torch.no_grad():
             self.linear.weight.normal_(0.0, weight_scale, generator=generator)
             if bias:
                 self.linear.bias.zero_()
-        self.clip = SmoothClip(actions)
+        self.clip = SmoothClip(actions, device=generator.device)
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
         return self.clip(self.linear(observation))
@@ -97,7 +98,7 @@ class SaturatedMLP(nn.Module):
         self.network = mlp(n_observations, hidden, len(actions), generator=generator)
         with torch.no_grad():
             self.network[-1].weight.mul_(output_scale)
-        self.clip = SmoothClip(actions)
+        self.clip = SmoothClip(actions, device=generator.device)
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
         return self.clip(self.network(observation))
@@ -118,7 +119,7 @@ def mlp(
         raise ValueError(f"layer widths {widths} must all be at least 1.")
     layers: list[nn.Module] = []
     for i, (fan_in, fan_out) in enumerate(zip(widths, widths[1:], strict=False)):
-        linear = nn.Linear(fan_in, fan_out, dtype=dtype)
+        linear = nn.Linear(fan_in, fan_out, dtype=dtype, device=generator.device)
         with torch.no_grad():
             linear.weight.normal_(0.0, fan_in**-0.5, generator=generator)
             linear.bias.zero_()

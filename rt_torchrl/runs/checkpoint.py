@@ -7,64 +7,30 @@ import torch
 
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
-FORMAT = 2
+FORMAT = 3
 
 
 def state_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
     """Everything that the next episode depends on."""
-    return {
-        "format": FORMAT,
-        "plant": algorithm.twin.plant.name,
-        "episodes_done": algorithm.episodes_done,
-        "policies": {role: policy.state_dict() for role, policy in algorithm.policies.items()},
-        "closure": algorithm.twin.closure.state_dict(),
-        "loss": algorithm.model_free.loss.state_dict(),
-        "critic_optimiser": algorithm.model_free.critic_optimiser.state_dict(),
-        "actor_optimiser": algorithm.model_free.actor_optimiser.state_dict(),
-        "assimilation": algorithm.assimilation.descent.state_dict(),
-        "damping": algorithm.assimilation.second_order.damping,
-        "model_based": algorithm.model_based.descent.state_dict(),
-        "long_term": algorithm.long_term.state_dict(),
-        "short_term": list(algorithm.short_term),
-        "processes": list(algorithm.processes),
-        "switch": (algorithm.switch.live, algorithm.switch.worse_count, algorithm.switch.stall_count),
-        "generator": algorithm.generator.get_state(),
-        "real_system": algorithm.env.state_dict(),
-    }
+    return {"format": FORMAT, "plant": algorithm.twin.plant.name, "algorithm": algorithm.state_dict()}
 
 
 def restore(algorithm: ReinforcementTwinning, state: dict[str, Any]) -> None:
     """Put an algorithm, built with the same configuration, into a saved state.
 
     Raises:
-        ValueError: if the state is of another plant, or its weights do not fit.
+        ValueError: if the state is of another plant, or does not fit.
     """
     name = algorithm.twin.plant.name
     if state["plant"] != name:
         raise ValueError(f"the checkpoint is of plant {state['plant']!r}, this training of {name!r}; use its recipe.")
     try:
-        for role, policy in algorithm.policies.items():
-            policy.load_state_dict(state["policies"][role])
-        algorithm.twin.closure.load_state_dict(state["closure"])
-        algorithm.model_free.loss.load_state_dict(state["loss"])
-    except (RuntimeError, KeyError, ValueError) as error:  # of torch and of tensordict
+        algorithm.load_state_dict(state["algorithm"])
+    except ValueError as error:
         raise ValueError(
             f"the checkpoint's weights do not fit this training of {name!r}; start with the options it was started "
             f"with (see its config.json). {error}"
         ) from error
-    algorithm.model_free.critic_optimiser.load_state_dict(state["critic_optimiser"])
-    algorithm.model_free.actor_optimiser.load_state_dict(state["actor_optimiser"])
-    algorithm.assimilation.descent.load_state_dict(state["assimilation"])
-    algorithm.assimilation.second_order.damping = state["damping"]
-    algorithm.model_based.descent.load_state_dict(state["model_based"])
-    algorithm.long_term.load_state_dict(state["long_term"])
-    for memory in ("short_term", "processes"):
-        getattr(algorithm, memory).clear()
-        getattr(algorithm, memory).extend(state[memory])
-    algorithm.switch.live, algorithm.switch.worse_count, algorithm.switch.stall_count = state["switch"]
-    algorithm.generator.set_state(state["generator"])
-    algorithm.env.load_state_dict(state["real_system"])
-    algorithm.episodes_done = state["episodes_done"]
 
 
 def save(path: Path, algorithm: ReinforcementTwinning, episodes: list[dict[str, Any]]) -> None:

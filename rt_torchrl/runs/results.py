@@ -13,7 +13,7 @@ from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, mean_w
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.switching import Role
+from rt_torchrl.twinning.referees import Role
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
@@ -59,7 +59,7 @@ def summarise(
 
     J_p before and after are of the same episodes, flown by the final live policy.
     """
-    closure, live = algorithm.twin.closure, algorithm.switch.live
+    closure, live = algorithm.twin.closure, algorithm.referee.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])

@@ -33,7 +33,7 @@ from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.switching import Role
+from rt_torchrl.twinning.referees import Role
 
 PlantFigures = Callable[[Snapshot], dict[str, Figure]]
 
@@ -131,13 +131,13 @@ class Run:
         return metrics
 
     def _episode(self, dashboard: Dashboard) -> None:
-        live = self.algorithm.switch.live
+        live = self.algorithm.referee.live
         record = results.episode_record(self.algorithm.episode(), episode=len(self.episodes), live=live)
         record["closure"] = named_weights(self.algorithm.twin.closure)
         every = self.config.unseen_every
         if every and (len(self.episodes) + 1) % every == 0:
             self._follow_wear()
-            acting = self.algorithm.policies[self.algorithm.switch.live]
+            acting = self.algorithm.policies[self.algorithm.referee.live]
             record["J_a_unseen"] = self.unseen.control_costs(acting).mean().item()
         self.episodes.append(record)
         checkpoint.save(self.folder / "checkpoint.pt", self.algorithm, self.episodes)

@@ -13,8 +13,8 @@ from torch import nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.trajectories.rollout import Engine
-from rt_torchrl.twinning.algorithm import TwinningConfig
-from rt_torchrl.twinning.switching import Role
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.referees import Role
 
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
 
@@ -139,10 +139,10 @@ class RunConfig:
         """With ``quick`` carried out."""
         if not self.quick:
             return self
-        model_free = dataclasses.replace(
-            self.twinning.model_free, critic_iterations=QUICK_ITERATIONS, actor_iterations=QUICK_ITERATIONS
+        learner = dataclasses.replace(
+            self.twinning.learner, critic_iterations=QUICK_ITERATIONS, actor_iterations=QUICK_ITERATIONS
         )
-        twinning = dataclasses.replace(self.twinning, model_free=model_free)
+        twinning = dataclasses.replace(self.twinning, learner=learner)
         return dataclasses.replace(
             self,
             quick=False,

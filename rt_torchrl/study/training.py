@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.twinning.algorithm import Arm
+from rt_torchrl.twinning.config import Arm
 
 CHANGED = "model error"
 """The variant whose real system is not what the twin was made for."""

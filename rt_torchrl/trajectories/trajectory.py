@@ -61,7 +61,7 @@ class Trajectory(NamedTuple):
 
     def each(self) -> "list[Trajectory]":
         """The trajectories of a batch, one by one."""
-        starts = torch.as_tensor(self.start, dtype=torch.float64).expand(len(self.states)).tolist()
+        starts = torch.as_tensor(self.start, dtype=torch.float64, device="cpu").expand(len(self.states)).tolist()
         return [Trajectory(*parts) for parts in zip(self.states, self.actions, self.exogenous, starts, strict=True)]
 
 

@@ -6,69 +6,31 @@ on the real system. The other is idle, learns beside it and can take over.
 
 import copy
 import time
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map_only
 from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
-from rt_torchrl.twinning.distillation import Distillation, DistillationConfig, same_architecture
-from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
-from rt_torchrl.twinning.memory import LongTermMemory, LongTermMemoryConfig, ShortTermMemory
-from rt_torchrl.twinning.model_based import ModelBased, ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFree, ModelFreeConfig
-from rt_torchrl.twinning.switching import PolicySwitch, Role, SwitchConfig
-
-Arm = Literal["twinning", "model_free", "model_based"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class TwinningConfig:
-    """Hyper-parameters of the algorithm, by step.
-
-    Args:
-        arm: ``twinning``, or one of its halves alone: ``model_free`` makes steps 1 and 2, ``model_based`` 1 and 3 to 5.
-        realisations: N_z, samples of the exogenous process per record in steps 4 and 5.
-        records: n_S, real episodes that steps 3 to 5 look back on.
-        virtual_episodes: N, over which step 5 judges a plan and step 6 compares the policies.
-        exploration: step 1.
-        long_term: the memory of step 2.
-        model_free: step 2.
-        exogenous: step 3.
-        assimilation: step 4.
-        model_based: step 5.
-        switch: step 6.
-        distillation: how step 6 clones between policies of different architectures.
-    """
-
-    arm: Arm = "twinning"
-    realisations: int = 5
-    records: int = 1
-    virtual_episodes: int = 20
-    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
-    long_term: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
-    model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
-    exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)
-    assimilation: AssimilationConfig = field(default_factory=AssimilationConfig)
-    model_based: ModelBasedConfig = field(default_factory=ModelBasedConfig)
-    switch: SwitchConfig = field(default_factory=SwitchConfig)
-    distillation: DistillationConfig = field(default_factory=DistillationConfig)
-
-    def __post_init__(self):
-        for argument in ("realisations", "records", "virtual_episodes"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+from rt_torchrl.twinning.assimilation import Assimilation
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.distillation import Distillation, same_architecture
+from rt_torchrl.twinning.findings import findings, merged, weight_vector
+from rt_torchrl.twinning.learners import Learner, make_learner
+from rt_torchrl.twinning.planners import Planner, make_planner
+from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
+from rt_torchrl.twinning.short_term_memory import ShortTermMemory
+from rt_torchrl.twinning.track_record import TrackRecord
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class ReinforcementTwinning:
@@ -81,6 +43,12 @@ class ReinforcementTwinning:
         model_based: π_mb, trained in place.
         config: see :class:`TwinningConfig`.
         generator: source of everything random except what the real system draws itself.
+        learner: step 2, of the policy ``model_free``; that of ``config.learner`` by default.
+        planner: step 5, of the policy ``model_based``; that of ``config.planner`` by default.
+        referee: step 6; that of ``config.referee`` by default.
+
+    Raises:
+        ValueError: if a learner or planner is given that trains another policy.
     """
 
     def __init__(
@@ -92,18 +60,24 @@ class ReinforcementTwinning:
         model_based: nn.Module,
         config: TwinningConfig,
         generator: torch.Generator,
+        learner: Learner | None = None,
+        planner: Planner | None = None,
+        referee: Referee | None = None,
     ):
         self.env, self.twin, self.config, self.generator = env, twin, config, generator
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        self.model_free = ModelFree(twin.plant, model_free, config.model_free, generator=generator)
+        first: Role = "model_based" if config.arm == "model_based" else "model_free"
+        self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
+        self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
+        self.referee = referee or make_referee(config.referee, first)
+        require_own_policies(self)
         self.assimilation = Assimilation(twin, config.assimilation)
-        self.model_based = ModelBased(twin, model_based, config.model_based, generator=generator)
         self.distillation = Distillation(twin, config.distillation)
-        self.long_term = LongTermMemory(config.long_term, generator=generator)
         self.short_term = ShortTermMemory(config.records)
-        self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
-        self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
-        self.actor = LivePolicy(twin.plant, self.policies[self.switch.live], config.exploration, generator=generator)
+        self.track_record = TrackRecord(self.policies)
+        experience = max(config.records, config.planner.experience)
+        self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         simulated = isinstance(env, PlantEnv)
         self.collector = (
             FlightCollector(env, self.actor) if simulated else EpisodeCollector(env, self.actor, twin.plant.n_steps)
@@ -111,8 +85,11 @@ class ReinforcementTwinning:
         self.episodes_done = 0
         self._earlier_closure: dict[str, Any] | None = None
 
-    def episode(self) -> TensorDict:
+    def episode(self, tell: Callable[[str], None] = lambda step: None) -> TensorDict:
         """One real episode and all that is learned from it: the six steps of the paper, in order.
+
+        Args:
+            tell: is called with the name of every step as it begins.
 
         Returns:
             ``real_cost``, the reports of the steps that were made, and ``seconds`` of each step.
@@ -123,53 +100,55 @@ class ReinforcementTwinning:
         steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
+            tell(step.__name__)
             start = time.perf_counter()
-            report.update(self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())
+            merged(report, self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
         return report.update({"seconds": findings(**seconds)})
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
-        self.actor.begin(self.policies[self.switch.live], strength=self.config.exploration.strength(self.episodes_done))
+        live = self.referee.live
+        self.actor.begin(self.policies[live], strength=self.config.exploration.strength(self.episodes_done))
         episode = next(iter(self.collector))[0]
         # What is learned from is the action that was applied.
         episode["action"] = episode["next", "applied"]
-        transitions = self.model_free.transitions(episode)
-        self.long_term.store(transitions, self.model_free.td_errors(transitions))
+        self.learner.store(episode)
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
-        self.short_term.append(Trajectory(states, episode["action"], episode["exogenous"]))
+        record = Trajectory(states, episode["action"], episode["exogenous"])
         reward = episode["next", "reward"].mean()
+        self.short_term.append(record)
+        self.track_record.append(record, live, -reward.item())
         return findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
 
     def update_model_free(self) -> TensorDict:
-        """Step 2: n_Q updates of the critic, then n_A of π_mf."""
+        """Step 2: the learner improves π_mf."""
         self._earlier_weights = {role: weight_vector(policy) for role, policy in self.policies.items()}
-        return self.model_free.update(self.long_term, self.twin.plant.n_steps)
+        return self.learner.update()
 
     def fit_exogenous(self) -> TensorDict:
         """Step 3: a Gaussian process of the exogenous input of this episode."""
-        plant, record = self.twin.plant, self.short_term[-1]
-        self.processes.append(
-            ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=self.config.exogenous)
-        )
+        self.virtual.learn(self.short_term[-1])
         return findings()
 
     def assimilate(self) -> TensorDict:
         """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
-        processes = list(self.processes)[-len(self.short_term) :]
+        processes = list(self.virtual.processes)[-len(self.short_term) :]
         self._earlier_closure = copy.deepcopy(self.twin.closure.state_dict())
         found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
         return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
 
     def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Step 5 or 6; if the twin diverges in it, the closure of the episode before takes the place of w_p*.
+        """Step 5 or 6; if the live policy diverges in it, the closure of the episode before takes the place of w_p*.
 
-        Note: the paper keeps every closure. One that replays the records best may still be one that no other flight can
-        be made with, where noise of the sensors is large beside what the closure does; the real system cannot wait.
+        The live policy has just flown on the real system, so the closure must be wrong; any other policy may diverge on
+        a sound twin, and loses. Note: the paper keeps every closure. One that replays the records best may still be one
+        that no other flight can be made with, where noise of the sensors is large beside what the closure does; the
+        real system cannot wait.
 
         Raises:
-            DivergenceError: if the twin diverges with the earlier closure too.
+            DivergenceError: if the live policy diverges with the earlier closure too.
         """
         state, policy = self.generator.get_state(), copy.deepcopy(self.policies["model_based"].state_dict())
         try:
@@ -182,84 +161,136 @@ class ReinforcementTwinning:
         self._earlier_closure = None
         self.generator.set_state(state)
         self.policies["model_based"].load_state_dict(policy)
-        self.model_based.restart()
-        report = step()
-        return report.update(findings(closure_refused=1.0)).set_non_tensor("reason", refused)
+        self.planner.restart()
+        return merged(step(), findings(refused, closure_refused=1.0))
 
     def plan(self) -> TensorDict:
-        """Step 5: n_mb gradient steps on J_a over N_z virtual trajectories under π_mb, on the twin with w_p*."""
-        count = self.config.model_based.realisations or self.config.realisations
-        planned_on, judged_on = map(self.draw_virtual_episodes, (count, self.config.virtual_episodes))
-        found, accepted = self.model_based.update(planned_on, judged_on)
+        """Step 5: π_mb is planned on the twin with w_p*; the referee keeps the plan only if it is no worse.
+
+        Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the policy before on N others,
+        because the best policy for a few winds can lie just beyond a cliff of another one.
+        """
+        count = self.config.planner.realisations or self.config.realisations
+        planned_on, judged_on = map(self.virtual.draw, (count, self.config.virtual_episodes))
+        policy = self.policies["model_based"]
+        before = copy.deepcopy(policy.state_dict())
+        incumbent = self.virtual_costs(judged_on, {self.referee.live, "model_based"})["model_based"]
+        try:
+            found = self.planner.plan(planned_on)
+        except DivergenceError as error:
+            if self.referee.live == "model_based":
+                raise
+            policy.load_state_dict(before)
+            self.planner.restart()
+            return findings(f"no plan: {error}", plan_accepted=0.0)
+        accepted = not self.referee.worse(self.virtual.cost(policy, judged_on).item(), than=incumbent.item())
+        if not accepted:
+            policy.load_state_dict(before)
+            self.planner.refuse()
         return findings(
             J_a_plan_before=found.start,
-            J_a_plan=found.best,
+            J_a_plan=found.best if accepted else found.start,
             policy_gradient=found.gradient,
             plan_accepted=float(accepted),
         )
 
-    def draw_virtual_episodes(self, count: int) -> Scenario:
-        """Random initial states, and exogenous inputs from the processes of the episodes so far.
-
-        Note: the paper plans from the initial state and with the disturbances of the last episode alone; here from
-        random ones and with those of all episodes (``experience``), because a policy that is optimal for one wind can
-        lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in one wind of twenty.
-        """
-        initial_state = self.twin.plant.draw_initial_state(count, self.generator)
-        return Scenario(initial_state, sample_experience(self.processes, count, self.generator))
-
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
-        """Step 6: mean J_a of both policies over the same N virtual episodes, then the decision tree."""
-        judged_on = self.draw_virtual_episodes(self.config.virtual_episodes)
+        """Step 6: mean J_a of both policies over the same N virtual episodes, then the referee's word."""
+        judged_on = self.virtual.draw(self.config.virtual_episodes)
         costs = self.virtual_costs(judged_on)
-        idle = self.switch.idle
+        live, idle = self.referee.live, self.referee.idle
         now = weight_vector(self.policies[idle])
         change = (now - self._earlier_weights[idle]).norm() / now.norm()
-        event = self.switch.decide(costs[self.switch.live].item(), costs[idle].item(), change.item())
-        report = findings(**{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
+        evidence = Evidence(
+            live_cost=costs[live].item(),
+            idle_cost=costs[idle].item(),
+            idle_weight_change=change.item(),
+            real_costs=self.track_record.real_costs,
+            predicted_costs=lambda: self.track_record.predicted_costs(self.twin),
+        )
+        event = self.referee.decide(evidence)
+        diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]
+        report = findings(*diverged, **{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
         report.set_non_tensor("event", event)
-        return report.update(self.clone(costs, judged_on)) if event == "clone" else report
+        return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
-    def virtual_costs(self, episodes: Scenario) -> dict[Role, Tensor]:
-        """Mean J_a of each policy over virtual episodes."""
-        return {role: self.twin.cost(policy, *episodes) for role, policy in self.policies.items()}
+    def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
+        """Mean J_a of policies over virtual episodes; infinite for an idle policy under which the twin diverges.
+
+        Raises:
+            DivergenceError: if the twin diverges under the live policy.
+        """
+        flies = {role: role == self.referee.live for role in roles}
+        return {role: self.virtual.cost(self.policies[role], episodes, flies=flies[role]) for role in roles}
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
         """The live policy into the idle one: a copy of its weights, or a distillation into another architecture.
 
         Args:
-            costs: mean J_a of both policies over ``judged_on``, where a distilled clone must not cost more than the
-                policy it replaces.
+            costs: mean J_a of both policies over ``judged_on``, where the referee may find a distilled clone worse than
+                the policy it replaces.
             judged_on: virtual episodes.
         """
-        live, idle = (self.policies[role] for role in (self.switch.live, self.switch.idle))
+        live, idle = (self.policies[role] for role in (self.referee.live, self.referee.idle))
         report = findings()
         if same_architecture(live, idle):
             idle.load_state_dict(live.state_dict())
         else:
-            found = self.distillation.clone(
-                live,
-                idle,
-                seen=self.long_term.observations(),
-                draw=lambda: self.draw_virtual_episodes(self.config.virtual_episodes),
-                judged_on=judged_on,
-                to_beat=costs[self.switch.idle].item(),
-            )
-            ratio = found.cost / costs[self.switch.live]
-            report.update(findings(distillation_error=found.error, distillation_cost_ratio=ratio))
-            if not found.accepted:
-                reason = f"clone refused: J_a {found.cost:.4g} of it, {costs[self.switch.idle]:.4g} of what it replaces"
-                return report.set_non_tensor("event", "keep").set_non_tensor("reason", reason)
-        (self.model_free if self.switch.idle == "model_free" else self.model_based).restart()
+            before, replaced = copy.deepcopy(idle.state_dict()), costs[self.referee.idle]
+            seen, count = self.learner.observations(), self.config.virtual_episodes
+            error = self.distillation.imitate(live, idle, seen=seen, draw=lambda: self.virtual.draw(count))
+            cost = self.virtual.cost(idle, judged_on)
+            report = findings(distillation_error=error, distillation_cost_ratio=cost / costs[self.referee.live])
+            if self.referee.worse(cost.item(), than=replaced.item()):
+                idle.load_state_dict(before)
+                reason = f"clone refused: J_a {cost:.4g} of it, {replaced:.4g} of what it replaces"
+                return merged(report, findings(reason)).set_non_tensor("event", "keep")
+        (self.learner if self.referee.idle == "model_free" else self.planner).restart()
         return report
 
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next episode depends on: the state of every component, in tensors and plain containers."""
+        return {
+            "episodes_done": self.episodes_done,
+            "generator": self.generator.get_state(),
+            "policies": {role: policy.state_dict() for role, policy in self.policies.items()},
+            "closure": self.twin.closure.state_dict(),
+            **{name: getattr(self, name).state_dict() for name in COMPONENTS},
+        }
 
-def findings(**values: float | Tensor) -> TensorDict:
-    """Scalars in double precision."""
-    return TensorDict({key: torch.as_tensor(value, dtype=torch.float64).detach() for key, value in values.items()})
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state_dict` of an algorithm that was built with the same arguments.
+
+        Raises:
+            ValueError: if the weights do not fit; names the component.
+        """
+        kept = {name: state[name] for name in KEPT}
+        state = state | tree_map_only(Tensor, lambda tensor: tensor.to(self.generator.device), kept)
+        parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
+        parts |= {"closure": (self.twin.closure, state["closure"])}
+        parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
+        for name, (part, saved) in parts.items():
+            try:
+                part.load_state_dict(saved)
+            # Torch, tensordict and environments each have errors of their own for what does not fit.
+            except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+                raise ValueError(f"the saved state of {name} does not fit: {error}") from error
+        self.generator.set_state(state["generator"].cpu())
+        self.episodes_done = state["episodes_done"]
 
 
-def weight_vector(module: nn.Module) -> Tensor:
-    """All weights of a module, detached, in one vector."""
-    return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
+KEPT = ("virtual", "short_term", "track_record")
+"""Components that take the tensors of their state as they are, wherever these lie."""
+COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
+
+
+def require_own_policies(algorithm: ReinforcementTwinning) -> None:
+    """Refuse a learner or planner that would train a policy which nobody flies.
+
+    Raises:
+        ValueError: naming it.
+    """
+    for part, role in (("learner", "model_free"), ("planner", "model_based")):
+        if getattr(algorithm, part).policy is not algorithm.policies[role]:
+            raise ValueError(f"{part} trains another policy than {role}; build it with the module given as {role}.")

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -175,7 +175,7 @@ class Assimilation:
 
     def _weights(self) -> Tensor:
         trained = [w.flatten() for w in self.twin.closure.parameters() if w.requires_grad]
-        return torch.cat(trained) if trained else torch.empty(0, dtype=torch.float64)
+        return torch.cat(trained) if trained else self._nothing()
 
     def _prior_cost(self) -> Tensor:
         return 0.5 * (self._stiffness * (self._weights() - self._start).square()).sum()
@@ -186,7 +186,12 @@ class Assimilation:
         held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
         trained = [w for w in closure.parameters() if w.requires_grad]
         each = [torch.full_like(w.detach().flatten(), rho if id(w) in held else 0.0) for w in trained]
-        return torch.cat(each) if each else torch.empty(0, dtype=torch.float64)
+        return torch.cat(each) if each else self._nothing()
+
+    def _nothing(self) -> Tensor:
+        """The weights of a closure without any."""
+        device = next((x.device for x in self.twin.plant.buffers()), "cpu")
+        return torch.empty(0, dtype=torch.float64, device=device)
 
     def _with_prior(self, found: NormalEquations) -> NormalEquations:
         if not self.config.prior:
@@ -211,3 +216,11 @@ class Assimilation:
             share * torch.einsum("bki,bkiw->w", g, S),
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next update depends on, the closure apart."""
+        return {"descent": self.descent.state_dict(), "damping": self.second_order.damping}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.descent.load_state_dict(state["descent"])
+        self.second_order.damping = state["damping"]

@@ -6,11 +6,10 @@ and the twin have shown:
 .. math:: \min_w \mathbb E_e\,\Big\|\frac{\pi(e; w) - \pi_{live}(e)}{a_{hi} - a_{lo}}\Big\|^2
 """
 
-import copy
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -48,18 +47,6 @@ class DistillationConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the distillation must be at least 1.")
 
 
-class Distilled(NamedTuple):
-    """How good a clone is, and whether it was kept.
-
-    ``error`` is the RMS difference of the actions on all observations, as a share of their ranges; ``cost`` the clone's
-    mean J_a on the twin.
-    """
-
-    error: float
-    cost: float
-    accepted: bool
-
-
 class Distillation:
     """Makes the idle policy imitate the live one.
 
@@ -71,38 +58,31 @@ class Distillation:
     def __init__(self, twin: DigitalTwin, config: DistillationConfig):
         self.twin, self.config = twin, config
 
-    def clone(
+    def imitate(
         self,
         live: nn.Module,
         idle: nn.Module,
         *,
         seen: Float[Tensor, "n n_o"],
         draw: Callable[[], Scenario],
-        judged_on: Scenario,
-        to_beat: float,
-    ) -> Distilled:
-        """Train ``idle`` in place; it keeps its weights if the clone would be worse than it is.
+    ) -> float:
+        """Train ``idle`` in place.
 
         Args:
             live: the teacher, not changed.
             idle: the student; it starts from the weights it has.
             seen: observations of the real system.
-            draw: initial states and disturbances of other virtual episodes than it is judged on.
-            judged_on: virtual episodes on which the clone is compared.
-            to_beat: mean J_a on them of the policy that would be replaced; a clone of the same cost is taken.
+            draw: initial states and disturbances of virtual episodes, other ones at each call.
+
+        Returns:
+            RMS difference of the actions on all observations, as a share of their ranges.
         """
-        before = copy.deepcopy(idle.state_dict())
         observations = [self._thinned(seen), self._thinned(self._observed(live, draw()))]
         for number in range(self.config.rounds):
             if number:
                 observations.append(self._thinned(self._observed(idle, draw())))
-            error = imitate(self.twin.plant, live, idle, torch.cat(observations), self.config.iterations)
-        with torch.no_grad():
-            cost = self.twin.cost(idle, *judged_on).item()
-        accepted = cost <= to_beat
-        if not accepted:
-            idle.load_state_dict(before)
-        return Distilled(error, cost, accepted)
+            error = match_actions(self.twin.plant, live, idle, torch.cat(observations), self.config.iterations)
+        return error
 
     @torch.no_grad()
     def _observed(self, policy: nn.Module, episodes: Scenario) -> Float[Tensor, "n n_o"]:
@@ -115,7 +95,7 @@ class Distillation:
         return observations[:: -(-len(observations) // self.config.samples)]
 
 
-def imitate(
+def match_actions(
     plant: Plant, teacher: nn.Module, student: nn.Module, observations: Float[Tensor, "n n_o"], iterations: int
 ) -> float:
     """Fit the student's actions to the teacher's in place, by TorchRL's behaviour-cloning loss.
@@ -163,6 +143,20 @@ class ShareOfRange(nn.Module):
 
 
 def same_architecture(first: nn.Module, second: nn.Module) -> bool:
-    """Whether the weights of one fit the other: same names and shapes."""
-    shapes = [{name: value.shape for name, value in module.state_dict().items()} for module in (first, second)]
-    return shapes[0] == shapes[1]
+    """Whether a copy of its weights makes one module the other: same modules, same settings, same shapes of weights.
+
+    Shapes alone do not tell: two perceptrons of other activations have the same.
+    """
+    return _structure(first) == _structure(second)
+
+
+def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
+    """Class and settings of every submodule, and the shapes of what its state dict holds."""
+    parts = [(name, type(part), part.extra_repr(), _settings(part)) for name, part in module.named_modules()]
+    return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
+
+
+def _settings(module: nn.Module) -> dict[str, Any]:
+    """Attributes that are neither weights nor submodules, such as an activation or a depth."""
+    values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
+    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}

@@ -80,6 +80,18 @@ class ExogenousProcess:
         self.mean: Float[Tensor, "n n_z"] = torch.as_tensor(large, **like)
         self.covariance: Float[Tensor, "n n_z"] = torch.as_tensor(covariance, **like)
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """What :meth:`from_state` rebuilds it from."""
+        return {"mean": self.mean, "covariance": self.covariance}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Tensor], signals: Sequence[Signal]) -> "ExogenousProcess":
+        """A process from its :meth:`state_dict` and the inputs that it was fitted to."""
+        process = cls.__new__(cls)
+        process.mean, process.covariance = state["mean"], state["covariance"]
+        process._low, process._high = bounds(signals, dtype=process.mean.dtype, device=process.mean.device)
+        return process
+
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
         """Realisations of the input, within the physical ranges of the signals."""
         n, n_z = self.mean.shape

@@ -2,8 +2,8 @@
 
 import shutil
 import sysconfig
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -68,6 +68,19 @@ def missing_for_compilation() -> str | None:
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
         return "the headers of Python"
     return None
+
+
+@contextmanager
+def watched_compilation(tell: Callable[[bool], None]) -> Iterator[None]:
+    """Tell when the compiler begins, with True, and when it ends, for as long as the context lasts."""
+    handler = torch._dynamo.callback_handler
+    begun = handler.register_start_callback(lambda arguments: tell(True))
+    ended = handler.register_end_callback(lambda arguments: tell(False))
+    try:
+        yield
+    finally:
+        handler.remove_start_callback(begun)
+        handler.remove_end_callback(ended)
 
 
 @cache

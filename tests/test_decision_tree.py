@@ -4,16 +4,23 @@ import math
 
 import pytest
 
-from rt_torchrl.twinning.switching import PolicySwitch, SwitchConfig
+from rt_torchrl.twinning.referees import DecisionTree, Evidence, RefereeConfig
 
 WORSE, BETTER, EQUAL = (2.0, 1.0), (1.0, 2.0), (1.0, 1.0)
 MOVING, STALLED = 0.9, 0.1
 
 
+def evidence(live_cost, idle_cost, change):
+    return Evidence(live_cost=live_cost, idle_cost=idle_cost, idle_weight_change=change)
+
+
 def play(config, script, live="model_free"):
     """Events and counters of a script of ((live cost, idle cost), weight change)."""
-    switch = PolicySwitch(config, live=live)
-    return [(switch.decide(*costs, change), switch.worse_count, switch.stall_count) for costs, change in script], switch
+    referee, found = DecisionTree(config, live=live), []
+    for costs, change in script:
+        event = referee.decide(evidence(*costs, change))
+        found.append((event, referee.worse_count, referee.stall_count))
+    return found, referee
 
 
 @pytest.mark.parametrize(
@@ -48,12 +55,12 @@ def play(config, script, live="model_free"):
     ],
 )
 def test_every_branch(script, expected):
-    assert play(SwitchConfig(), script)[0] == expected
+    assert play(RefereeConfig(), script)[0] == expected
 
 
 @pytest.mark.parametrize("patience", [0, 1, 4])
 def test_swap_and_clone_need_more_than_their_patience(patience):
-    config = SwitchConfig(patience=patience, clone_patience=patience)
+    config = RefereeConfig(patience=patience, clone_patience=patience)
     for costs, event in ((WORSE, "swap"), (BETTER, "clone")):
         events = [e for e, *_ in play(config, [(costs, STALLED)] * (2 * patience + 2))[0]]
         assert events == (["keep"] * patience + [event]) * 2
@@ -61,28 +68,28 @@ def test_swap_and_clone_need_more_than_their_patience(patience):
 
 @pytest.mark.parametrize("live, other", [("model_free", "model_based"), ("model_based", "model_free")])
 def test_roles_exchange_and_only_by_a_swap(live, other):
-    switch = play(SwitchConfig(), [(WORSE, MOVING)] * 2, live)[1]
-    assert (switch.live, switch.idle) == (live, other)
-    switch.decide(*WORSE, MOVING)
-    assert (switch.live, switch.idle) == (other, live)
-    switch = play(SwitchConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
-    assert (switch.live, switch.idle) == (live, other)
+    referee = play(RefereeConfig(), [(WORSE, MOVING)] * 2, live)[1]
+    assert (referee.live, referee.idle) == (live, other)
+    referee.decide(evidence(*WORSE, MOVING))
+    assert (referee.live, referee.idle) == (other, live)
+    referee = play(RefereeConfig(clone_patience=0), [(BETTER, STALLED)], live)[1]
+    assert (referee.live, referee.idle) == (live, other)
 
 
 @pytest.mark.parametrize("live_cost, event", [(1.49, "keep"), (1.5, "keep"), (1.51, "swap")])
 def test_tolerance_is_a_factor_on_the_idle_cost(live_cost, event):
-    config = SwitchConfig(patience=0, tolerance=1.5)
-    assert PolicySwitch(config).decide(live_cost, 1.0, MOVING) == event
+    config = RefereeConfig(patience=0, tolerance=1.5)
+    assert DecisionTree(config).decide(evidence(live_cost, 1.0, MOVING)) == event
 
 
-@pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "change"])))
+@pytest.mark.parametrize("position, name", list(enumerate(["live_cost", "idle_cost", "idle_weight_change"])))
 def test_nan_is_refused_and_leaves_the_counters(position, name):
-    switch = play(SwitchConfig(), [(WORSE, MOVING)])[1]
+    referee = play(RefereeConfig(), [(WORSE, MOVING)])[1]
     arguments = [1.0, 1.0, 1.0]
     arguments[position] = math.nan
     with pytest.raises(ValueError, match=f"{name} of step 6 is NaN"):
-        switch.decide(*arguments)
-    assert (switch.live, switch.worse_count, switch.stall_count) == ("model_free", 1, 0)
+        referee.decide(evidence(*arguments))
+    assert (referee.live, referee.worse_count, referee.stall_count) == ("model_free", 1, 0)
 
 
 @pytest.mark.parametrize(
@@ -90,4 +97,4 @@ def test_nan_is_refused_and_leaves_the_counters(position, name):
 )
 def test_wrong_thresholds_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
-        SwitchConfig(**change)
+        RefereeConfig(**change)

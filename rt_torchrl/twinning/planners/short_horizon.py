@@ -16,55 +16,17 @@ Source: Xu et al., *Accelerated policy learning with parallel differentiable sim
 """
 
 import copy
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.plants.policies import mlp
-from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShortHorizonConfig:
-    """Parameters of the planning over short windows.
-
-    Args:
-        window: control intervals of a window; 0 plans over whole episodes instead, as in the paper.
-        discount: γ per control interval.
-        mixing: λ, how much the critic's targets trust the rest of the window over the critic itself.
-        critic_iterations: gradients of the critic for each window.
-        critic_hidden: widths of the critic's hidden layers.
-        target_rate: share by which the target critic moves towards the critic after each window.
-        policy_rate: learning rate of the policy (Adam).
-        critic_rate: learning rate of the critic (Adam).
-    """
-
-    window: int = 0
-    discount: float = 0.98
-    mixing: float = 0.95
-    critic_iterations: int = 8
-    critic_hidden: tuple[int, ...] = (64, 64)
-    target_rate: float = 0.2
-    policy_rate: float = 5e-3
-    critic_rate: float = 2e-3
-
-    def __post_init__(self):
-        for argument, least in (("window", 0), ("critic_iterations", 1)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")
-        if not 0.0 <= self.discount < 1.0:
-            raise ValueError(f"discount={self.discount} of the short horizon must lie in [0, 1).")
-        for argument in ("mixing", "target_rate"):
-            if not 0.0 < getattr(self, argument) <= 1.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must lie in (0, 1].")
-        for argument in ("policy_rate", "critic_rate"):
-            if not getattr(self, argument) > 0.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be positive.")
-
+from rt_torchrl.twinning.planners.planner import PlannerConfig
 
 MODULES = ("learner", "critic", "target")
 
@@ -78,7 +40,7 @@ class ShortHorizon:
     Args:
         twin: flies the windows.
         policy: π_mb, not changed here; ``learner`` is the copy.
-        config: see :class:`ShortHorizonConfig`.
+        config: see :class:`PlannerConfig`; its iterations are sweeps through the episodes.
         generator: source of the critic's initial weights.
 
     Raises:
@@ -88,7 +50,10 @@ class ShortHorizon:
     gradient_limit = 1.0
     moments = (0.7, 0.95)  # of Adam: the cost is another one in every window
 
-    def __init__(self, twin: DigitalTwin, policy: nn.Module, config: ShortHorizonConfig, *, generator: torch.Generator):
+    def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator):
+        self.iterations, config = config.iterations, config.short_horizon
+        if config.window < 1:
+            raise ValueError(f"window={config.window} of a short horizon must be at least 1 control interval.")
         if config.window > twin.plant.n_steps:
             raise ValueError(
                 f"window={config.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
@@ -107,6 +72,19 @@ class ShortHorizon:
         """Go on from the policy as it is now, because its weights have jumped."""
         self.learner = copy.deepcopy(self.policy)
         self._optimiser = torch.optim.Adam(self.learner.parameters(), lr=self.config.policy_rate, betas=self.moments)
+
+    def plan(self, episodes: Scenario) -> Descended:
+        """See :meth:`Planner.plan`; the policy takes the weights of the copy that descends."""
+        with torch.no_grad():
+            start = self.twin.cost(self.policy, *episodes).item()
+        gradients = [self.sweep(*episodes) for _ in range(self.iterations)]
+        self.policy.load_state_dict(self.learner.state_dict())
+        with torch.no_grad():
+            end = self.twin.cost(self.policy, *episodes).item()
+        return Descended(start, end, gradients[0] if gradients else float("nan"), len(gradients))
+
+    def refuse(self) -> None:
+        """Nothing: the copy goes on from where it is, because it gets worse before it gets better."""
 
     def sweep(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> float:
         """Fly the episodes once, then take a step of the policy for each of their whole windows.

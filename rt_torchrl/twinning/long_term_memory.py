@@ -1,6 +1,5 @@
-"""What step 1 stores: transitions for the critic in the long term, trajectories for the twin in the short term."""
+"""D_L: the transitions that critics learn from, by priority."""
 
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -13,15 +12,6 @@ from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplay
 
 AT_ONCE = 100
 """Batches drawn in one call: enough for its overhead not to matter, and few enough for their copies to be small."""
-
-
-class ShortTermMemory(deque):
-    """D_S: the records of the last ``capacity`` real episodes, oldest first."""
-
-    def __init__(self, capacity: int):
-        if capacity < 1:
-            raise ValueError(f"capacity={capacity} of the short-term memory (n_S) must be at least 1.")
-        super().__init__(maxlen=capacity)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,16 +51,20 @@ class LongTermMemory:
     """
 
     def __init__(self, config: LongTermMemoryConfig, *, generator: torch.Generator):
+        self._config, self._device, self._generator = config, generator.device, on_cpu(generator)
+        self._clear()
+
+    def _clear(self) -> None:
+        config = self._config
         self.sampler = PriorityReader(
             config.capacity, alpha=config.prioritisation, beta=config.correction, eps=config.offset
         )
         self._buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(config.capacity, device=generator.device),
+            storage=LazyTensorStorage(config.capacity, device=self._device),
             sampler=self.sampler,
             writer=LeastPriorityWriter(self.sampler),
         )
-        self._generator = generator
-        self._buffer.set_rng(generator)
+        self._buffer.set_rng(self._generator)
 
     def __len__(self) -> int:
         return len(self._buffer)
@@ -99,15 +93,37 @@ class LongTermMemory:
     def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
         """Give sampled transitions their new TD errors δ."""
         # Single precision, because the sampler draws in it when it is given a generator.
-        self.sampler.update_priority(index, td_errors.detach().abs().float())
+        self.sampler.update_priority(index.cpu(), td_errors.detach().abs().float().cpu())
 
     def state_dict(self) -> dict[str, Any]:
-        return self._buffer.state_dict()
+        """The transitions in their places, and the leaves of the trees that they are sampled by.
+
+        The trees themselves are objects of TorchRL; every other node of them is a sum or a minimum of its leaves.
+        """
+        count = len(self)
+        if not count:
+            return {"count": 0}
+        stored = self._buffer[:].flatten_keys(".").to_dict()
+        leaves = {name: self.sampler.leaves(name, count) for name in TREES}
+        own = {} if self._generator.device == self._device else {"generator": self._generator.get_state()}
+        return {"count": count, "transitions": stored, "max_priority": self.sampler._max_priority} | leaves | own
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._buffer.load_state_dict(state)
-        # Loading gives the buffer a generator of its own; the shared one has its own place in a checkpoint.
-        self._buffer.set_rng(self._generator)
+        self._clear()
+        count = state["count"]
+        if not count:
+            return
+        transitions = TensorDict(state["transitions"], batch_size=[count], device=self._device)
+        places = torch.arange(count, device="cpu")
+        self._buffer._storage.set(places, transitions.unflatten_keys("."))
+        for name in TREES:
+            getattr(self.sampler, name)[places] = state[name].cpu()
+        self.sampler._max_priority = state["max_priority"]
+        if "generator" in state:
+            self._generator.set_state(state["generator"].cpu())
+
+
+TREES = ("_sum_tree", "_min_tree")
 
 
 class PriorityReader(PrioritizedSampler):
@@ -115,8 +131,12 @@ class PriorityReader(PrioritizedSampler):
 
     def priorities(self, count: int) -> Float[Tensor, " {count}"]:
         """(|δ_i| + tol)^α* of the first ``count`` transitions."""
+        return self.leaves("_sum_tree", count)
+
+    def leaves(self, tree: str, count: int) -> Float[Tensor, " {count}"]:
+        """What a tree holds of the first ``count`` transitions."""
         # The tree answers for a single one with a scalar.
-        return torch.as_tensor(self._sum_tree[torch.arange(count)]).reshape(count)
+        return torch.as_tensor(getattr(self, tree)[torch.arange(count, device="cpu")], device="cpu").reshape(count)
 
 
 class LeastPriorityWriter(Writer):
@@ -143,7 +163,7 @@ class LeastPriorityWriter(Writer):
                 f"{n} transitions at once do not fit a long-term memory of {capacity}; raise capacity to at least one "
                 "episode."
             )
-        free = torch.arange(stored, min(stored + n, capacity))
+        free = torch.arange(stored, min(stored + n, capacity), device="cpu")
         evicted = self._sampler.priorities(stored).argsort(stable=True)[: n - len(free)]
         index = torch.cat([free, evicted])
         data.set("index", index)
@@ -164,3 +184,11 @@ class LeastPriorityWriter(Writer):
 
     def loads(self, path) -> None:
         """Nothing to read, as in :meth:`_empty`."""
+
+
+def on_cpu(generator: torch.Generator) -> torch.Generator:
+    """A generator for the sampler, whose tree of priorities is on the CPU: the same one, or one that it seeds."""
+    if generator.device.type == "cpu":
+        return generator
+    seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+    return torch.Generator(device="cpu").manual_seed(int(seed))

@@ -1,0 +1,83 @@
+"""The bar of a training: what it is doing, from the first second to the last."""
+
+import sys
+import threading
+import time
+from typing import Any
+
+from tqdm import tqdm
+
+from rt_torchrl.runs.results_table import progress
+from rt_torchrl.trajectories.engines.compilation import watched_compilation
+
+WORDS = {
+    "interact": "real episode",
+    "update_model_free": "model-free update",
+    "fit_exogenous": "fitting the input",
+    "assimilate": "assimilating",
+    "plan": "planning",
+    "switch_policies": "comparing policies",
+}
+"""How the steps of the algorithm are shown."""
+ON_TERMINAL, IN_FILE = 0.5, 30.0
+"""Seconds between two refreshes: a file keeps every one of them."""
+
+
+class Progress:
+    """A bar over the real episodes that moves while a step is under way.
+
+    It shows the costs of the last episode, what is being done, for how long, and whether it is the compiler's time: the
+    first graphs take a minute in which nothing else would move.
+
+    Args:
+        total: real episodes of the training.
+        done: those that were done before.
+    """
+
+    def __init__(self, total: int, done: int = 0):
+        self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True)
+        self._interval = ON_TERMINAL if sys.stderr.isatty() else IN_FILE
+        self._costs, self._doing, self._since = "", "starting", time.perf_counter()
+        self._compiling, self._ended = False, threading.Event()
+        self._thread = threading.Thread(target=self._keep_moving, daemon=True)
+
+    def __enter__(self) -> "Progress":
+        self._watch = watched_compilation(self._compilation)
+        self._watch.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._watch.__exit__(None, None, None)
+        self._doing = ""
+        self._show()
+        self._bar.close()
+
+    def doing(self, what: str) -> None:
+        """Say what begins now: a step of the algorithm, or anything else in words."""
+        self._doing, self._since = WORDS.get(what, what), time.perf_counter()
+        self._show()
+
+    def episode(self, record: dict[str, Any]) -> None:
+        """Count an episode and show its costs."""
+        self._costs = progress(record)
+        self._bar.update()
+        self._show()
+
+    def write(self, line: str) -> None:
+        """A line above the bar."""
+        self._bar.write(line)
+
+    def _compilation(self, under_way: bool) -> None:
+        self._compiling = under_way
+
+    def _keep_moving(self) -> None:
+        while not self._ended.wait(self._interval):
+            self._show()
+
+    def _show(self) -> None:
+        seconds = time.perf_counter() - self._since
+        doing = f"{self._doing} {seconds:.0f} s{', compiling' if self._compiling else ''}" if self._doing else ""
+        self._bar.set_postfix_str("; ".join(part for part in (self._costs, doing) if part))

@@ -1,0 +1,189 @@
+"""What learners with a critic share: transitions with sums of rewards, prioritised memory, optimisers."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import MultiStep
+from torchrl.modules import ValueOperator
+from torchrl.objectives import LossModule
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import mlp
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.twinning.learners.learner import LearnerConfig
+from rt_torchrl.twinning.long_term_memory import LongTermMemory
+
+TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))
+
+
+class Critic(nn.Module):
+    """q(e, a): a perceptron of the observation and of the action scaled from its range to [−1, 1].
+
+    Args:
+        plant: gives the number of observations and the ranges of the actions.
+        hidden: widths of the hidden layers.
+        generator: source of the initial weights.
+    """
+
+    def __init__(self, plant: Plant, hidden: Sequence[int], *, generator: torch.Generator):
+        super().__init__()
+        low, high = bounds(plant.actions)
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("half_range", 0.5 * (high - low))
+        self.network = mlp(
+            len(plant.observations) + len(plant.actions), hidden, 1, generator=generator, activation=nn.SiLU
+        )
+
+    def forward(
+        self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
+    ) -> Float[Tensor, "*batch 1"]:
+        return self.network(torch.cat([observation, (action - self.middle) / self.half_range], -1))
+
+
+class ActorCritic(ABC):
+    r"""A policy that climbs the value of one or more critics, which learn from prioritised replay.
+
+    .. math::
+        y_k = \sum_{j<m}\gamma^jr_{k+j} + \gamma^m\,q'(e_{k+m}, \pi(e_{k+m})), \qquad \delta_k = y_k - q(e_k, a_k)
+
+    A subclass makes the loss, one of TorchRL's, and says in which order its parts descend.
+
+    Args:
+        plant: see :class:`Critic`.
+        policy: π_mf, updated in place.
+        config: see :class:`LearnerConfig`.
+        generator: source of the critics' initial weights and of the samples.
+
+    Raises:
+        ValueError: if ``return_steps`` exceeds an episode of the plant.
+    """
+
+    loss: LossModule
+
+    def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator):
+        if config.return_steps > plant.n_steps:
+            raise ValueError(
+                f"return_steps={config.return_steps} exceeds the {plant.n_steps} control intervals of an episode of "
+                f"plant {plant.name!r}; use at most a tenth of them, or a longer horizon."
+            )
+        self.config, self.policy, self.generator = config, policy, generator
+        self.batch_size = min(config.batch_size, plant.n_steps)
+        self.memory = LongTermMemory(config.memory, generator=generator)
+        self.critics = nn.ModuleList(self.make_critics(plant)).to(generator.device)
+        self.loss = self.make_loss(plant)
+        self.critic_optimiser = torch.optim.Adam(self.critic_weights(), lr=config.critic_rate)
+        self._returns = MultiStep(config.discount, config.return_steps)
+        self.restart()
+
+    @abstractmethod
+    def make_critics(self, plant: Plant) -> list[Critic]:
+        """The critics, with random initial weights."""
+
+    @abstractmethod
+    def make_loss(self, plant: Plant) -> LossModule:
+        """TorchRL's loss of policy and critics."""
+
+    @abstractmethod
+    def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, Float[Tensor, " n"]]:
+        """Loss of the critics, and |δ| of each transition."""
+
+    @abstractmethod
+    def actor_loss(self, batch: TensorDictBase) -> Tensor:
+        """−E[q(e, π(e))], with the critics' weights detached."""
+
+    @abstractmethod
+    def update(self) -> TensorDict:
+        """See :meth:`Learner.update`."""
+
+    @abstractmethod
+    def critic_weights(self) -> list[nn.Parameter]:
+        """The weights that the critics' optimiser trains."""
+
+    def actor_module(self) -> TensorDictModule:
+        """The policy as TorchRL's losses take it."""
+        return TensorDictModule(self.policy, in_keys=["observation"], out_keys=["action"])
+
+    def critic_modules(self) -> list[ValueOperator]:
+        """The critics as TorchRL's losses take them."""
+        return [ValueOperator(critic, in_keys=["observation", "action"]) for critic in self.critics]
+
+    def store(self, episode: TensorDictBase) -> None:
+        """Keep the transitions of a real episode, by their TD errors."""
+        transitions = self.transitions(episode)
+        self.memory.store(transitions, self.td_errors(transitions))
+
+    def transitions(self, episode: TensorDictBase) -> TensorDictBase:
+        """What D_L keeps of an episode, a TensorDict: (e_k, a_k, return, e_{k+m}) of the intervals with m after them.
+
+        The last m − 1 are left out: with shorter sums, the values of where episodes end, such as a target that is
+        reached, would rest on hardly anything but themselves, and drift without bound.
+        """
+        whole = len(episode) - self.config.return_steps + 1
+        transitions = episode.select(*TRANSITION)
+        transitions["next", "reward"] = self.config.reward_scale * transitions["next", "reward"]
+        returns = self._returns(transitions.unsqueeze(0))[0, :whole]
+        return returns.select(*TRANSITION, "steps_to_next_obs", strict=False)
+
+    @torch.no_grad()
+    def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
+        """|δ| of transitions under the critics and target critics as they are."""
+        return self.critic_loss(transitions.copy())[1]
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """See :meth:`Learner.observations`."""
+        return self.memory.observations()
+
+    def restart(self) -> None:
+        """Forget the state of the policy's optimiser, because its weights have jumped."""
+        self.actor_optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.config.actor_rate)
+
+    def critic_step(self) -> tuple[Tensor, Tensor, Tensor]:
+        """One iteration of the critics; loss and mean |δ| for the rewards as they are, and the gradient's norm."""
+        scale = self.config.reward_scale
+        batch = self.memory.sample(self.batch_size)
+        loss, td_error = self.critic_loss(batch)
+        self.critic_optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.get_total_norm([w.grad for w in self.critic_weights()])
+        self.critic_optimiser.step()
+        self.memory.refresh(batch["index"], td_error)
+        return loss.detach() / scale**2, td_error.mean() / scale, norm
+
+    def actor_step(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """One iteration of the policy; the mean value for the rewards as they are, and the gradient's norm."""
+        loss = self.actor_loss(batch)
+        self.actor_optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.gradient_limit)
+        self.actor_optimiser.step()
+        return -loss.detach() / self.config.reward_scale, norm
+
+    def state_dict(self) -> dict[str, Any]:
+        """See :meth:`Learner.state_dict`."""
+        return {name: getattr(self, name).state_dict() for name in COMPONENTS}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See :meth:`Learner.load_state_dict`."""
+        for name in COMPONENTS:
+            getattr(self, name).load_state_dict(state[name])
+
+
+CRITIC_FINDINGS, ACTOR_FINDINGS = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")
+COMPONENTS = ("loss", "critic_optimiser", "actor_optimiser", "memory")
+
+
+def means(critic: list[tuple[Tensor, ...]], actor: list[tuple[Tensor, ...]]) -> TensorDict:
+    """Means over the iterations of what :meth:`ActorCritic.critic_step` and :meth:`ActorCritic.actor_step` return."""
+    names = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")
+    found = {}
+    for keys, iterations in zip(names, (critic, actor), strict=True):
+        found |= {
+            key: torch.stack(values).mean() for key, values in zip(keys, zip(*iterations, strict=True), strict=False)
+        }
+    return TensorDict(found)

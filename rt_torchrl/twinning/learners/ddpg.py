@@ -1,0 +1,60 @@
+"""Deep deterministic policy gradient, the paper's step 2, from TorchRL's parts."""
+
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.twinning.learners.actor_critic import ActorCritic, Critic, means
+
+
+class DDPG(ActorCritic):
+    r"""Deep deterministic policy gradient with prioritised replay (paper, section 4.1).
+
+    .. math::
+        J_q = \mathbb E[w_k\delta_k^2], \qquad
+        \frac{dR}{dw_a} = \mathbb E\Big[\frac{dq}{da}\frac{d\pi}{dw_a}\Big]
+
+    with one critic q, its target q′, and the importance weights w of the sampling. First come n_Q iterations of the
+    critic, then n_A of the policy. See :class:`ActorCritic` for the arguments and δ.
+    """
+
+    def make_critics(self, plant: Plant) -> list[Critic]:
+        return [Critic(plant, self.config.critic_hidden, generator=self.generator)]
+
+    def make_loss(self, plant: Plant) -> DDPGLoss:
+        (critic,) = self.critic_modules()
+        loss = DDPGLoss(self.actor_module(), critic, loss_function="l2", delay_actor=False, delay_value=True)
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.config.discount)
+        self.target = SoftUpdate(loss, tau=self.config.target_rate)
+        return loss
+
+    @property
+    def critic(self) -> nn.Module:
+        """q."""
+        return self.critics[0]
+
+    def critic_weights(self) -> list[nn.Parameter]:
+        return list(self.critic.parameters())
+
+    def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, Float[Tensor, " n"]]:
+        value, metadata = self.loss.loss_value(batch)
+        return value, metadata["td_error"].sqrt()  # TorchRL reports δ²
+
+    def actor_loss(self, batch: TensorDictBase) -> Tensor:
+        return self.loss.loss_actor(batch)[0]
+
+    def update(self) -> TensorDict:
+        """n_Q critic iterations, then n_A policy iterations.
+
+        Returns:
+            Means over the iterations of ``critic_loss``, ``td_error``, ``value`` and both gradient norms; the first
+            three for the rewards as they are, without ``reward_scale``.
+        """
+        critic = []
+        for _ in range(self.config.critic_iterations):
+            critic.append(self.critic_step())
+            self.target.step()
+        batches = self.memory.samples(self.batch_size, self.config.actor_iterations)
+        return means(critic, [self.actor_step(batch) for batch in batches])

@@ -1,0 +1,42 @@
+"""Planning over whole virtual episodes, as in the paper."""
+
+from typing import Any
+
+from torch import nn
+
+from rt_torchrl.optimisers.descent import Descended, Descent
+from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.planners.planner import PlannerConfig
+
+
+class WholeEpisodes:
+    r"""Descends :math:`J_a = \mathbb E\frac1{T_o}\int L_a\,dt` over the weights of π_mb, on the twin (paper, eq. J_a).
+
+    Args:
+        twin: with the best closure so far, w_p*.
+        policy: π_mb, updated in place.
+        config: see :class:`PlannerConfig`.
+    """
+
+    def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
+        self.twin, self.policy, self.config = twin, policy, config
+        self.descent = Descent(policy, config.descent)
+
+    def plan(self, episodes: Scenario) -> Descended:
+        """n_mb gradient steps; the policy keeps the best weights seen in them."""
+        return self.descent.run(lambda: self.twin.cost(self.policy, *episodes), self.config.iterations)
+
+    def refuse(self) -> None:
+        """Start the optimiser afresh: its state led to the plan that was refused."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the state of the optimiser."""
+        self.descent.restart()
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.descent.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.descent.load_state_dict(state)

@@ -1,0 +1,74 @@
+"""What the latest real episodes cost, and what the twin says of them."""
+
+import copy
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.referees import Role
+
+COMPARED = 2
+"""Episodes that are kept: a change takes two."""
+
+
+class Flown(NamedTuple):
+    """A real episode: what the system did, the weights of the policy that flew it, and J_a."""
+
+    trajectory: Trajectory
+    role: Role
+    weights: dict[str, Tensor]
+    cost: float
+
+
+class TrackRecord:
+    """The latest real episodes, oldest first, with the weights that flew them.
+
+    Args:
+        policies: both policies; the weights of an episode are put into a copy of the one that flew it.
+    """
+
+    def __init__(self, policies: Mapping[Role, nn.Module]):
+        self._policies = policies
+        self._flown: deque[Flown] = deque(maxlen=COMPARED)
+
+    def append(self, trajectory: Trajectory, role: Role, cost: float) -> None:
+        """Add an episode that the policy of this role has just flown."""
+        weights = {name: weight.detach().clone() for name, weight in self._policies[role].state_dict().items()}
+        self._flown.append(Flown(trajectory, role, weights, cost))
+
+    @property
+    def real_costs(self) -> tuple[float, ...]:
+        """J_a of the episodes."""
+        return tuple(flown.cost for flown in self._flown)
+
+    def predicted_costs(self, twin: DigitalTwin) -> tuple[float, ...]:
+        """J_a of the same episodes on the twin: the same weights, from the same state, under the same inputs.
+
+        It is infinite where the twin diverges.
+        """
+        return tuple(self._predicted(twin, flown) for flown in self._flown)
+
+    @torch.no_grad()
+    def _predicted(self, twin: DigitalTwin, flown: Flown) -> float:
+        policy = copy.deepcopy(self._policies[flown.role])
+        policy.load_state_dict(flown.weights)
+        trajectory = flown.trajectory
+        try:
+            return twin.cost(policy, trajectory.states[:1], trajectory.exogenous[None]).item()
+        except DivergenceError:
+            return float("inf")
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"flown": [flown._asdict() | {"trajectory": flown.trajectory._asdict()} for flown in self._flown]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._flown.clear()
+        self._flown.extend(
+            Flown(**flown | {"trajectory": Trajectory(**flown["trajectory"])}) for flown in state["flown"]
+        )

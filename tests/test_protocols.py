@@ -1,0 +1,172 @@
+"""Every learner, planner and referee, those of the documentation among them, through the same checks."""
+
+import copy
+import io
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from test_algorithm import twinning, weights
+
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.learners import DDPG, TD3, Learner, LearnerConfig
+from rt_torchrl.twinning.learners.learner import TD3Config
+from rt_torchrl.twinning.planners import (
+    Planner,
+    PlannerConfig,
+    ShortHorizon,
+    ShortHorizonConfig,
+    WholeEpisodes,
+)
+from rt_torchrl.twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
+
+DOCS = Path(__file__).parent.parent / "docs"
+PLANT = LinearQuadratic(horizon=2.0)
+SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16, "critic_hidden": (8,)}
+
+
+def documented(page, name):
+    """The class of that name that a page of the documentation writes."""
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    return scope[name]
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+LEARNERS = {
+    "ddpg": lambda policy: DDPG(PLANT, policy, LearnerConfig(**SMALL), generator=seeded(1)),
+    "td3": lambda policy: TD3(PLANT, policy, LearnerConfig(**SMALL, td3=TD3Config(delay=2)), generator=seeded(1)),
+    "documented": lambda policy: documented("learner.md", "RandomSearch")(policy, generator=seeded(1)),
+}
+PLANNERS = {
+    "whole episodes": lambda twin, policy: WholeEpisodes(twin, policy, PlannerConfig(iterations=2)),
+    "short horizon": lambda twin, policy: ShortHorizon(
+        twin, policy, PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10)), generator=seeded(1)
+    ),
+    "documented": lambda twin, policy: documented("planner.md", "Steps")(twin, policy),
+}
+REFEREES = {
+    "decision tree": lambda: DecisionTree(RefereeConfig(patience=0)),
+    "trust ratio": lambda: TrustRatio(RefereeConfig()),
+    "documented": lambda: documented("referee.md", "ModelFirst")(),
+}
+
+
+def algorithm(**parts):
+    """The algorithm with learner, planner or referee given as an argument: a function of twin and policies."""
+    generator = seeded(2)
+    twin = DigitalTwin(PLANT, PLANT.make_closure(generator))
+    policies = {"model_free": PLANT.make_policy(generator), "model_based": PLANT.make_policy(generator)}
+    given = {"learner": (policies["model_free"],), "planner": (twin, policies["model_based"]), "referee": ()}
+    parts = {name: make(*given[name]) for name, make in parts.items()}
+    config = twinning().config
+    return ReinforcementTwinning(PlantEnv(PLANT), twin, **policies, config=config, generator=generator, **parts)
+
+
+def saved(state):
+    """The state as a file gives it back that may hold tensors and plain containers only."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@pytest.mark.parametrize(
+    "part, protocol, makers",
+    [("learner", Learner, LEARNERS), ("planner", Planner, PLANNERS), ("referee", Referee, REFEREES)],
+)
+def test_a_training_with_each_goes_on_from_its_state_as_if_never_interrupted(part, protocol, makers):
+    """To the bit, with the other two parts by default."""
+    for name, make in makers.items():
+        one, other = algorithm(**{part: make}), algorithm(**{part: make})
+        assert isinstance(getattr(one, part), protocol), name
+        one.episode(), one.episode()
+        other.load_state_dict(saved(one.state_dict()))
+        costs = [found.episode()["real_cost"] for found in (one, other)]
+        assert costs[0] == costs[1], name
+        for role in ("model_free", "model_based"):
+            assert torch.equal(*(weights(found.policies[role]) for found in (one, other))), (name, role)
+        assert one.referee.live == other.referee.live and one.episodes_done == other.episodes_done == 3
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_learners_train_their_policy_in_place_and_no_other(name):
+    found = algorithm(learner=LEARNERS[name])
+    before = {role: weights(policy) for role, policy in found.policies.items()}
+    found.interact()
+    report = found.update_model_free()
+    assert all(value.isfinite() for value in report.values())
+    assert not torch.equal(weights(found.policies["model_free"]), before["model_free"])
+    assert torch.equal(weights(found.policies["model_based"]), before["model_based"])
+    assert found.learner.observations().shape[1] == len(PLANT.observations)
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_planners_improve_their_policy_on_what_they_are_given(name):
+    found = algorithm(planner=PLANNERS[name])
+    found.interact(), found.fit_exogenous()
+    episodes, policy = found.virtual.draw(8), found.policies["model_based"]
+    before = found.virtual.cost(policy, episodes).item()
+    plan = found.planner.plan(episodes)
+    after = found.virtual.cost(policy, episodes).item()
+    assert plan.start == pytest.approx(before, rel=1e-12) and plan.best == pytest.approx(after, rel=1e-12)
+    assert after < before and plan.gradient > 0 and plan.iterations >= 1
+
+
+@pytest.mark.parametrize("name", REFEREES)
+def test_referees_ask_one_question(name):
+    referee = REFEREES[name]()
+    assert referee.worse(2.0, than=1.0) and not referee.worse(1.0, than=2.0) and not referee.worse(1.0, than=1.0)
+    # A policy that diverges loses against any, and nobody profits from a comparison with what is not a number.
+    assert referee.worse(float("nan"), than=1.0) and not referee.worse(1.0, than=float("inf"))
+
+
+def test_a_learner_of_another_policy_is_refused():
+    other = PLANT.make_policy(seeded(5))
+    with pytest.raises(ValueError, match="learner trains another policy than model_free"):
+        algorithm(learner=lambda policy: LEARNERS["ddpg"](other))
+    with pytest.raises(ValueError, match="planner trains another policy than model_based"):
+        algorithm(planner=lambda twin, policy: PLANNERS["whole episodes"](twin, other))
+
+
+def test_configuration_names_the_parts():
+    parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="trust_ratio")}
+    short = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10))
+    found = twinning(PLANT, **parts, planner=short)
+    kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
+    assert kinds == ["TD3", "ShortHorizon", "TrustRatio"]
+    report = found.episode()
+    assert {"critic_loss", "value", "J_a_plan", "J_a_model_free", "event"} <= set(report.keys())
+
+
+def test_the_state_of_another_training_is_refused_by_the_name_of_what_does_not_fit():
+    found, other = algorithm(), algorithm(learner=LEARNERS["td3"])
+    with pytest.raises(ValueError, match="the saved state of learner does not fit"):
+        found.load_state_dict(copy.deepcopy(other.state_dict()))
+
+
+def test_evidence_predicts_the_cost_of_the_flight_itself():
+    """A twin with the true closure flies the real episodes again at their cost: no exploration, the same inputs."""
+    from rt_torchrl.systems.exploration import ExplorationConfig
+
+    found = twinning(PLANT, closure=copy.deepcopy(PLANT.closure), exploration=ExplorationConfig(episodes=0))
+    found.interact()
+    found.policies["model_free"].load_state_dict({"gain": torch.tensor([[0.9, 1.2]], dtype=torch.float64)})
+    found.interact()
+    real, predicted = found.track_record.real_costs, found.track_record.predicted_costs(found.twin)
+    assert len(real) == 2 and real[0] != real[1]
+    assert predicted == pytest.approx(real, rel=1e-12)
+    evidence = Evidence(
+        live_cost=1.0, idle_cost=2.0, idle_weight_change=1.0, real_costs=real, predicted_costs=lambda: predicted
+    )
+    referee = TrustRatio(RefereeConfig())
+    referee.doubt_count = 5
+    assert referee.decide(evidence) == "keep" and referee.doubt_count == 0
