@@ -1,6 +1,6 @@
 r"""The oracle plant: linear dynamics and quadratic costs, so that rollouts, costs and optimal gains have closed forms.
 
-.. math:: \dot s = A s + B a + z + p, \qquad L_a = s^\top Q s + a^\top R a, \qquad p = C s
+.. math:: \dot s = A s + B a + D z + p, \qquad L_a = s^\top Q s + a^\top R a, \qquad p = C s
 
 with the closure C the unknown part of the dynamics. With A and B in real-Jordan form nothing here is shared with the
 library's solvers: the tests compute matrix exponentials and Riccati solutions with scipy.
@@ -52,6 +52,7 @@ class LinearQuadratic(Plant):
 
     A = ((0.0, 1.0), (-1.0, -0.3))
     B = ((0.0,), (1.0,))
+    D = ((0.0,), (1.0,))
     Q = ((1.0, 0.0), (0.0, 0.5))
     R = ((0.1,),)
     true_closure = ((0.0, 0.0), (-0.2, 0.1))
@@ -59,11 +60,11 @@ class LinearQuadratic(Plant):
     def __init__(self, *, dt=0.1, horizon=5.0, noise=0.05):
         super().__init__(dt=dt, horizon=horizon, closure=LinearClosure(self.true_closure))
         self.noise = noise
-        for name in "ABQR":
+        for name in "ABDQR":
             self.register_buffer(f"_{name}", torch.tensor(getattr(self, name), dtype=torch.float64))
 
     def vector_field(self, t, state, action, exogenous, closure):
-        force = torch.cat([torch.zeros_like(exogenous), exogenous], -1)
+        force = (exogenous.unsqueeze(-2) * self._D).sum(-1)
         return (
             (state.unsqueeze(-2) * self._A).sum(-1) + (action.unsqueeze(-2) * self._B).sum(-1) + force + closure(state)
         )
@@ -79,14 +80,15 @@ class LinearQuadratic(Plant):
         return 0.5 * ((state - measured) ** 2).sum(-1)
 
     def draw_initial_state(self, batch, generator):
-        return torch.randn(batch, 2, generator=generator, dtype=torch.float64)
+        return torch.randn(batch, len(self.states), generator=generator, dtype=torch.float64)
 
     def draw_exogenous(self, batch, generator):
         return self.noise * torch.randn(batch, self.n_steps, 1, generator=generator, dtype=torch.float64)
 
     def make_closure(self, generator):
         start = torch.tensor(self.true_closure, dtype=torch.float64)
-        return LinearClosure(start + 0.3 * torch.randn(2, 2, generator=generator, dtype=torch.float64))
+        return LinearClosure(start + 0.3 * torch.randn(start.shape, generator=generator, dtype=torch.float64))
 
     def make_policy(self, generator):
-        return LinearGain(0.1 * torch.randn(1, 2, generator=generator, dtype=torch.float64))
+        shape = len(self.actions), len(self.observations)
+        return LinearGain(0.1 * torch.randn(shape, generator=generator, dtype=torch.float64))
