@@ -105,11 +105,13 @@ class Config:
         every = POLICIES.get(plant, {}).items()
         return {name: options for name, options in every if not (self.quick and name in LONG_ONLY)}
 
+    def episodes_of(self, plant: str) -> int:
+        """Real episodes of every training of a plant."""
+        return SHORT_EPISODES if self.quick else EPISODES[plant]
+
     def options_of(self, plant: str) -> tuple[str, ...]:
-        """Options of every training of a plant."""
-        if self.quick:
-            return "--quick", "--episodes", str(SHORT_EPISODES), "--horizon", str(SHORT[plant])
-        return ("--unseen", str(self.unseen), "--episodes", str(EPISODES[plant]))
+        """Further options of every training of a plant."""
+        return ("--quick", "--horizon", str(SHORT[plant])) if self.quick else ("--unseen", str(self.unseen))
 
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Of a plant: those of every variant and arm, a list over the seeds."""
@@ -120,6 +122,7 @@ class Config:
             place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
             every_option = (*self.options_of(plant), "--unseen-every", "1", *further)
             common = {"recipe": recipe_of(plant), "arm": arm, "variant": variant, "options": every_option}
+            common["episodes"] = self.episodes_of(plant)
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
@@ -138,7 +141,7 @@ class Config:
         starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
         best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
         tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
-        system = recipe_of(plant), self.options_of(plant)
+        system = recipe_of(plant), ("--episodes", str(self.episodes_of(plant)), *self.options_of(plant))
         found = {"oracle": partial(oracle, *system, **best)}
         found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
         return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}

@@ -1,17 +1,18 @@
 """The study's tasks side by side: processes, progress and failures."""
 
 import os
+import time
 
 import pytest
-from handwritten_study import training, written
+from handwritten_study import WRITE_RESULTS, training, written
 
+from rt_torchrl.study import scheduling
 from rt_torchrl.study.scheduling import side_by_side
 
 
 def computed(tmp_path, backend, jobs=2):
-    """What the study computes side by side from two trainings of a recipe that only writes its process."""
-    main = "(config.log_dir / 'metrics.json').write_text(json.dumps({'process': os.getpid()}))"
-    script = written(tmp_path / "tiny.py", main)
+    """What the study computes side by side from two trainings of a recipe that only writes results."""
+    script = written(tmp_path / "tiny.py", WRITE_RESULTS)
     trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
     side_by_side([[task] for task in trainings], backend=backend, jobs=jobs)
     return [t.metrics()["process"] for t in trainings]
@@ -43,6 +44,21 @@ def test_a_batch_runs_in_one_process_and_the_bar_counts_tasks(tmp_path, capsys):
     assert all(len(set(found)) == 1 for found in workers)
     shown = capsys.readouterr().err
     assert "1/6" in shown and "6/6" in shown
+
+
+class Slow(Counted):
+    """A task that takes several glances of the bar."""
+
+    def run(self):
+        time.sleep(0.3)
+        super().run()
+
+
+def test_the_bar_moves_inside_a_batch(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(scheduling, "GLANCE", 0.05)
+    side_by_side([[Slow(tmp_path / str(task)) for task in range(3)]], backend="loky", jobs=1)
+    shown = capsys.readouterr().err
+    assert all(f"{done}/3" in shown for done in range(4))
 
 
 def test_a_task_that_fails_stops_no_other(tmp_path):

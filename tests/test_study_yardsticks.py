@@ -19,6 +19,16 @@ def test_what_is_kept_is_not_computed_again(tmp_path):
     assert len(calls) == 1
 
 
+@pytest.mark.parametrize("left", ["", '{"costs": [1.0', "null"])
+def test_a_damaged_yardstick_is_computed_again(tmp_path, left):
+    yardstick = Yardstick(tmp_path / "x.json", lambda: {"costs": [1.0]})
+    yardstick.path.write_text(left)
+    assert not yardstick.done()
+    with pytest.warns(UserWarning, match=r"x\.json is damaged; what it held is computed again"):
+        assert yardstick.run() == {"costs": [1.0]}
+    assert yardstick.done()
+
+
 def test_a_system_with_model_error_ends_as_its_recipe_says():
     turbine, drone, tank = (plants()[name]() for name in ("wind_turbine", "flapping_wing", "cryogenic_tank"))
     recipes = [RECIPES / f"{name}.py" for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]

@@ -1,12 +1,12 @@
 """One training of the study, as the command of its recipe."""
 
 import contextlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.study.json_file import read_json
 from rt_torchrl.twinning.algorithm import Arm
 
 CHANGED = "model error"
@@ -33,6 +33,7 @@ class Training:
         seed: of the run.
         variant: key of ``VARIANTS``.
         folder: run folder.
+        episodes: number of real episodes.
         options: further options of the recipe.
         figures: draw its figures; the report shows those of one training of a plant, and drawing takes up to 25 s.
     """
@@ -42,6 +43,7 @@ class Training:
     seed: int
     variant: str
     folder: Path
+    episodes: int
     options: tuple[str, ...] = ()
     figures: bool = False
 
@@ -57,6 +59,7 @@ class Training:
         """Options of the recipe; goes on with a run that was interrupted after its first episode."""
         begun = (self.folder / "checkpoint.pt").exists()
         options = ["--seed", str(self.seed), "--twinning.arm", self.arm, "--log-dir", str(self.folder)]
+        options += ["--episodes", str(self.episodes)]
         # The report compares costs with each seed's own start, not with those of random ones.
         options += ["--figures-every", "0", "--untrained", "0", "--threads", "1"]
         options += ["--resume" if begun else "--overwrite"]
@@ -68,15 +71,15 @@ class Training:
         return " ".join(["uv run", str(self.recipe), *self.arguments()])
 
     def done(self) -> bool:
-        """Whether its results are there, with the figures if it draws them."""
+        """Whether the results of all its episodes are there, with the figures if it draws them."""
         drawn = not self.figures or (self.folder / "figures" / "unseen.png").exists()
-        return drawn and (self.folder / "metrics.json").exists()
+        return drawn and self._results() is not None
 
     def run(self) -> None:
         """Train, unless that is done; what the recipe prints goes to ``training.log`` in the folder.
 
         Raises:
-            RuntimeError: if the recipe fails; with what it said.
+            RuntimeError: if the recipe fails, with what it said, or ends without the results of all episodes.
         """
         if self.done():
             return
@@ -85,12 +88,32 @@ class Training:
         log, command, arguments = self.folder / "training.log", self.command(), self.arguments()
         with log.open("w") as output, contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             print(command, flush=True)
+            if (self.folder / "metrics.json").exists():
+                print("the results in this folder are damaged or incomplete; this training replaces them", flush=True)
             try:
                 recipe = load_recipe(self.recipe)
                 recipe.main(from_command_line(recipe.Config, arguments))
             except (Exception, SystemExit) as error:
                 raise RuntimeError(f"{command} failed; see {log}: {error}") from error
+        if not self.done():
+            raise RuntimeError(f"{command} ended without the results of {self.episodes} episodes; see {log}")
 
     def metrics(self) -> dict[str, Any]:
-        """Its ``metrics.json``."""
-        return json.loads((self.folder / "metrics.json").read_text())
+        """Its ``metrics.json``.
+
+        Raises:
+            ValueError: if the file is missing or damaged, or holds the results of fewer or more episodes.
+        """
+        if (found := self._results()) is None:
+            raise ValueError(
+                f"{self.folder} holds no results of a training of {self.episodes} episodes; run the study again, it "
+                "computes what is missing."
+            )
+        return found
+
+    def _results(self) -> dict[str, Any] | None:
+        # A run that is interrupted ends with results too, those of the episodes that it has done.
+        found = read_json(self.folder / "metrics.json") or {}
+        episodes, summary = found.get("episodes"), found.get("summary")
+        whole = isinstance(summary, dict) and isinstance(episodes, list) and len(episodes) == self.episodes
+        return found if whole else None

@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 
@@ -38,15 +40,18 @@ class Yardstick:
     compute: Callable[[], dict[str, Any]]
 
     def done(self) -> bool:
-        """Whether it is kept."""
-        return self.path.exists()
+        """Whether a whole result is kept."""
+        return read_json(self.path) is not None
 
     def run(self) -> dict[str, Any]:
-        """What is kept, or else what is computed now."""
-        if not self.done():
-            found = self.compute()
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.path.write_text(json.dumps(found, indent=2) + "\n")
+        """What is kept, or else what is computed now; that replaces a damaged file."""
+        if (kept := read_json(self.path)) is not None:
+            return kept
+        if self.path.exists():
+            warnings.warn(f"{self.path} is damaged; what it held is computed again.", stacklevel=2)
+        found = self.compute()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.write_text(json.dumps(found, indent=2) + "\n")
         return json.loads(self.path.read_text())
 
 
