@@ -9,7 +9,7 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 GLANCE = 1.0
-"""Between two looks at what is done [s]."""
+"""Time between two looks at what is done [s]."""
 
 
 @runtime_checkable
@@ -60,14 +60,17 @@ def in_a_row(tasks: Sequence[Task]) -> list[str]:
 def progress(tasks: Sequence[Task]) -> Iterator[None]:
     """A bar of the tasks that are done, for as long as the context lasts.
 
-    It looks at the results rather than hears of them, and so follows workers on other machines too.
+    The bar looks for results that were missing at its last look. So it counts the tasks inside a batch and on other
+    machines; joblib's generator gives one result for a whole batch, and none at all on Ray's backend.
     """
     stopped = threading.Event()
-    before = sum(task.done() for task in tasks)
-    with tqdm(total=len(tasks), initial=before, unit="task", desc="study", dynamic_ncols=True) as bar:
+    missing = [task for task in tasks if not task.done()]
+    done = len(tasks) - len(missing)
+    with tqdm(total=len(tasks), initial=done, unit="task", desc="study", dynamic_ncols=True) as bar:
 
         def look() -> None:
-            bar.update(sum(task.done() for task in tasks) - bar.n)
+            missing[:] = [task for task in missing if not task.done()]
+            bar.update(len(tasks) - len(missing) - bar.n)
 
         def watch() -> None:
             while not stopped.wait(GLANCE):
