@@ -1,6 +1,5 @@
 """What reinforcement twinning is worth: every arm on every plant, classical controllers, and the best possible."""
 
-import json
 import os
 import shutil
 from dataclasses import dataclass, replace
@@ -14,9 +13,11 @@ from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
-from rt_torchrl.study import captions, page, report
+from rt_torchrl.study import captions, report
 from rt_torchrl.study import figures as charts
-from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
+from rt_torchrl.study.names import title
+from rt_torchrl.study.report import CaptionedFigure
+from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import Task, side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
 from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, cost_over_episodes, oracle
@@ -233,9 +234,10 @@ def gather(config: Config) -> Results:
     return results
 
 
-def draw(config: Config, results: Results) -> list[str]:
-    """Figures of the study and of the first twinning run of each plant, as Markdown with captions."""
-    folder = config.kept / "figures"
+def draw(config: Config, results: Results) -> list[CaptionedFigure]:
+    """Figures of the study and of the first twinning run of each plant, with captions."""
+    place = Path("figures")
+    folder = config.kept / place
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
     if config.variant_seeds:
@@ -250,22 +252,21 @@ def draw(config: Config, results: Results) -> list[str]:
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
-        found.append(page.figure(folder / f"{name}.png", config.kept, texts[name]))
+        found.append(CaptionedFigure(place / f"{name}.png", texts[name]))
     for plant in config.chosen():
         first = config.trainings(plant)["nominal", "twinning"][0]
         for name, text in captions.of_run(plant, first.metrics()).items():
             copy = folder / f"{plant}_{name}.png"
             shutil.copy(first.folder / "figures" / f"{name}.png", copy)
-            found.append(page.figure(copy, config.kept, f"{captions.title(plant)}, seed 0. {text}"))
+            found.append(CaptionedFigure(place / copy.name, f"{title(plant)}, seed 0. {text}"))
     return found
 
 
 def write(config: Config) -> Path:
     """The report: Markdown, HTML, figures and ``study.json``; returns the page."""
     results = gather(config)
-    sections = report.sections(results, figures=draw(config, results), quick=config.quick, command=command(config))
-    (config.kept / "study.json").write_text(json.dumps(report.numbers(results), indent=2) + "\n")
-    return page.write(config.kept, "What reinforcement twinning is worth", sections)[1]
+    figures = draw(config, results)
+    return report.write(config.kept, results, figures=figures, quick=config.quick, command=command(config))[1]
 
 
 def command(config: Config) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
+from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.training import CHANGED, Training
 
 EPISODES = 30

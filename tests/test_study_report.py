@@ -2,30 +2,37 @@
 
 import base64
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from handwritten_study import finished, results
 
-from rt_torchrl.study import captions, page, report
+from rt_torchrl.study import captions, report
 from rt_torchrl.study import figures as charts
+from rt_torchrl.study.report import CaptionedFigure
+from rt_torchrl.study.results import Results
 
 
 def test_the_report_says_what_was_found(tmp_path):
-    found = results(tmp_path)
-    text = "\n\n".join(report.sections(found, figures=["FIGURE"], quick=True, command="uv run x"))
+    figures = [CaptionedFigure(Path("figures/a.png"), "what is seen")]
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "a.png").write_bytes(b"PNG")
+    source, _ = report.write(tmp_path, results(tmp_path), figures=figures, quick=True, command="uv run x")
+    text = source.read_text()
     assert "Within 5 % of the oracle: **yes** (1.020)" in text
     assert "Against model free alone: **better**" in text
     assert "Against model based alone: **neither better nor worse**" in text
     assert "Twinning against the classical PD: **better**" in text
     assert "Twinning, other against the classical PD: **worse**" in text
-    assert "(4.18 ± 0.01)e-1" in text and "no result" in text and "FIGURE" in text
+    assert "(4.18 ± 0.01)e-1" in text and "no result" in text and "uv run x" in text
+    assert "![what is seen](figures/a.png)\n\n*what is seen*" in text
     (row,) = [line for line in text.splitlines() if line.startswith("| noise 1 % | twinning |")]
     assert "| 1.500 |" in row
     assert any(line.startswith("| model error | PD |") and "| 1.000 |" in line for line in text.splitlines())
     assert "Twinning, noise 1 %: against model based alone **neither better nor worse**" in text
     assert "against model free alone **better**" in text
-    numbers = json.loads(json.dumps(report.numbers(found)["flapping_wing"]))
+    numbers = json.loads((tmp_path / "study.json").read_text())["flapping_wing"]
     assert numbers["entries"]["PD"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
     assert numbers["variants"]["noise 1 %"]["twinning"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
 
@@ -85,10 +92,17 @@ def test_captions_of_a_training_come_from_its_metrics(tmp_path):
 def test_the_page_holds_its_figures(tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "a.png").write_bytes(b"\x89PNG")
-    shown = page.figure(tmp_path / "figures" / "a.png", tmp_path, "what is seen")
-    source, html = page.write(tmp_path, "Title", [page.table(["x", "y"], [["1", "2"]]), shown])
-    assert "![what is seen](figures/a.png)" in source.read_text()
+    figures = [CaptionedFigure(Path("figures/a.png"), "what is seen")]
+    _, html = report.write(tmp_path, results(tmp_path), figures=figures, quick=False, command="uv run x")
     text = html.read_text()
     held = base64.b64encode(b"\x89PNG").decode()
     assert "<table>" in text and f'src="data:image/png;base64,{held}"' in text
-    assert "figures/a.png" not in text
+    assert "figures/a.png" not in text and "no result" not in text
+    assert text.count("<h3>") == 1 and text.count("<li>") == 5 + 2
+
+
+def test_a_study_without_variants_has_no_section_of_them(tmp_path):
+    found = results(tmp_path)
+    alone = Results(found.entries, found.summaries, {"flapping_wing": {}})
+    source, _ = report.write(tmp_path, alone, figures=[], quick=False, command="uv run x")
+    assert "Sensor noise and model error" not in source.read_text()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from handwritten_study import EPISODES, finished
 
-from rt_torchrl.study.findings import Entry, arm_entry, difference, spread, weight_error
+from rt_torchrl.study.results import Entry, arm_entry, difference, mean_interval, weight_error
 
 
 def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
@@ -21,7 +21,7 @@ def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
 def test_intervals_cover_the_mean_as_often_as_they_say():
     rng, hits = np.random.default_rng(0), 0
     for _ in range(40):
-        low, high = spread(rng.standard_normal((1, 60)))
+        low, high = mean_interval(rng.standard_normal((1, 60)))
         hits += low < 0.0 < high
     # 95 % of 40 is 38; fewer than 33 has a probability of 1e-3.
     assert hits >= 33

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from rt_torchrl.study.figures import shown
-from rt_torchrl.study.findings import NEAR, Entry, Results, named
+from rt_torchrl.study.names import shown, title
+from rt_torchrl.study.results import HALVES, NEAR, Entry, Results, named
 from rt_torchrl.study.training import CHANGED
-from rt_torchrl.study.variants import HALVES
 
 ARMS = ("twinning", *HALVES)
 RUN = {
@@ -154,11 +153,6 @@ def closure_error(metrics: dict[str, Any]) -> str:
     errors = metrics["summary"]["closure_error"]
     found, start = (", ".join(f"{error:.2g}" for error in errors[when]) for when in ("found", "start"))
     return f"RMS error where the last episode went: {found}; of the initial twin {start}."
-
-
-def title(plant: str) -> str:
-    """A plant at the start of a sentence."""
-    return shown(plant).capitalize()
 
 
 def episodes_to(entry: Entry, oracle: Entry) -> str:

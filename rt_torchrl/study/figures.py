@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, TWIN, caption, legend_below, panels
-from rt_torchrl.study.findings import Entry, named
+from rt_torchrl.study.names import shown
+from rt_torchrl.study.results import Entry, named
 from rt_torchrl.study.training import CHANGED
 
 ARMS = {"twinning": REAL, **ROLES}
@@ -156,8 +157,3 @@ def _colours(entries: list[Entry]) -> dict[str, str]:
     others = list(dict.fromkeys(entry.name for entry in entries if entry.curves and entry.name not in ARMS))
     policies = {name: POLICIES[k % len(POLICIES)] for k, name in enumerate(others)}
     return {entry.name: (ARMS | policies).get(entry.name, REFERENCE) for entry in entries}
-
-
-def shown(name: str) -> str:
-    """A name as it is read."""
-    return name.replace("_", " ")

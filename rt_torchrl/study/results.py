@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.training import Training
 
-RESAMPLES = 2000
+HALVES = ("model_based", "model_free")
+"""Arms that train one of the two controllers alone."""
 NEAR = 1.1
 """Over the oracle's cost: what counts as having come near it."""
 
@@ -41,23 +43,12 @@ class Entry:
 
     def interval(self) -> tuple[float, float]:
         """95 % interval of the mean, by resampling seeds and episodes."""
-        return spread(self.costs)
+        return mean_interval(self.costs)
 
     def episodes_to(self, cost: float) -> list[int | None]:
         """Real episodes after which the live policy first comes within ``NEAR`` of a cost, of each seed."""
         reached = [[k + 1 for k, value in enumerate(curve) if value <= NEAR * cost] for curve in self.curves]
         return [found[0] if found else None for found in reached]
-
-
-def spread(costs: Float[np.ndarray, "seeds episodes"]) -> tuple[float, float]:
-    """95 % percentile-bootstrap interval of the mean over seeds and episodes, both resampled."""
-    rng = np.random.default_rng(0)
-    seeds, episodes = costs.shape
-    rows = rng.integers(seeds, size=(RESAMPLES, seeds))
-    columns = rng.integers(episodes, size=(RESAMPLES, episodes))
-    means = [costs[np.ix_(r, c)].mean() for r, c in zip(rows, columns, strict=True)]
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
 
 
 def difference(first: Entry, second: Entry) -> tuple[float, float]:
@@ -72,8 +63,8 @@ def difference(first: Entry, second: Entry) -> tuple[float, float]:
             f"{second.costs.shape[1]}; compare results of the same study."
         )
     if len(first.costs) != len(second.costs):
-        return spread(first.costs.mean(0, keepdims=True) - second.costs.mean(0, keepdims=True))
-    return spread(first.costs - second.costs)
+        return mean_interval(first.costs.mean(0, keepdims=True) - second.costs.mean(0, keepdims=True))
+    return mean_interval(first.costs - second.costs)
 
 
 def named(entries: list[Entry]) -> dict[str, Entry]:
