@@ -22,6 +22,7 @@ T5 = 0.5 * np.arange(5)
         (T5, [8, 8, math.nan, 8, 8], "r.hh: wind speed at t = 1 s is nan .* interpolation"),
         ([0, 0.5, math.nan, 1.5, 2], np.ones(5), "r.hh: time of sample 2 is nan"),
         (T5, [8, -0.5, 8, 8, 8], "r.hh: wind speed at t = 0.5 s is -0.5 m/s; it must not be negative"),
+        (T5, [8, 1e42, 8, 8, 8], r"r.hh: wind speed at t = 0.5 s is 1e\+42 m/s; it must not exceed 200 m/s"),
         ([0, 0.5, 0.5, 1.0, 1.5], np.ones(5), "r.hh: time goes from 0.5 s to 0.5 s; it must increase"),
         ([0, 0.5, 1.0, 2.5, 3.0], np.ones(5), "r.hh: gap after t = 1 s, where 2 samples are missing"),
         ([0, 0.5, 1.0, 1.6, 2.1], np.ones(5), "r.hh: unequal time step after t = 1 s, 0.6 s instead of 0.5 s"),
@@ -145,6 +146,12 @@ def test_faulty_bts_files_are_refused(tmp_path, spoil, message):
 def test_other_formats_are_refused():
     with pytest.raises(ValueError, match=r"w\.wnd: suffix '\.wnd' is no wind format read here; .*'\.hh'.*'\.bts'"):
         read_wind("w.wnd")
+
+
+@pytest.mark.parametrize("suffix", ["hh", "bts"])
+def test_a_missing_file_is_refused(tmp_path, suffix):
+    with pytest.raises(ValueError, match=rf"wind\.{suffix} is no file; give the path of TurbSim output"):
+        read_wind(tmp_path / f"wind.{suffix}")
 
 
 def peak_memory(read):

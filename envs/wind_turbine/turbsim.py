@@ -18,17 +18,19 @@ def read_wind(path: str | os.PathLike) -> WindRecord:
         path: a ``.hh`` file, see :func:`read_hh`, or a ``.bts`` file, see :func:`read_bts`.
 
     Raises:
-        ValueError: if the suffix is another, or the file is malformed.
+        ValueError: if the suffix is another, there is no such file, or it is malformed.
     """
+    readers = {".hh": read_hh, ".bts": read_bts}
     suffix = Path(path).suffix.lower()
-    if suffix == ".hh":
-        return read_hh(path)
-    if suffix == ".bts":
-        return read_bts(path)
-    raise ValueError(
-        f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' (WrADHH) "
-        "or binary full field '.bts' (WrADFF). A file in the .hh format under another name can go to read_hh."
-    )
+    if suffix not in readers:
+        raise ValueError(
+            f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' "
+            "(WrADHH) or binary full field '.bts' (WrADFF). A file in the .hh format under another name can go to "
+            "read_hh."
+        )
+    if not Path(path).is_file():
+        raise ValueError(f"{path} is no file; give the path of TurbSim output.")
+    return readers[suffix](path)
 
 
 def read_hh(path: str | os.PathLike) -> WindRecord:

@@ -6,6 +6,8 @@ import numpy as np
 
 PRINTED_TIME_RESOLUTION = 1e-3
 """Resolution of the times in a ``.hh`` file [s]; TurbSim prints them as F8.3."""
+GREATEST_SPEED = 200.0
+"""Speed above which a record cannot be of wind [m/s]; the strongest winds on Earth, in tornadoes, reach 135 m/s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,12 +16,12 @@ class WindRecord:
 
     Args:
         time: sample times [s], a vector of n, increasing by equal steps to within the 1 ms that TurbSim prints.
-        speed: longitudinal wind speed u [m/s], a vector of n, not negative.
+        speed: longitudinal wind speed u [m/s], a vector of n, from 0 to ``GREATEST_SPEED``.
         source: where the record comes from, such as the path of the file; named in every error.
 
     Raises:
         ValueError: if there are fewer than two samples, the lengths differ, a value is NaN or infinite, a time does not
-            increase, samples are missing, steps are unequal, or a speed is negative.
+            increase, samples are missing, steps are unequal, or a speed is out of its range.
     """
 
     time: np.ndarray
@@ -72,6 +74,12 @@ class WindRecord:
             raise ValueError(
                 f"{self.source}: wind speed at t = {self.time[bad[0]]:g} s is {self.speed[bad[0]]:g} m/s; it must "
                 "not be negative. Check its sign and the wind direction, which is 0 deg along the rotor axis."
+            )
+
+        if (bad := np.flatnonzero(self.speed > GREATEST_SPEED)).size:
+            raise ValueError(
+                f"{self.source}: wind speed at t = {self.time[bad[0]]:g} s is {self.speed[bad[0]]:g} m/s; it must "
+                f"not exceed {GREATEST_SPEED:g} m/s. Check its unit, and that the file is whole."
             )
 
     def _check_time(self) -> None:
