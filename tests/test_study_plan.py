@@ -1,8 +1,11 @@
 """The plan of the study: which trainings and yardsticks its recipe asks for, and in which batches."""
 
-import pytest
-from handwritten_study import recipe
+import json
 
+import pytest
+from handwritten_study import EPISODES, finish, recipe
+
+from rt_torchrl.study import captions
 from rt_torchrl.study.training import VARIANTS, Training
 
 
@@ -48,3 +51,33 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     assert list(dict.fromkeys(variant for variant, _ in short)) == ["nominal", "noise 5 %", "model error"]
     # What is kept of a quick study is never taken for a result of the whole one.
     assert folders.isdisjoint(t.folder for group in short.values() for t in group)
+
+
+def test_the_report_is_written_from_what_is_kept(tmp_path):
+    """A whole quick study of the drone from results written by hand: nothing is computed."""
+    study = recipe("study")
+    config = study.Config(plants=("flapping_wing",), quick=True, folder=tmp_path)
+    groups = config.trainings("flapping_wing")
+    for training in (training for group in groups.values() for training in group):
+        finish(training)
+    drawn = groups["nominal", "twinning"][0].folder / "figures"
+    drawn.mkdir()
+    names = list(captions.of_run("flapping_wing", groups["nominal", "twinning"][0].metrics()))
+    for name in names:
+        (drawn / f"{name}.png").write_bytes(b"PNG")
+    judged = {"costs": [1.1] * EPISODES, "merit": {"m [m]": {"mean": 1.0}}}
+    line = {"name": "episodes planned on", "unit": "-", "values": [2, 5], "costs": [1.2, 1.1]}
+    for task in study.yardstick_tasks(config, "flapping_wing"):
+        task.path.parent.mkdir(parents=True, exist_ok=True)
+        task.path.write_text(json.dumps(line if task.path.stem == "episode-line" else judged | {"changed": judged}))
+    assert all(task.done() for task in study.ordered_tasks(config))
+    page = study.write(config)
+    text = (page.parent / "README.md").read_text()
+    study_figures = ["learning", "robustness", "variants", "following", "flapping_wing_episode-line"]
+    shown = [part.split(")")[0] for part in text.split("](figures/")[1:]]
+    assert shown == [f"{name}.png" for name in [*study_figures, *(f"flapping_wing_{name}" for name in names)]]
+    assert page.read_text().count("data:image/png;base64,") == len(shown)
+    assert all(f"| {name} |" in text for name in ("twinning", "twinning, perceptron", "PD", "oracle"))
+    assert "1.2 on 2, 1.1 on 5" in text and "--quick" in text
+    numbers = json.loads((page.parent / "study.json").read_text())["flapping_wing"]
+    assert list(numbers["variants"]) == ["noise 5 %", "model error"]

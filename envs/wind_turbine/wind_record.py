@@ -7,7 +7,7 @@ import numpy as np
 PRINTED_TIME_RESOLUTION = 1e-3
 """Resolution of the times in a ``.hh`` file [s]; TurbSim prints them as F8.3."""
 GREATEST_SPEED = 200.0
-"""Speed above which a record cannot be of wind [m/s]; the strongest winds on Earth, in tornadoes, reach 135 m/s."""
+"""Speed above which a record cannot be of wind [m/s]; tornadoes, the strongest winds on Earth, reach about 140 m/s."""
 
 
 @dataclass(frozen=True, eq=False)
