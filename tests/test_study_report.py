@@ -85,7 +85,7 @@ def test_captions_of_a_training_come_from_its_metrics(tmp_path):
     assert found["learning_curves"].endswith("Swap after episode 2; no clone. J_a of the live policy went from 5 to 1.")
     # The model-free costs are twice the live ones.
     assert "The live policy (model based) costs less than model free on 30 of 30." in found["unseen"]
-    assert "RMS error where the last episode went: 0.1, 0.02; of the initial twin 1, 0.2." in found["polars"]
+    assert "The RMS error along the last episode is 0.1, 0.02; that of the initial twin is 1, 0.2." in found["polars"]
     assert "RMS error" not in found["flight"]
 
 

@@ -1,4 +1,4 @@
-"""The report: Markdown, the same as one HTML page that holds its figures, and its numbers."""
+"""The report as Markdown, as one HTML page that holds its figures, and as numbers."""
 
 import base64
 import json
@@ -28,14 +28,14 @@ class CaptionedFigure(NamedTuple):
 def write(
     folder: Path, results: Results, *, figures: list[CaptionedFigure], quick: bool, command: str
 ) -> tuple[Path, Path]:
-    """Write ``README.md``, ``report.html`` and ``study.json``; the sentences are in ``report.md.jinja``.
+    """Write ``README.md``, ``report.html`` and ``study.json``. ``report.md.jinja`` holds the sentences.
 
     Args:
         folder: of the report.
-        results: what was found.
-        figures: in their order.
-        quick: mark the report as made from short trainings.
-        command: that makes the report.
+        results: of the study.
+        figures: in the order of the report.
+        quick: whether to mark the report as one of short trainings.
+        command: the command that makes the report.
 
     Returns:
         Paths of the Markdown and of the page.
@@ -57,19 +57,19 @@ def write(
 
 
 def compared(first: Entry, second: Entry) -> str:
-    """Whether ``first`` costs less than ``second`` beyond the interval of the difference, which it gives too."""
+    """Whether ``first`` costs less than ``second``, more, or neither with 95 % confidence; and the interval."""
     low, high = difference(first, second)
     word = "better" if high < 0 else "worse" if low > 0 else "neither better nor worse"
     return f"**{word}** (difference {low:.3g} … {high:.3g})"
 
 
 def embedded(path: Path) -> str:
-    """A PNG as a data address."""
+    """A PNG as a data URI."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def numbers(results: Results) -> dict[str, Any]:
-    """What ``study.json`` holds."""
+    """Content of ``study.json``."""
     return {
         plant: {
             "entries": {entry.name: numbers_of(entry) for entry in entries},
@@ -83,7 +83,7 @@ def numbers(results: Results) -> dict[str, Any]:
 
 
 def numbers_of(entry: Entry) -> dict[str, Any]:
-    """What ``study.json`` holds of a row."""
+    """Content of ``study.json`` for one entry."""
     return {
         "J_a": entry.mean,
         "confidence_interval": entry.interval(),

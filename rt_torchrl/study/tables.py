@@ -17,7 +17,7 @@ PAPER = {
 }
 """The paper's table of learning performance: ratios of J_p, of J_a model-based and of J_a model-free."""
 RATIOS = (("J_p_before", "J_p"), ("J_a_before", "J_a_model_based"), ("J_a_before", "J_a_model_free"))
-"""Costs before and after training whose ratios that table has."""
+"""Costs before and after training, whose ratios the table gives."""
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -27,7 +27,7 @@ def table(header: list[str], rows: list[list[str]]) -> str:
 
 
 def nominal_table(entries: list[Entry]) -> str:
-    """Every arm and yardstick of a plant with J_a, its interval, the regret and the plant's own quantities."""
+    """J_a of every arm and yardstick of a plant, its interval and ratio to the oracle's, and the plant's quantities."""
     oracle = named(entries)["oracle"]
     header = ["", *COST_HEADER, "over oracle", *oracle.merit, *TWIN_HEADER, "episodes to 110 %"]
     rows = []
@@ -39,7 +39,7 @@ def nominal_table(entries: list[Entry]) -> str:
 
 
 def variant_table(variants: dict[str, list[Entry]], nominal: list[Entry]) -> str:
-    """Every arm under every variant, with its cost over its own nominal one.
+    """J_a of every arm under every variant, its interval and ratio to the arm's nominal J_a, and the same quantities.
 
     Args:
         variants: entries of a plant by variant.
@@ -56,7 +56,7 @@ def variant_table(variants: dict[str, list[Entry]], nominal: list[Entry]) -> str
 
 
 def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:
-    """The paper's table of learning performance beside ours: cost after over mean cost before, over the seeds.
+    """The paper's table of learning performance beside ours: cost after training over the mean cost before.
 
     Args:
         summaries: ``summary`` of ``metrics.json`` of every twinning run, by plant.
@@ -76,17 +76,17 @@ def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def cost_cells(entry: Entry) -> list[str]:
-    """Under ``COST_HEADER``."""
+    """Cells under ``COST_HEADER``."""
     low, high = entry.interval()
     return [f"{entry.mean:.4g}", f"{low:.4g} … {high:.4g}"]
 
 
 def merit_cells(entry: Entry) -> list[str]:
-    """The plant's own quantities."""
+    """Cells of the plant's own quantities."""
     return [f"{value:.4g}" for value in entry.merit.values()]
 
 
 def twin_cells(entry: Entry) -> list[str]:
-    """Under ``TWIN_HEADER``: mean over the seeds, and the worst of them."""
+    """Cells under ``TWIN_HEADER``: the mean ratio over the seeds, and the greatest error of all seeds."""
     ratio = f"{np.mean(entry.J_p_ratio):.1e}" if entry.J_p_ratio else "–"
     return [ratio, with_unit(100 * max(entry.weight_error), "%") if entry.weight_error else "–"]
