@@ -1,6 +1,5 @@
 """What reinforcement twinning is worth: every arm on every plant, classical controllers, and the best possible."""
 
-import json
 import os
 import shutil
 from dataclasses import dataclass, replace
@@ -12,11 +11,13 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.figures import study as charts
 from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
-from rt_torchrl.study import captions, page, report
-from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
+from rt_torchrl.study import captions, report
+from rt_torchrl.study import figures as charts
+from rt_torchrl.study.names import title
+from rt_torchrl.study.report import CaptionedFigure
+from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import Task, side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
 from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, cost_over_episodes, oracle
@@ -37,41 +38,41 @@ POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Policies beside a plant's own that twinning trains too, as options of its recipe."""
 LONG_ONLY = ("twinning, with bias",)
-"""Those that ``quick`` leaves out: tracing them would take it a minute."""
+"""Policies that ``quick`` leaves out, because tracing them takes a minute."""
 OTHER_PLANT = ("twinning, gain-scheduled",)
-"""Those that need a plant with more signals."""
+"""Policies that need a plant with more signals."""
 OTHER_CLOSURE = ("wind_turbine",)
-"""Plants whose true closure is of another kind than the twin's: no training uses the graphs of their oracle."""
+"""Plants whose true closure is of another kind than the twin's; no training uses the graphs of their oracle."""
 
 EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
-"""Real episodes of a training, of every arm alike; more leave drone and tank where they are."""
+"""Real episodes of a training, the same for every arm; more of them do not improve drone and tank."""
 SHORT = {"wind_turbine": 600.0, "flapping_wing": 0.75, "cryogenic_tank": 7.5e4}
-"""Length of an episode with ``quick`` [s]: a turbine's whole one, about a sixth of the others'."""
+"""Length of an episode with ``quick`` [s]: the whole episode of the turbine, about a sixth of the others."""
 SHORT_EPISODES = 2
 """Real episodes of a training with ``quick``."""
 QUICK_VARIANTS = ("noise 5 %", CHANGED)
-"""Of the variants, those that short trainings have."""
+"""Variants that ``quick`` trains."""
 MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
-"""Of the default gain, at which the cost of a controller is drawn."""
+"""Multiples of the default gain at which the figure draws the cost of a controller."""
 COUNTS = (2, 5, 10, 20)
-"""Of training episodes that exact gradients plan on."""
+"""Numbers of training episodes that exact gradients plan on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """Train every arm on every plant, tune the classical controllers, find the oracle, and write a report.
 
-    What is done already in the folder is kept: the same command goes on where it was interrupted.
+    The folder keeps what is done, so that the same command goes on where it was interrupted.
 
     Args:
         plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
         seeds: trainings of every arm.
         variant_seeds: trainings of every arm under each kind of sensor noise and model error; 0 leaves them out.
-        jobs: trainings side by side, one thread each; 0 takes one for every core.
+        jobs: number of trainings side by side, one thread each; 0 means one for every core.
         backend: of joblib; ray spreads over a Ray cluster and needs the extra ``ray``.
-        unseen: number of unseen episodes that everything is judged on.
-        folder: of the report and of all runs.
-        quick: the same report from one seed of short trainings, marked as such.
+        unseen: number of unseen episodes that judge everything.
+        folder: folder of the report and of all runs.
+        quick: make the same report from one seed of short trainings, and mark it so.
     """
 
     plants: tuple[str, ...] = ("all",)
@@ -92,27 +93,29 @@ class Config:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
 
     def chosen(self) -> list[str]:
-        """The plants, by folder."""
+        """Names of the plants."""
         return list(CONTROLLERS) if "all" in self.plants else list(self.plants)
 
     @property
     def kept(self) -> Path:
-        """The folder; short trainings and their report apart, or the whole study would take them for its own."""
+        """Folder of the results. Short trainings have their own, or the whole study would take them for its results."""
         return self.folder / "quick" if self.quick else self.folder
 
     def policies(self, plant: str) -> dict[str, tuple[str, ...]]:
-        """Those that twinning trains beside the plant's own, as options of its recipe."""
+        """Policies that twinning trains beside the plant's own, as options of its recipe."""
         every = POLICIES.get(plant, {}).items()
         return {name: options for name, options in every if not (self.quick and name in LONG_ONLY)}
 
+    def episodes_of(self, plant: str) -> int:
+        """Real episodes of every training of a plant."""
+        return SHORT_EPISODES if self.quick else EPISODES[plant]
+
     def options_of(self, plant: str) -> tuple[str, ...]:
-        """Options of every training of a plant."""
-        if self.quick:
-            return "--quick", "--episodes", str(SHORT_EPISODES), "--horizon", str(SHORT[plant])
-        return ("--unseen", str(self.unseen), "--episodes", str(EPISODES[plant]))
+        """Further options of every training of a plant."""
+        return ("--quick", "--horizon", str(SHORT[plant])) if self.quick else ("--unseen", str(self.unseen))
 
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
-        """Of a plant: those of every variant and arm, a list over the seeds."""
+        """Trainings of a plant by variant and arm, each a list over the seeds."""
         seeds, others = (1, min(self.variant_seeds, 1)) if self.quick else (self.seeds, self.variant_seeds)
         base = self.kept / "runs" / plant
 
@@ -120,6 +123,7 @@ class Config:
             place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
             every_option = (*self.options_of(plant), "--unseen-every", "1", *further)
             common = {"recipe": recipe_of(plant), "arm": arm, "variant": variant, "options": every_option}
+            common["episodes"] = self.episodes_of(plant)
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
@@ -138,13 +142,13 @@ class Config:
         starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
         best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
         tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
-        system = recipe_of(plant), self.options_of(plant)
+        system = recipe_of(plant), ("--episodes", str(self.episodes_of(plant)), *self.options_of(plant))
         found = {"oracle": partial(oracle, *system, **best)}
         found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
         return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
 
     def line(self, plant: str) -> Yardstick | None:
-        """A line through the costs of a plant, where that explains what a table cannot."""
+        """Costs of a plant along one quantity, where they explain what a table cannot."""
         counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
         lines = {
             "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=PIValve, multiples=MULTIPLES)),
@@ -164,13 +168,13 @@ def recipe_of(plant: str) -> Path:
 
 
 def compute(config: Config) -> None:
-    """Everything that is not done yet, side by side, with one progress bar."""
+    """Compute everything that is not done yet, side by side, with one progress bar."""
     batches = short_batches(config) if config.quick else [[task] for task in ordered_tasks(config)]
     side_by_side(batches, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
 
 
 def ordered_tasks(config: Config) -> list[Task]:
-    """Yardsticks, then the nominal trainings that the other results are measured by, then what is made harder."""
+    """Yardsticks first, then the nominal trainings, then those of the other variants."""
     tasks = [task for plant in config.chosen() for task in yardstick_tasks(config, plant)]
     # The plant that takes longest first.
     groups = [item for plant in reversed(config.chosen()) for item in config.trainings(plant).items()]
@@ -180,9 +184,9 @@ def ordered_tasks(config: Config) -> list[Task]:
 
 
 def short_batches(config: Config) -> list[list[Task]]:
-    """What one worker does in a row: tracing takes longer than a short training, so what shares graphs has one worker.
+    """Batches of tasks, one worker for each: tasks that share graphs share a worker, because tracing takes longest.
 
-    The longest first; the rest goes wherever there is time.
+    The longest batches come first; the others go wherever there is time.
     """
     batches, rest = [], []
     for plant in reversed(config.chosen()):
@@ -196,13 +200,13 @@ def short_batches(config: Config) -> list[list[Task]]:
 
 
 def yardstick_tasks(config: Config, plant: str) -> list[Task]:
-    """What trainings of a plant are measured against."""
+    """Tasks that compute the yardsticks of a plant, and its line of costs if it has one."""
     line = config.line(plant)
     return [*config.yardsticks(plant).values(), *([line] if line else [])]
 
 
 def entries_of(config: Config, plant: str) -> list[Entry]:
-    """Arms, then classical controllers, then the oracle."""
+    """Entries of a plant: arms, then classical controllers, then the oracle."""
     trainings = config.trainings(plant)
     found = [arm_entry(name, trainings["nominal", name]) for name in (*ARMS, *config.policies(plant))]
     yardsticks = [yardstick_entry(name, task.run()) for name, task in config.yardsticks(plant).items()]
@@ -210,7 +214,7 @@ def entries_of(config: Config, plant: str) -> list[Entry]:
 
 
 def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
-    """Every arm under every variant; with model error the classical controllers too."""
+    """Entries of every arm under every variant; the model error has the classical controllers too."""
     trainings = config.trainings(plant)
     variants = dict.fromkeys(variant for variant, _ in trainings if variant != "nominal")
     found = {variant: [arm_entry(arm, trainings[variant, arm]) for arm in ARMS] for variant in variants}
@@ -221,7 +225,7 @@ def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
 
 
 def gather(config: Config) -> Results:
-    """Everything the report is written from."""
+    """Everything that the report needs."""
     results = Results({}, {}, {})
     for plant in config.chosen():
         nominal = config.trainings(plant)["nominal", "twinning"]
@@ -230,9 +234,10 @@ def gather(config: Config) -> Results:
     return results
 
 
-def draw(config: Config, results: Results) -> list[str]:
-    """Figures of the study and of the first twinning run of each plant, as Markdown with captions."""
-    folder = config.kept / "figures"
+def draw(config: Config, results: Results) -> list[CaptionedFigure]:
+    """Draw the figures of the study, copy those of the first twinning run of each plant, and add captions."""
+    place = Path("figures")
+    folder = config.kept / place
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
     if config.variant_seeds:
@@ -247,26 +252,25 @@ def draw(config: Config, results: Results) -> list[str]:
     found = []
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
-        found.append(page.figure(folder / f"{name}.png", config.kept, texts[name]))
+        found.append(CaptionedFigure(place / f"{name}.png", texts[name]))
     for plant in config.chosen():
         first = config.trainings(plant)["nominal", "twinning"][0]
         for name, text in captions.of_run(plant, first.metrics()).items():
             copy = folder / f"{plant}_{name}.png"
             shutil.copy(first.folder / "figures" / f"{name}.png", copy)
-            found.append(page.figure(copy, config.kept, f"{captions.title(plant)}, seed 0. {text}"))
+            found.append(CaptionedFigure(place / copy.name, f"{title(plant)}, seed 0. {text}"))
     return found
 
 
 def write(config: Config) -> Path:
-    """The report: Markdown, HTML, figures and ``study.json``; returns the page."""
+    """Write the report as Markdown, HTML, figures and ``study.json``; return the path of the page."""
     results = gather(config)
-    sections = report.sections(results, figures=draw(config, results), quick=config.quick, command=command(config))
-    (config.kept / "study.json").write_text(json.dumps(report.numbers(results), indent=2) + "\n")
-    return page.write(config.kept, "What reinforcement twinning is worth", sections)[1]
+    figures = draw(config, results)
+    return report.write(config.kept, results, figures=figures, quick=config.quick, command=command(config))[1]
 
 
 def command(config: Config) -> str:
-    """The command that makes this report."""
+    """The command line that makes this report."""
     plants = " ".join(config.plants)
     size = f"--seeds {config.seeds} --variant-seeds {config.variant_seeds} --unseen {config.unseen}"
     return f"uv run recipes/study.py --plants {plants} {'--quick' if config.quick else size}"

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
+from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
 from rt_torchrl.plants.disturbance import require_request
 
 CUT_IN_SPEED = 3.0
@@ -140,7 +140,7 @@ class RecordedWind:
     interval, over which it is then held; content above the new Nyquist frequency is folded, not filtered out.
 
     Args:
-        records: at least one :class:`~rt_torchrl.envs.wind_turbine.turbsim.WindRecord`.
+        records: at least one :class:`~rt_torchrl.envs.wind_turbine.wind_record.WindRecord`.
         floor: the wind is cut off below this speed [m/s], the turbine's cut-in; ``-math.inf`` switches it off.
 
     Raises:

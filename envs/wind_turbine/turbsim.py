@@ -3,104 +3,12 @@
 import math
 import os
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-PRINTED_TIME_RESOLUTION = 1e-3
-"""Resolution of the times in a ``.hh`` file [s]; TurbSim prints them as F8.3."""
-
-
-@dataclass(frozen=True, eq=False)
-class WindRecord:
-    """Longitudinal wind at the hub at evenly spaced times; the arrays are copied and made read-only.
-
-    Args:
-        time: sample times [s], a vector of n, increasing by equal steps to within the 1 ms that TurbSim prints.
-        speed: longitudinal wind speed u [m/s], a vector of n, not negative.
-        source: where the record comes from, such as the path of the file; named in every error.
-
-    Raises:
-        ValueError: if there are fewer than two samples, the lengths differ, a value is NaN or infinite, a time does not
-            increase, samples are missing, steps are unequal, or a speed is negative.
-    """
-
-    time: np.ndarray
-    speed: np.ndarray
-    source: str
-
-    def __post_init__(self):
-        for field in ("time", "speed"):
-            array = np.array(getattr(self, field), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, field, array)
-        self._check_shapes()
-        self._check_speed()
-        self._check_time()
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last sample [s]."""
-        return float(self.time[-1] - self.time[0])
-
-    @property
-    def step(self) -> float:
-        """Sampling interval [s], the mean one: it averages out the rounding of printed times."""
-        return self.duration / (len(self.time) - 1)
-
-    def _check_shapes(self) -> None:
-        if self.time.ndim != 1 or self.time.shape != self.speed.shape:
-            raise ValueError(
-                f"{self.source}: time has shape {self.time.shape} and speed {self.speed.shape}; "
-                "pass two vectors of equal length."
-            )
-        if len(self.time) < 2:
-            raise ValueError(
-                f"{self.source}: holds {len(self.time)} wind samples, at least 2 are needed; "
-                "check that the file was written to its end."
-            )
-
-    def _check_speed(self) -> None:
-        if (bad := np.flatnonzero(~np.isfinite(self.time))).size:
-            raise ValueError(
-                f"{self.source}: time of sample {bad[0]} is {self.time[bad[0]]}; all must be finite. "
-                "Write the file again."
-            )
-        if (bad := np.flatnonzero(~np.isfinite(self.speed))).size:
-            raise ValueError(
-                f"{self.source}: wind speed at t = {self.time[bad[0]]:g} s is {self.speed[bad[0]]} "
-                f"({bad.size} such samples); all must be finite. Fill the gap by interpolation or cut the record there."
-            )
-        if (bad := np.flatnonzero(self.speed < 0)).size:
-            raise ValueError(
-                f"{self.source}: wind speed at t = {self.time[bad[0]]:g} s is {self.speed[bad[0]]:g} m/s; it must "
-                "not be negative. Check its sign and the wind direction, which is 0 deg along the rotor axis."
-            )
-
-    def _check_time(self) -> None:
-        steps = np.diff(self.time)
-        if (bad := np.flatnonzero(steps <= 0)).size:
-            raise ValueError(
-                f"{self.source}: time goes from {self.time[bad[0]]:g} s to {self.time[bad[0] + 1]:g} s; it must "
-                "increase. Sort the samples and drop repeated ones."
-            )
-        step = float(np.median(steps))
-        # Two times rounded to 1 ms give a step off by up to 1 ms; below 2 ms that would hide a missing sample.
-        tolerance = min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
-        if not (bad := np.flatnonzero(np.abs(steps - step) > tolerance)).size:
-            return
-        where, found = self.time[bad[0]], steps[bad[0]]
-        if found > 1.5 * step:
-            raise ValueError(
-                f"{self.source}: gap after t = {where:g} s, where {round(found / step) - 1} samples are missing (step "
-                f"{found:g} s instead of {step:g} s). Fill it by interpolation or cut the record there."
-            )
-        raise ValueError(
-            f"{self.source}: unequal time step after t = {where:g} s, {found:g} s instead of {step:g} s. "
-            "Resample the record to equal steps."
-        )
+from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
 
 
 def read_wind(path: str | os.PathLike) -> WindRecord:
@@ -110,17 +18,19 @@ def read_wind(path: str | os.PathLike) -> WindRecord:
         path: a ``.hh`` file, see :func:`read_hh`, or a ``.bts`` file, see :func:`read_bts`.
 
     Raises:
-        ValueError: if the suffix is another, or the file is malformed.
+        ValueError: if the suffix is another, there is no such file, or it is malformed.
     """
+    readers = {".hh": read_hh, ".bts": read_bts}
     suffix = Path(path).suffix.lower()
-    if suffix == ".hh":
-        return read_hh(path)
-    if suffix == ".bts":
-        return read_bts(path)
-    raise ValueError(
-        f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' (WrADHH) "
-        "or binary full field '.bts' (WrADFF). A file in the .hh format under another name can go to read_hh."
-    )
+    if suffix not in readers:
+        raise ValueError(
+            f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' "
+            "(WrADHH) or binary full field '.bts' (WrADFF). A file in the .hh format under another name can go to "
+            "read_hh."
+        )
+    if not Path(path).is_file():
+        raise ValueError(f"{path} is no file; give the path of TurbSim output.")
+    return readers[suffix](path)
 
 
 def read_hh(path: str | os.PathLike) -> WindRecord:
@@ -231,7 +141,8 @@ def read_bts(path: str | os.PathLike) -> WindRecord:
             f"{header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies {expected} bytes. "
             "Copy the file again, in binary mode, or run TurbSim again."
         )
-    # Mapped, not read: a field is hundreds of megabytes, of which four columns are needed.
+    # The field is mapped, not read: it has hundreds of megabytes, of which the hub needs four columns. The reader of
+    # openfast_toolbox and weio allocates what the header declares, in double precision, and checks no length.
     raw = np.memmap(path, dtype="<i2", mode="r", offset=start, shape=shape)
     z = _interpolation(path, (header.hub_height - header.bottom) / header.dz, header.n_z, "height")
     y = _interpolation(path, 0.5 * (header.n_y - 1), header.n_y, "width")

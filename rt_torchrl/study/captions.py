@@ -1,49 +1,48 @@
-"""Captions of the report's figures: what is drawn, and what is seen there in numbers."""
+"""Captions of the report's figures: they say what a figure draws, and give in numbers what a reader sees there."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from rt_torchrl.study.figures import shown
-from rt_torchrl.study.findings import NEAR, Entry, Results, named
+from rt_torchrl.study.names import shown, title
+from rt_torchrl.study.results import HALVES, NEAR, Entry, Results, named
 from rt_torchrl.study.training import CHANGED
-from rt_torchrl.study.variants import HALVES
 
 ARMS = ("twinning", *HALVES)
 RUN = {
-    "learning_curves": "Costs, the twin's error and who was live; vertical lines are swaps and clones.",
+    "learning_curves": "Costs, the twin's error and the live policy; vertical lines mark swaps and clones.",
     "states": "The last real episode and the twin's replay of it.",
     "actions": "Actions of the last real episode.",
     "policy_contours": "Both policies after training.",
-    "unseen": "Every unseen episode under both policies and the classical controllers.",
+    "unseen": "Cost of every unseen episode under both policies and the classical controllers.",
 }
 """Figures that every training draws."""
 PLANT = {
     "wind_turbine": {
         "power_and_speed": "Wind, generator speed, power, torque and pitch of the last episode, with their references.",
-        "power_coefficient": "Power coefficient of the twin against the true one; ticks mark what was visited.",
+        "power_coefficient": "Power coefficient of the twin against the true one; ticks mark visited values.",
         "scatter": "Generator speed of the twin against the real one; a perfect twin lies on the line.",
     },
     "flapping_wing": {
         "flight_path": "The last flight in the plane with its target, and the gust.",
         "flight": "Positions and speeds of real drone and twin, amplitude and stroke-plane angle.",
         "polars": "Lift and drag of the twin against the true ones.",
-        "control_surfaces": "Both policies over the position and speed errors, as the paper draws them.",
+        "control_surfaces": "Both policies over the errors of position and speed, as the paper draws them.",
     },
     "cryogenic_tank": {
         "tank": "Pressure, masses, vent and load of the last episode.",
-        "heat_exchanger": "Heat taken by the exchanger over the pressure drop at the valve, twin against true.",
+        "heat_exchanger": "Heat that the exchanger takes over the pressure drop at the valve, twin against true.",
         "vent_path": "Path of the vented fluid in the temperature-entropy plane.",
     },
 }
-"""What the figures of a plant's own show."""
+"""Figures that one plant alone draws."""
 CLOSURES = ("power_coefficient", "polars", "heat_exchanger")
-"""Those of them that show the twin's closure."""
+"""Figures among these that show the twin's closure."""
 
 
 def learning(results: Results) -> str:
-    """Of the learning curves: when each arm comes near the oracle."""
+    """Caption of the learning curves: it says when each arm comes near the oracle."""
     lines = ["Mean cost of the live policy on unseen episodes after each real episode, with the range of the seeds."]
     for plant, found in entries_by_name(results):
         arms = [f"{shown(arm)} {episodes_to(found[arm], found['oracle'])}" for arm in ARMS if arm in found]
@@ -53,7 +52,7 @@ def learning(results: Results) -> str:
 
 
 def robustness(results: Results) -> str:
-    """Of the violins: how bad the worst unseen episode is."""
+    """Caption of the violins: it gives the cost of the worst unseen episode."""
     lines = ["Distribution of the cost over the unseen episodes, all seeds together."]
     for plant, found in entries_by_name(results):
         worst = [f"{shown(name)} {entry.costs.max():.3g}" for name, entry in found.items()]
@@ -62,8 +61,8 @@ def robustness(results: Results) -> str:
 
 
 def variants(results: Results) -> str:
-    """Of what noise and model error do: where twinning suffers most."""
-    lines = ["Every arm under sensor noise and model error, over twinning's nominal cost; a point for each seed."]
+    """Caption of the figure of noise and model error: it says where twinning suffers most."""
+    lines = ["Cost of every arm under sensor noise and model error over twinning's nominal cost; each point is a seed."]
     for plant, found in entries_by_name(results):
         harder = {variant: named(entries)["twinning"].mean for variant, entries in results.variants[plant].items()}
         ratios = {variant: mean / found["twinning"].mean for variant, mean in harder.items()}
@@ -73,8 +72,8 @@ def variants(results: Results) -> str:
 
 
 def following(results: Results) -> str:
-    """Of the twin's errors: where they end with model error, and where without."""
-    lines = ["The twin's error after each real episode, as the twin knows the system and with model error."]
+    """Caption of the twin's errors: it says where they end with and without model error."""
+    lines = ["The twin's error after each real episode, on the system that the twin knows and with model error."]
     for plant, found in entries_by_name(results):
         arms = found["twinning"], named(results.variants[plant][CHANGED])["twinning"]
         nominal, other = (np.mean([errors[-1] for errors in arm.twin_errors]) for arm in arms)
@@ -83,7 +82,7 @@ def following(results: Results) -> str:
 
 
 def gain_line(found: dict[str, Any]) -> str:
-    """Of a cost over a gain: its first minimum, what lies behind it, and the far end."""
+    """Caption of a cost over a gain: its first minimum, the greatest cost behind it, and the far end."""
     costs, name = found["costs"], found["name"]
     first = next((k for k, (here, after) in enumerate(zip(costs, costs[1:], strict=False)) if after > here), None)
     if first is None:
@@ -91,19 +90,19 @@ def gain_line(found: dict[str, Any]) -> str:
     values = [f"{name} = {value:.3g}" for value in found["values"]]
     top = first + int(np.argmax(costs[first:]))
     return (
-        f"Cost of a proportional vent over its gain: least on the smooth side at {values[first]} with "
+        f"Cost of a proportional vent over its gain. It is least on the smooth side at {values[first]} with "
         f"{costs[first]:.4g}, {costs[top]:.4g} at {values[top]}, and {costs[-1]:.4g} at {values[-1]}, where the vent "
         "only opens and shuts, as the on-off valve does."
     )
 
 
 def episode_line(found: dict[str, Any]) -> str:
-    """Of a cost over the number of episodes planned on: its ends."""
+    """Caption of a cost over the number of training episodes in a plan: it gives every cost."""
     counts, costs = found["values"], found["costs"]
     parts = ", ".join(f"{cost:.4g} on {count}" for count, cost in zip(counts, costs, strict=True))
     return (
-        "Cost on the unseen episodes of the plant's own policy, planned with exact gradients on the true plant, over "
-        f"the number of training episodes that it is planned on: {parts}."
+        "Cost of the plant's own policy on the unseen episodes, over the number of training episodes in its plan. The "
+        f"plan uses exact gradients on the true plant. The costs are {parts}."
     )
 
 
@@ -117,7 +116,7 @@ def of_run(plant: str, metrics: dict[str, Any]) -> dict[str, str]:
     """Captions of a training's figures, by name.
 
     Args:
-        plant: folder of the plant.
+        plant: name of the plant's folder.
         metrics: content of ``metrics.json``.
     """
     found = RUN | PLANT[plant]
@@ -131,7 +130,7 @@ def of_run(plant: str, metrics: dict[str, Any]) -> dict[str, str]:
 
 
 def events(metrics: dict[str, Any]) -> str:
-    """When policies swapped and were cloned, and what the live one came to."""
+    """Sentences that say when policies swapped or were cloned, and what the live policy costs at the end."""
     episodes = metrics["episodes"]
     parts = []
     for event in ("swap", "clone"):
@@ -142,7 +141,7 @@ def events(metrics: dict[str, Any]) -> str:
 
 
 def cheaper(metrics: dict[str, Any]) -> str:
-    """On how many unseen episodes the live policy costs less than the others."""
+    """Sentence that counts the unseen episodes on which the live policy costs less than the others."""
     live = metrics["summary"]["live"]
     costs = {name: np.array(values) for name, values in metrics["summary"]["unseen"]["costs"].items()}
     against = [f"{shown(name)} on {int((costs[live] < costs[name]).sum())}" for name in costs if name != live]
@@ -150,22 +149,17 @@ def cheaper(metrics: dict[str, Any]) -> str:
 
 
 def closure_error(metrics: dict[str, Any]) -> str:
-    """RMS error of the twin's closure where the last episode went."""
+    """Sentence with the RMS error of the twin's closure along the last episode."""
     errors = metrics["summary"]["closure_error"]
     found, start = (", ".join(f"{error:.2g}" for error in errors[when]) for when in ("found", "start"))
-    return f"RMS error where the last episode went: {found}; of the initial twin {start}."
-
-
-def title(plant: str) -> str:
-    """A plant at the start of a sentence."""
-    return shown(plant).capitalize()
+    return f"The RMS error along the last episode is {found}; that of the initial twin is {start}."
 
 
 def episodes_to(entry: Entry, oracle: Entry) -> str:
-    """Real episodes until an arm comes near the oracle, seed by seed."""
+    """Number of real episodes until an arm comes near the oracle, seed by seed."""
     return ", ".join("never" if count is None else str(count) for count in entry.episodes_to(oracle.mean))
 
 
 def entries_by_name(results: Results) -> list[tuple[str, dict[str, Entry]]]:
-    """Every plant, by folder, with its entries by name."""
+    """Every plant with its entries by name."""
     return [(plant, named(found)) for plant, found in results.entries.items()]

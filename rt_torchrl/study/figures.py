@@ -1,4 +1,4 @@
-"""Figures of the study: how arms learn, and how they do on the unseen episodes."""
+"""Figures of the study: how arms learn, and what they cost on the unseen episodes."""
 
 from typing import Any
 
@@ -8,19 +8,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, TWIN, caption, legend_below, panels
-from rt_torchrl.study.findings import Entry, named
+from rt_torchrl.study.names import shown
+from rt_torchrl.study.results import Entry, named
 from rt_torchrl.study.training import CHANGED
 
 ARMS = {"twinning": REAL, **ROLES}
 ARM_SHIFT = {"twinning": -0.2, "model_based": 0.0, "model_free": 0.2}
 POLICIES = ("#7f3c8d", "#a0522d", "#e75480", "#6b8e23")
-"""Colours of twinning with other policies, in their order."""
+"""Colours of twinning with other policies, in the order of the policies."""
 DASHES = ("--", ":", "-.", (0, (1, 1)), (0, (8, 1)))
 YARDSTICK_LINE = {"color": REFERENCE, "linewidth": 1.2}
 WIDEST_LINEAR = 5.0
 """Ratio of the greatest to the least cost above which an axis is logarithmic."""
 WIDEST_LINEAR_SPAN = 50.0
-"""The same of an abscissa."""
+"""Ratio of the greatest to the least abscissa above which its axis is logarithmic."""
 
 
 def learning(entries: dict[str, list[Entry]]) -> Figure:
@@ -70,7 +71,7 @@ def robustness(entries: dict[str, list[Entry]]) -> Figure:
 
 
 def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[Entry]]]) -> Figure:
-    """Mean J_a of every arm under sensor noise and model error over twinning's nominal one, a point for every seed.
+    """Mean J_a of every arm under sensor noise and model error over twinning's nominal mean, a point for every seed.
 
     Args:
         entries: of each plant as it is.
@@ -96,7 +97,7 @@ def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[E
 
 
 def following(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[Entry]]]) -> Figure:
-    """J_p of twinning's twin after each real episode, as the twin knows the system and with model error, by plant.
+    """J_p of twinning's twin after each real episode, on the system that the twin knows and with model error, by plant.
 
     Args:
         entries: of each plant as it is.
@@ -138,7 +139,7 @@ def cost_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
 
 
 def _spread(ax: Axes, curves: list[list[float]], *, color: str, label: str) -> None:
-    """Mean and range over the seeds, as long as all have come."""
+    """Draw the mean and range over the seeds, up to the last episode that all seeds have reached."""
     length = min(map(len, curves))
     values = np.array([curve[:length] for curve in curves])
     episode = np.arange(1, length + 1)
@@ -152,12 +153,7 @@ def _bars(ax: Axes, means: list[float]) -> None:
 
 
 def _colours(entries: list[Entry]) -> dict[str, str]:
-    """Of each arm, policy and yardstick."""
+    """Colour of each arm, policy and yardstick."""
     others = list(dict.fromkeys(entry.name for entry in entries if entry.curves and entry.name not in ARMS))
     policies = {name: POLICIES[k % len(POLICIES)] for k, name in enumerate(others)}
     return {entry.name: (ARMS | policies).get(entry.name, REFERENCE) for entry in entries}
-
-
-def shown(name: str) -> str:
-    """A name as it is read."""
-    return name.replace("_", " ")

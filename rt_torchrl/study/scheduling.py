@@ -1,4 +1,4 @@
-"""What the study computes, side by side, with one progress bar."""
+"""The study's tasks side by side, with one progress bar."""
 
 import threading
 from collections.abc import Iterator, Sequence
@@ -9,28 +9,33 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 GLANCE = 1.0
-"""Between two looks at what is done [s]."""
+"""Time between two looks at what is done [s]."""
 
 
 @runtime_checkable
 class Task(Protocol):
-    """Something whose result is kept in a file."""
+    """A computation whose result is kept in a file."""
 
     def run(self) -> Any:
-        """Compute it, unless that is done."""
+        """Compute the result, unless it is there."""
 
     def done(self) -> bool:
-        """Whether its result is there."""
+        """Whether the result is there."""
 
 
 def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) -> None:
-    """Run batches of tasks through joblib, the tasks of a batch one after another in one process.
+    """Run batches of tasks through joblib. The tasks of a batch run one after another in one process.
 
-    A task that fails stops no other: what they compute is kept.
+    A task that fails stops no other task; the results of the others are kept.
+
+    Args:
+        batches: tasks of each batch.
+        backend: of joblib, loky or ray.
+        jobs: number of processes.
 
     Raises:
-        ValueError: if the backend is Ray and there is none.
-        RuntimeError: after all tasks, if some failed; with what they said.
+        ValueError: if the backend is Ray and Ray is not installed.
+        RuntimeError: after all tasks, if some failed; it repeats their errors.
     """
     if backend == "ray":
         try:
@@ -46,7 +51,7 @@ def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) 
 
 
 def in_a_row(tasks: Sequence[Task]) -> list[str]:
-    """One after another; returns what those that failed said."""
+    """Run tasks one after another, and return the errors of those that failed."""
     failures = []
     for task in tasks:
         try:
@@ -58,16 +63,19 @@ def in_a_row(tasks: Sequence[Task]) -> list[str]:
 
 @contextmanager
 def progress(tasks: Sequence[Task]) -> Iterator[None]:
-    """A bar of the tasks that are done, for as long as the context lasts.
+    """A bar that counts the finished tasks, for as long as the context lasts.
 
-    It looks at the results rather than hears of them, and so follows workers on other machines too.
+    The bar looks for results that were missing at its last look. So it counts the tasks inside a batch and on other
+    machines. joblib's generator gives one result for a whole batch, and Ray's backend refuses it.
     """
     stopped = threading.Event()
-    before = sum(task.done() for task in tasks)
-    with tqdm(total=len(tasks), initial=before, unit="task", desc="study", dynamic_ncols=True) as bar:
+    missing = [task for task in tasks if not task.done()]
+    done = len(tasks) - len(missing)
+    with tqdm(total=len(tasks), initial=done, unit="task", desc="study", dynamic_ncols=True) as bar:
 
         def look() -> None:
-            bar.update(sum(task.done() for task in tasks) - bar.n)
+            missing[:] = [task for task in missing if not task.done()]
+            bar.update(len(tasks) - len(missing) - bar.n)
 
         def watch() -> None:
             while not stopped.wait(GLANCE):

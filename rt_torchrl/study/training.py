@@ -1,16 +1,16 @@
 """One training of the study, as the command of its recipe."""
 
 import contextlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.study.json_file import read_json
 from rt_torchrl.twinning.config import Arm
 
 CHANGED = "model error"
-"""The variant whose real system is not what the twin was made for."""
+"""The variant in which the real system differs from what the twin assumes."""
 VARIANTS: dict[str, tuple[str, ...]] = {
     "nominal": (),
     "noise 0.5 %": ("--noise", "0.005"),
@@ -18,14 +18,14 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "noise 5 %": ("--noise", "0.05"),
     CHANGED: ("--model-error",),
 }
-"""What is made harder, by name, as options of every recipe."""
+"""Variants of a training by name, each as options of every recipe."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """A recipe's run with one arm, seed and variant, by the options of a command that can be repeated by hand.
+    """A recipe's run with one arm, seed and variant. Its command can be repeated by hand.
 
-    It runs in the process that asks for it: the next one of the same plant then finds everything compiled.
+    It runs in the process that calls it, so that the next training of the same plant finds everything compiled.
 
     Args:
         recipe: path of the recipe.
@@ -33,8 +33,9 @@ class Training:
         seed: of the run.
         variant: key of ``VARIANTS``.
         folder: run folder.
+        episodes: number of real episodes.
         options: further options of the recipe.
-        figures: draw its figures; the report shows those of one training of a plant, and drawing takes up to 25 s.
+        figures: draw its figures. The report shows those of one training of a plant; drawing takes up to 25 s.
     """
 
     recipe: Path
@@ -42,6 +43,7 @@ class Training:
     seed: int
     variant: str
     folder: Path
+    episodes: int
     options: tuple[str, ...] = ()
     figures: bool = False
 
@@ -54,10 +56,11 @@ class Training:
         return self.recipe.stem
 
     def arguments(self) -> list[str]:
-        """Options of the recipe; goes on with a run that was interrupted after its first episode."""
+        """Options of the recipe. They resume a run that was interrupted after its first episode."""
         begun = (self.folder / "checkpoint.pt").exists()
         options = ["--seed", str(self.seed), "--twinning.arm", self.arm, "--log-dir", str(self.folder)]
-        # The report compares costs with each seed's own start, not with those of random ones.
+        options += ["--episodes", str(self.episodes)]
+        # The report compares costs with the start of each seed, not with random starts.
         options += ["--figures-every", "0", "--untrained", "0", "--threads", "1"]
         options += ["--resume" if begun else "--overwrite"]
         options += [] if self.figures else ["--no-figures"]
@@ -68,29 +71,49 @@ class Training:
         return " ".join(["uv run", str(self.recipe), *self.arguments()])
 
     def done(self) -> bool:
-        """Whether its results are there, with the figures if it draws them."""
+        """Whether the results of all episodes are there, and the figures if it draws them."""
         drawn = not self.figures or (self.folder / "figures" / "unseen.png").exists()
-        return drawn and (self.folder / "metrics.json").exists()
+        return drawn and self._results() is not None
 
     def run(self) -> None:
-        """Train, unless that is done; what the recipe prints goes to ``training.log`` in the folder.
+        """Train, unless the results are there. ``training.log`` in the folder takes what the recipe prints.
 
         Raises:
-            RuntimeError: if the recipe fails; with what it said.
+            RuntimeError: if the recipe fails, with what it said, or ends without the results of all episodes.
         """
         if self.done():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        # As it is begun: a training that fails in its second episode has left a checkpoint, and would be another one.
+        # The command is taken before the start: a training that fails later leaves a checkpoint, which changes it.
         log, command, arguments = self.folder / "training.log", self.command(), self.arguments()
         with log.open("w") as output, contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             print(command, flush=True)
+            if (self.folder / "metrics.json").exists():
+                print("the results in this folder are damaged or incomplete; this training replaces them", flush=True)
             try:
                 recipe = load_recipe(self.recipe)
                 recipe.main(from_command_line(recipe.Config, arguments))
             except (Exception, SystemExit) as error:
                 raise RuntimeError(f"{command} failed; see {log}: {error}") from error
+        if not self.done():
+            raise RuntimeError(f"{command} ended without the results of {self.episodes} episodes; see {log}")
 
     def metrics(self) -> dict[str, Any]:
-        """Its ``metrics.json``."""
-        return json.loads((self.folder / "metrics.json").read_text())
+        """Content of its ``metrics.json``.
+
+        Raises:
+            ValueError: if the file is missing or damaged, or holds the results of fewer or more episodes.
+        """
+        if (found := self._results()) is None:
+            raise ValueError(
+                f"{self.folder} holds no results of a training of {self.episodes} episodes; run the study again, it "
+                "computes what is missing."
+            )
+        return found
+
+    def _results(self) -> dict[str, Any] | None:
+        # An interrupted run writes results too, of the episodes that it has done.
+        found = read_json(self.folder / "metrics.json") or {}
+        episodes, summary = found.get("episodes"), found.get("summary")
+        whole = isinstance(summary, dict) and isinstance(episodes, list) and len(episodes) == self.episodes
+        return found if whole else None

@@ -1,7 +1,8 @@
-"""What trainings are measured against: the best that a class of policies can do, and tuned classical controllers."""
+"""Yardsticks of the trainings: the best that a class of policies can do, and tuned classical controllers."""
 
 import json
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,42 +17,46 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 
 Options = tuple[str, ...]
-"""Of a recipe's command line."""
+"""Options of a recipe's command line."""
 TRAINING_SEED = 0
-"""Seed of the disturbances that classical controllers are tuned on; the unseen episodes have another."""
+"""Seed of the disturbances that tune the classical controllers; the unseen episodes have another seed."""
 
 
 @dataclass(frozen=True)
 class Yardstick:
-    """Something to measure by that is computed once and kept.
+    """A yardstick that is computed once and kept.
 
     Args:
         path: JSON file to keep the result in.
-        compute: finds it.
+        compute: computes the result.
     """
 
     path: Path
     compute: Callable[[], dict[str, Any]]
 
     def done(self) -> bool:
-        """Whether it is kept."""
-        return self.path.exists()
+        """Whether a whole result is kept."""
+        return read_json(self.path) is not None
 
     def run(self) -> dict[str, Any]:
-        """What is kept, or else what is computed now."""
-        if not self.done():
-            found = self.compute()
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.path.write_text(json.dumps(found, indent=2) + "\n")
+        """The kept result, or a new one where none is kept or the file is damaged."""
+        if (kept := read_json(self.path)) is not None:
+            return kept
+        if self.path.exists():
+            warnings.warn(f"{self.path} is damaged; what it held is computed again.", stacklevel=2)
+        found = self.compute()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.write_text(json.dumps(found, indent=2) + "\n")
         return json.loads(self.path.read_text())
 
 
 def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iterations: int, polish: int) -> dict[str, Any]:
-    """The plant's own policy, optimised with exact gradients on the true plant and on the unseen episodes themselves.
+    """Optimise the plant's own policy with exact gradients, on the true plant and on the unseen episodes themselves.
 
     Args:
         recipe: of the plant.
@@ -79,11 +84,11 @@ def classical(
     episodes: int,
     evaluations: int,
 ) -> dict[str, Any]:
-    """A classical controller, tuned by a simplex search on training episodes and judged on the unseen ones.
+    """Tune a classical controller by a simplex search on training episodes, and judge it on the unseen episodes.
 
     Args:
         recipe: of the plant.
-        options: of its trainings; with them and its model error it tells how the real system ends.
+        options: of its trainings; they tell, with those of the model error, how the real system ends.
         kind: of the controller; one without gains is judged as it is.
         unseen: number of unseen episodes.
         episodes: number of training episodes.
@@ -102,7 +107,7 @@ def classical(
 
 
 def tuned(kind: type[ClassicalController], plant: Plant, *, episodes: int, evaluations: int) -> ClassicalController:
-    """A controller with the best gains that a search finds on training episodes, if it has gains."""
+    """The controller with the best gains that a search finds on training episodes; one without gains as it is."""
     start = {"gains": kind.placed_gains} if kind.placed_gains else {}
     controller = kind(plant, **start, compiled=missing_for_compilation() is None)
     generator = torch.Generator().manual_seed(TRAINING_SEED)
@@ -121,7 +126,7 @@ def record(judged: UnseenEpisodes, controller: ClassicalController) -> dict[str,
 def cost_along_gain(
     recipe: Path, options: Options, kind: type[ClassicalController], *, unseen: int, multiples: Sequence[float]
 ) -> dict[str, Any]:
-    """J_a of a classical controller over its first gain, the others as by default: a line through the landscape.
+    """J_a of a classical controller over its first gain; the other gains keep their defaults.
 
     Args:
         recipe: of the plant.
@@ -146,15 +151,15 @@ def cost_along_gain(
 def cost_over_episodes(
     recipe: Path, options: Options, *, unseen: int, counts: Sequence[int], iterations: int
 ) -> dict[str, Any]:
-    """J_a of the plant's own policy over the number of training episodes that it is planned on, by exact gradients.
+    """J_a of the plant's own policy over the number of training episodes that exact gradients plan on.
 
-    A training that has met no more of them cannot be expected to do better.
+    A training that meets as many episodes cannot be expected to cost less.
 
     Args:
         recipe: of the plant.
         options: of its trainings.
         unseen: number of unseen episodes to judge on.
-        counts: numbers of training episodes, the true disturbances of each known.
+        counts: numbers of training episodes, whose true disturbances the plan knows.
         iterations: gradients of each plan, from the same initial weights.
 
     Returns:
@@ -169,13 +174,13 @@ def cost_over_episodes(
 
 
 def unseen_episodes(plant: Plant, count: int, **seed: int) -> UnseenEpisodes:
-    """What everything is judged on, or with another seed others; with one thread, because others work beside it."""
+    """The unseen episodes that judge everything, or those of another seed; one thread leaves cores to other workers."""
     torch.set_num_threads(1)
     return UnseenEpisodes(plant, count, compiled=missing_for_compilation() is None, **seed)
 
 
 def changed_closure(system: Plant, recipe: Path, options: Options) -> nn.Module | None:
-    """Closure of the real system at the end of a training with model error; None for the plant's own."""
+    """Closure of the real system at the end of a training with model error; None where it is the plant's own."""
     config = configured(recipe, (*VARIANTS[CHANGED], *options))
     wear = config.wear(system)
     return None if wear is None else wear(config.episodes - 1)

@@ -1,4 +1,4 @@
-"""The study in numbers: costs of every arm and yardstick on the same unseen episodes, with honest intervals."""
+"""Results of the study: costs of every arm and yardstick on the same unseen episodes, with their intervals."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.training import Training
 
-RESAMPLES = 2000
+HALVES = ("model_based", "model_free")
+"""Arms that train one of the two controllers alone."""
 NEAR = 1.1
-"""Over the oracle's cost: what counts as having come near it."""
+"""An arm is near the oracle when it costs at most this multiple of the oracle's cost."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,10 +21,10 @@ class Entry:
 
     Args:
         name: arm or yardstick.
-        costs: J_a of each seed (a single row for a yardstick) and unseen episode.
-        merit: the plant's own quantities, mean over seeds.
-        J_p_ratio: cost of the twin after over before, of each seed.
-        weight_error: greatest relative error of a closure's weight, of each seed.
+        costs: J_a of each seed and unseen episode; a yardstick has a single row.
+        merit: means of the plant's own quantities over the seeds.
+        J_p_ratio: cost of the twin after training over its cost before, of each seed.
+        weight_error: greatest relative error among the closure's weights, of each seed.
         curves: mean J_a of the live policy on the unseen episodes after each real episode, a list for each seed.
         twin_errors: J_p of the twin over the records it holds, after each real episode, a list for each seed.
     """
@@ -40,28 +42,19 @@ class Entry:
         return float(self.costs.mean())
 
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the mean, by resampling seeds and episodes."""
-        return spread(self.costs)
+        """95 % interval of the mean over seeds and episodes."""
+        return mean_interval(self.costs)
 
     def episodes_to(self, cost: float) -> list[int | None]:
-        """Real episodes after which the live policy first comes within ``NEAR`` of a cost, of each seed."""
+        """Number of real episodes until the live policy costs at most ``NEAR`` times ``cost``; None for never."""
         reached = [[k + 1 for k, value in enumerate(curve) if value <= NEAR * cost] for curve in self.curves]
         return [found[0] if found else None for found in reached]
 
 
-def spread(costs: Float[np.ndarray, "seeds episodes"]) -> tuple[float, float]:
-    """95 % percentile-bootstrap interval of the mean over seeds and episodes, both resampled."""
-    rng = np.random.default_rng(0)
-    seeds, episodes = costs.shape
-    rows = rng.integers(seeds, size=(RESAMPLES, seeds))
-    columns = rng.integers(episodes, size=(RESAMPLES, episodes))
-    means = [costs[np.ix_(r, c)].mean() for r, c in zip(rows, columns, strict=True)]
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
-
-
 def difference(first: Entry, second: Entry) -> tuple[float, float]:
-    """95 % interval of the mean of ``first`` minus that of ``second``, paired by episode, and by seed where both have.
+    """95 % interval of the mean of ``first`` minus the mean of ``second``.
+
+    Costs are paired by episode, and by seed where both have the same number of seeds.
 
     Raises:
         ValueError: if they were not judged on the same number of episodes.
@@ -72,8 +65,8 @@ def difference(first: Entry, second: Entry) -> tuple[float, float]:
             f"{second.costs.shape[1]}; compare results of the same study."
         )
     if len(first.costs) != len(second.costs):
-        return spread(first.costs.mean(0, keepdims=True) - second.costs.mean(0, keepdims=True))
-    return spread(first.costs - second.costs)
+        return mean_interval(first.costs.mean(0, keepdims=True) - second.costs.mean(0, keepdims=True))
+    return mean_interval(first.costs - second.costs)
 
 
 def named(entries: list[Entry]) -> dict[str, Entry]:
@@ -82,7 +75,7 @@ def named(entries: list[Entry]) -> dict[str, Entry]:
 
 
 def arm_entry(name: str, trainings: list[Training]) -> Entry:
-    """An arm, or an arm with another policy, from its trainings; it is judged by the policy that acts at the end."""
+    """Entry of an arm, perhaps with another policy, from its trainings. The policy that is live at the end counts."""
     found = [training.metrics() for training in trainings]
     summaries = [metrics["summary"] for metrics in found]
     acting = [summary["live"] for summary in summaries]
@@ -100,18 +93,18 @@ def arm_entry(name: str, trainings: list[Training]) -> Entry:
 
 
 def yardstick_entry(name: str, found: dict[str, Any]) -> Entry:
-    """An oracle or a classical controller."""
+    """Entry of the oracle or of a classical controller."""
     merit = {quantity: values["mean"] for quantity, values in found["merit"].items()}
     return Entry(name=name, costs=np.array([found["costs"]]), merit=merit)
 
 
 def weight_errors(summaries: list[dict[str, Any]]) -> list[float]:
-    """Greatest relative error of a closure's weight, of each training whose real closure is of the same kind."""
+    """Greatest relative error among the closure's weights, of each training whose real closure is of the same kind."""
     return [error for summary in summaries if (error := weight_error(summary["closure"])) is not None]
 
 
 def weight_error(closure: dict[str, Any]) -> float | None:
-    """Greatest relative error of a weight; None where the real system's closure is of another kind."""
+    """Greatest relative error among the weights; None where the real system's closure is of another kind."""
     found, true = closure["found"], closure["true"] or {}
     if not found or set(found) != set(true) or not all(isinstance(value, float) for value in found.values()):
         return None
@@ -119,9 +112,12 @@ def weight_error(closure: dict[str, Any]) -> float | None:
 
 
 class Results(NamedTuple):
-    """Everything the report is written from, by plant.
+    """Everything that the report needs, by plant.
 
-    ``entries`` of the tables, ``summaries`` of the nominal twinning runs, and the entries of every ``variants``.
+    Args:
+        entries: of the nominal table.
+        summaries: ``summary`` in ``metrics.json`` of the nominal twinning runs.
+        variants: entries of each variant.
     """
 
     entries: dict[str, list[Entry]]

@@ -1,0 +1,83 @@
+"""The plan of the study: which trainings and yardsticks its recipe asks for, and in which batches."""
+
+import json
+
+import pytest
+from handwritten_study import EPISODES, finish, recipe
+
+from rt_torchrl.study import captions
+from rt_torchrl.study.training import VARIANTS, Training
+
+
+def test_a_plant_that_does_not_exist_is_refused():
+    config = recipe("study").Config
+    with pytest.raises(ValueError, match="must be all, or some of wind_turbine, flapping_wing, cryogenic_tank"):
+        config(plants=("moon",))
+    assert config(plants=("all",)).chosen() == ["wind_turbine", "flapping_wing", "cryogenic_tank"]
+
+
+def test_short_trainings_of_a_plant_share_a_worker(tmp_path):
+    study = recipe("study")
+    batches = study.short_batches(study.Config(quick=True, folder=tmp_path))
+    plants_of = [{task.plant for task in batch if isinstance(task, Training)} for batch in batches]
+    # The turbine's oracle shares no graph with its trainings, the gain-scheduled policy none with the other ones.
+    assert plants_of == [{"cryogenic_tank"}, {"flapping_wing"}, {"wind_turbine"}, {"wind_turbine"}, set()]
+    (alone,) = batches[3]
+    assert alone.options[-2:] == ("--policy", "scheduled")
+    assert [task.path.stem for task in batches[4]] == ["oracle", "Jonkman"]
+    planned = [task for batch in batches for task in batch]
+    assert len(planned) == len(study.ordered_tasks(study.Config(quick=True, folder=tmp_path)))
+
+
+def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
+    config = recipe("study").Config(seeds=3, variant_seeds=2, folder=tmp_path)
+    groups = config.trainings("flapping_wing")
+    assert {key: len(group) for key, group in groups.items() if key[0] == "nominal"} == {
+        ("nominal", arm): 3 for arm in ("twinning", "model_free", "model_based", "twinning, perceptron")
+    }
+    arms = ("twinning", "model_free", "model_based")
+    drawn = [t for group in groups.values() for t in group if t.figures]
+    assert drawn == groups["nominal", "twinning"][:1] and "--no-figures" not in drawn[0].command()
+    assert "--no-figures" in groups["nominal", "twinning"][1].command()
+    assert [key for key in groups if key[0] != "nominal"] == [(v, a) for v in VARIANTS if v != "nominal" for a in arms]
+    assert all(len(group) == 2 for key, group in groups.items() if key[0] != "nominal")
+    folders = {t.folder for group in groups.values() for t in group}
+    assert len(folders) == 3 * 4 + 4 * 3 * 2
+    policies = [name for v, name in config.trainings("wind_turbine") if v == "nominal"][3:]
+    assert policies == ["twinning, gain-scheduled", "twinning, with bias", "twinning, perceptron"]
+    (first, *_) = config.trainings("wind_turbine")["nominal", policies[0]]
+    assert first.arm == "twinning" and first.command().endswith("--policy scheduled")
+    short = recipe("study").Config(quick=True, folder=tmp_path).trainings("flapping_wing")
+    assert list(dict.fromkeys(variant for variant, _ in short)) == ["nominal", "noise 5 %", "model error"]
+    # What is kept of a quick study is never taken for a result of the whole one.
+    assert folders.isdisjoint(t.folder for group in short.values() for t in group)
+
+
+def test_the_report_is_written_from_what_is_kept(tmp_path):
+    """A whole quick study of the drone from results written by hand: nothing is computed."""
+    study = recipe("study")
+    config = study.Config(plants=("flapping_wing",), quick=True, folder=tmp_path)
+    groups = config.trainings("flapping_wing")
+    for training in (training for group in groups.values() for training in group):
+        finish(training)
+    drawn = groups["nominal", "twinning"][0].folder / "figures"
+    drawn.mkdir()
+    names = list(captions.of_run("flapping_wing", groups["nominal", "twinning"][0].metrics()))
+    for name in names:
+        (drawn / f"{name}.png").write_bytes(b"PNG")
+    judged = {"costs": [1.1] * EPISODES, "merit": {"m [m]": {"mean": 1.0}}}
+    line = {"name": "episodes planned on", "unit": "-", "values": [2, 5], "costs": [1.2, 1.1]}
+    for task in study.yardstick_tasks(config, "flapping_wing"):
+        task.path.parent.mkdir(parents=True, exist_ok=True)
+        task.path.write_text(json.dumps(line if task.path.stem == "episode-line" else judged | {"changed": judged}))
+    assert all(task.done() for task in study.ordered_tasks(config))
+    page = study.write(config)
+    text = (page.parent / "README.md").read_text()
+    study_figures = ["learning", "robustness", "variants", "following", "flapping_wing_episode-line"]
+    shown = [part.split(")")[0] for part in text.split("](figures/")[1:]]
+    assert shown == [f"{name}.png" for name in [*study_figures, *(f"flapping_wing_{name}" for name in names)]]
+    assert page.read_text().count("data:image/png;base64,") == len(shown)
+    assert all(f"| {name} |" in text for name in ("twinning", "twinning, perceptron", "PD", "oracle"))
+    assert "1.2 on 2, 1.1 on 5" in text and "--quick" in text
+    numbers = json.loads((page.parent / "study.json").read_text())["flapping_wing"]
+    assert list(numbers["variants"]) == ["noise 5 %", "model error"]

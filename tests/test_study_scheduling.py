@@ -1,0 +1,78 @@
+"""The study's tasks side by side: processes, progress and failures."""
+
+import os
+import time
+
+import pytest
+from handwritten_study import WRITE_RESULTS, training, written
+
+from rt_torchrl.study import scheduling
+from rt_torchrl.study.scheduling import side_by_side
+
+
+def computed(tmp_path, backend, jobs=2):
+    """What the study computes side by side from two trainings of a recipe that only writes results."""
+    script = written(tmp_path / "tiny.py", WRITE_RESULTS)
+    trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
+    side_by_side([[task] for task in trainings], backend=backend, jobs=jobs)
+    return [t.metrics()["process"] for t in trainings]
+
+
+def test_trainings_run_side_by_side(tmp_path):
+    assert os.getpid() not in computed(tmp_path, "loky")
+
+
+class Counted:
+    """A task that writes a file when it is run."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def run(self):
+        with self.path.open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+    def done(self):
+        return self.path.exists()
+
+
+def test_a_batch_runs_in_one_process_and_the_bar_counts_tasks(tmp_path, capsys):
+    batches = [[Counted(tmp_path / f"{batch}-{task}") for task in range(3)] for batch in range(2)]
+    batches[0][0].run()
+    side_by_side(batches, backend="loky", jobs=2)
+    workers = [[task.path.read_text().split()[-1] for task in batch] for batch in batches]
+    assert all(len(set(found)) == 1 for found in workers)
+    shown = capsys.readouterr().err
+    assert "1/6" in shown and "6/6" in shown
+
+
+class Slow(Counted):
+    """A task that takes several glances of the bar."""
+
+    def run(self):
+        time.sleep(0.3)
+        super().run()
+
+
+def test_the_bar_moves_inside_a_batch(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(scheduling, "GLANCE", 0.05)
+    side_by_side([[Slow(tmp_path / str(task)) for task in range(3)]], backend="loky", jobs=1)
+    shown = capsys.readouterr().err
+    assert all(f"{done}/3" in shown for done in range(4))
+
+
+def test_a_task_that_fails_stops_no_other(tmp_path):
+    failing = training(tmp_path, 7, recipe=written(tmp_path / "fails.py", "raise ValueError('no rotor')"))
+    others = [Counted(tmp_path / "first"), Counted(tmp_path / "second")]
+    with pytest.raises(RuntimeError, match=r"1 failed, the others are kept:\nRuntimeError: .*fails.py .* no rotor"):
+        side_by_side([[failing, others[0]], [others[1]]], backend="loky", jobs=1)
+    assert all(task.done() for task in others)
+
+
+def test_trainings_spread_over_ray(tmp_path):
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        assert os.getpid() not in computed(tmp_path, "ray")
+    finally:
+        ray.shutdown()

@@ -1,0 +1,85 @@
+"""Trainings of the study: their commands, what counts as finished, and the recipes' options for their variants."""
+
+import json
+
+import pytest
+import tyro
+from handwritten_study import WRITE_RESULTS, finished, recipe, training, written
+
+from rt_torchrl.study.training import VARIANTS
+
+
+def test_the_command_of_a_training_can_be_repeated_by_hand(tmp_path):
+    found = training(tmp_path, 3, variant="noise 1 %", options=("--quick",))
+    command = found.command()
+    assert "some_plant.py --seed 3 --twinning.arm twinning" in command and "--noise 0.01 --quick" in command
+    assert "--overwrite" in command and "--resume" not in command
+    found.folder.mkdir()
+    (found.folder / "checkpoint.pt").touch()
+    assert "--resume" in found.command() and "--overwrite" not in found.command()
+    with pytest.raises(ValueError, match="variant='rain' does not exist; choose one of nominal"):
+        training(tmp_path, variant="rain")
+
+
+def test_a_failed_training_says_why_and_a_finished_one_is_kept(tmp_path):
+    failing = training(tmp_path, recipe=written(tmp_path / "fails.py", "raise ValueError('no rotor')"))
+    with pytest.raises(RuntimeError, match="fails.py --seed 0 .* failed; see .*training.log: no rotor"):
+        failing.run()
+    assert "fails.py --seed 0" in (failing.folder / "training.log").read_text()
+    results = json.dumps({"summary": {}, "episodes": [{}] * 3})
+    (failing.folder / "metrics.json").write_text(results)
+    failing.run()
+    assert (failing.folder / "metrics.json").read_text() == results
+
+
+def test_a_training_needs_a_recipe(tmp_path):
+    with pytest.raises(RuntimeError, match="some_plant.py does not exist"):
+        training(tmp_path).run()
+    (tmp_path / "bare.py").write_text("x = 1")
+    with pytest.raises(RuntimeError, match="has no class Config"):
+        training(tmp_path, recipe=tmp_path / "bare.py").run()
+
+
+@pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
+def test_every_variant_is_an_option_of_every_recipe(plant):
+    config = recipe(plant).Config
+    nominal = tyro.cli(config, args=[])
+    for name, options in VARIANTS.items():
+        harder = tyro.cli(config, args=list(options))
+        assert (harder == nominal) == (name == "nominal")
+        assert harder.model_error == (name == "model error")
+
+
+@pytest.mark.parametrize(
+    "content", ["", '{"episodes": [', "{}", "null", "[1]", '{"episodes": 3, "summary": {}}', "\0\0"]
+)
+def test_a_damaged_metrics_file_is_no_finished_training(tmp_path, content):
+    found = finished(tmp_path, 0, 0.0)
+    assert found.done()
+    (found.folder / "metrics.json").write_text(content)
+    assert not found.done()
+    with pytest.raises(ValueError, match=r"seed-0 holds no results of a training of 3 episodes; run the study again"):
+        found.metrics()
+
+
+def test_a_training_that_was_cut_short_is_not_finished(tmp_path):
+    """An interrupted run judges the episodes that it has done, and writes their results."""
+    found = finished(tmp_path, 0, 0.0)
+    metrics = found.metrics()
+    (found.folder / "metrics.json").write_text(json.dumps(metrics | {"episodes": metrics["episodes"][:2]}))
+    assert not found.done()
+
+
+def test_a_training_with_damaged_results_runs_again(tmp_path):
+    found = training(tmp_path, recipe=written(tmp_path / "tiny.py", WRITE_RESULTS))
+    found.folder.mkdir()
+    (found.folder / "metrics.json").write_text("")
+    found.run()
+    assert found.done() and len(found.metrics()["episodes"]) == 3
+
+
+def test_a_recipe_that_ends_without_results_fails(tmp_path):
+    with pytest.raises(
+        RuntimeError, match=r"quiet.py --seed 0 .* ended without the results of 3 episodes; see .*\.log"
+    ):
+        training(tmp_path, recipe=written(tmp_path / "quiet.py", "pass")).run()

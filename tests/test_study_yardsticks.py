@@ -1,0 +1,61 @@
+"""Yardsticks of the study: what is kept, and on what they are measured."""
+
+import pytest
+import torch
+from handwritten_study import RECIPES
+
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl.study import yardsticks
+from rt_torchrl.study.yardsticks import Yardstick, changed_closure, configured, cost_over_episodes
+
+
+def test_what_is_kept_is_not_computed_again(tmp_path):
+    calls = []
+    yardstick = Yardstick(tmp_path / "deep" / "x.json", lambda: calls.append(1) or {"costs": [1.0]})
+    for _ in range(2):
+        assert yardstick.done() == bool(calls)
+        assert yardstick.run() == {"costs": [1.0]}
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("left", ["", '{"costs": [1.0', "null"])
+def test_a_damaged_yardstick_is_computed_again(tmp_path, left):
+    yardstick = Yardstick(tmp_path / "x.json", lambda: {"costs": [1.0]})
+    yardstick.path.write_text(left)
+    assert not yardstick.done()
+    with pytest.warns(UserWarning, match=r"x\.json is damaged; what it held is computed again"):
+        assert yardstick.run() == {"costs": [1.0]}
+    assert yardstick.done()
+
+
+def test_a_system_with_model_error_ends_as_its_recipe_says():
+    turbine, drone, tank = (plants()[name]() for name in ("wind_turbine", "flapping_wing", "cryogenic_tank"))
+    recipes = [RECIPES / f"{name}.py" for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]
+    worn = changed_closure(turbine, recipes[0], ())
+    speeds, pitch = torch.tensor([[7.6]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    features = torch.cat([speeds, pitch], -1)
+    assert worn(features).item() < 0.95 * turbine.closure(features).item()
+    # The drone's real body is the plant's own; it is the twin that believes in a lighter one.
+    assert changed_closure(drone, recipes[1], ()) is None
+    fouled = changed_closure(tank, recipes[2], ("--episodes", "11"))
+    ratio = fouled.log_coefficients.exp() / tank.closure.log_coefficients.exp()
+    assert ratio.tolist() == pytest.approx([1.0, 0.98**10, 1.0])
+
+
+def test_a_plan_on_training_episodes_is_judged_on_unseen_ones(monkeypatch):
+    monkeypatch.setattr(yardsticks, "missing_for_compilation", lambda: "a compiler")
+    system = RECIPES / "wind_turbine.py", ("--horizon", "5")
+    planned = {n: cost_over_episodes(*system, unseen=4, counts=(2, 3), iterations=n) for n in (0, 8)}
+    plant = configured(*system).plant()
+    start = plant.make_policy(torch.Generator().manual_seed(UNSEEN_SEED))
+    assert planned[0]["costs"] == pytest.approx([UnseenEpisodes(plant, 4).control_costs(start).mean().item()] * 2)
+    assert planned[8]["values"] == [2, 3] and max(planned[8]["costs"]) < planned[0]["costs"][0]
+
+
+def test_yardsticks_are_measured_on_the_plant_of_the_trainings():
+    short = configured(RECIPES / "flapping_wing.py", ("--quick", "--horizon", "1.25"))
+    assert short.plant().horizon == pytest.approx(1.25) and short.episodes == 3
+    for name, default in plants().items():
+        if (RECIPES / f"{name}.py").exists():
+            assert configured(RECIPES / f"{name}.py", ()).plant().extra_repr() == default().extra_repr()
