@@ -3,16 +3,19 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rt_torchrl import (
+    AssimilationConfig,
+    ExplorationConfig,
+    ModelBasedConfig,
+    ModelFreeConfig,
+    Run,
+    RunConfig,
+    ShortHorizonConfig,
+    TwinningConfig,
+    main_of,
+)
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
-from rt_torchrl.runs.run import Run, main_of
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.algorithm import TwinningConfig
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.model_based import ModelBasedConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.short_horizon import ShortHorizonConfig
 
 SWING_UP = TwinningConfig(
     # Half of the torque's range, for about as long as a swing takes: white noise hardly moves the rod.

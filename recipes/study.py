@@ -8,14 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl import ClassicalController, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.figures import study as charts
-from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
 from rt_torchrl.study import captions, page, report
+from rt_torchrl.study import figures as charts
 from rt_torchrl.study.findings import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import Task, side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
