@@ -27,7 +27,7 @@ class Signal:
     low: float = -math.inf
     high: float = math.inf
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"Signal name={self.name!r} must be an identifier such as 'rotor_speed'; rename it.")
         if not self.low < self.high:
