@@ -14,8 +14,8 @@ import tyro
 
 from rt_torchrl import shipped_plants
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
-from rt_torchrl.figures import study as charts
 from rt_torchrl.study import captions, page, report, yardsticks
+from rt_torchrl.study import figures as charts
 from rt_torchrl.study.findings import Entry, Results, arm_entry, difference, spread, weight_error, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training

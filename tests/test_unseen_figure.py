@@ -7,7 +7,8 @@ from figure_reading import collisions, draw
 from rt_torchrl import figures
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
-from rt_torchrl.runs.results import merit_lines, results
+from rt_torchrl.runs.results import results
+from rt_torchrl.runs.results_table import merit_lines
 
 COUNT = 12
 

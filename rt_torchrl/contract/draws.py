@@ -13,6 +13,7 @@ BATCH = 3
 
 
 def seeded(seed: int) -> torch.Generator:
+    """A generator of its own."""
     return torch.Generator().manual_seed(seed)
 
 
@@ -51,6 +52,7 @@ def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
 
 
 def wanted_as(shape: tuple[int, ...]) -> str:
+    """What a finding says that it expected."""
     return f"finite numbers of shape {shape} in torch.float64"
 
 

@@ -136,4 +136,5 @@ def twin_label(snapshot: Snapshot) -> str:
 
 
 def role_name(role: Role) -> str:
+    """What a policy is called in a figure."""
     return role.replace("_", "-")

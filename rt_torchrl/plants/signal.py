@@ -11,10 +11,10 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """A component of a state, action, exogenous input or observation.
+    r"""A component of a state, action, exogenous input or observation.
 
     Args:
-        symbol: the letter of the formulas, as matplotlib mathtext without the dollars (``r"\\omega_r"``).
+        symbol: the letter of the formulas, as matplotlib mathtext without the dollars (``r"\omega_r"``).
         name: the word of the interfaces, a valid identifier (``"rotor_speed"``).
         unit: SI unit, or the unit a correlation is defined in (``"rad/s"``, ``"deg"``, ``"-"``).
         low: least admissible value in ``unit``.
@@ -37,7 +37,7 @@ class Signal:
 
     @property
     def label(self) -> str:
-        """Axis label, such as ``rotor speed $\\omega_r$ [rad/s]``."""
+        r"""Axis label, such as ``rotor speed $\omega_r$ [rad/s]``."""
         return f"{self.name.replace('_', ' ')} ${self.symbol}$ [{self.unit}]"
 
 
