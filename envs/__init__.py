@@ -1,0 +1,1 @@
+"""The plants that ship with the library, a folder each."""

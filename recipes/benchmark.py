@@ -9,10 +9,7 @@ from pathlib import Path
 
 import torch
 
-from rt_torchrl.runs.run import main_of
-from rt_torchrl.runs.shipped_plants import plants
-from rt_torchrl.trajectories.rollout import Engine, Rollout
-from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl import Engine, Rollout, control_cost, main_of, shipped_plants
 
 REFERENCE: Engine = "odeint_adjoint"
 
@@ -44,8 +41,8 @@ class Config:
     output: Path | None = None
 
     def __post_init__(self):
-        if self.plant not in plants():
-            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(plants())}.")
+        if self.plant not in shipped_plants():
+            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(shipped_plants())}.")
         if not set(self.eager) <= set(self.engines):
             raise ValueError(f"eager={self.eager} must be some of engines={self.engines}.")
 
@@ -53,7 +50,7 @@ class Config:
 def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
     """One gradient as a function, always of the same trajectories."""
     generator = torch.Generator().manual_seed(0)
-    plant = plants()[config.plant]()
+    plant = shipped_plants()[config.plant]()
     closure, policy = plant.make_closure(generator), plant.make_policy(generator)
     initial_state = plant.draw_initial_state(config.realisations, generator)
     exogenous = plant.draw_exogenous(config.realisations, generator)[:, : config.steps or plant.n_steps]

@@ -8,20 +8,23 @@ from typing import Literal
 import torch
 from torch import nn
 
+from rt_torchrl import (
+    AssimilationConfig,
+    DescentConfig,
+    ExogenousConfig,
+    ExplorationConfig,
+    LearnerConfig,
+    PlannerConfig,
+    RefereeConfig,
+    Run,
+    RunConfig,
+    TwinningConfig,
+    main_of,
+)
 from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
-from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.run import Run, main_of
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.referees import RefereeConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.

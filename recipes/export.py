@@ -7,10 +7,9 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from rt_torchrl.export import export_c, export_onnx, export_program
+from rt_torchrl import export_c, export_onnx, export_program, main_of
 from rt_torchrl.export.onnx_model import require_packages
 from rt_torchrl.runs.loaded_run import FinishedRun, config_class_of, read_settings
-from rt_torchrl.runs.run import main_of
 
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 

@@ -4,21 +4,24 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rt_torchrl import (
+    AssimilationConfig,
+    DescentConfig,
+    ExogenousConfig,
+    ExplorationConfig,
+    LearnerConfig,
+    PlannerConfig,
+    RefereeConfig,
+    Run,
+    RunConfig,
+    TwinningConfig,
+    main_of,
+)
 from rt_torchrl.envs.flapping_wing import figures
 from rt_torchrl.envs.flapping_wing.animation import save_animation
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.run import Run, main_of
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.referees import RefereeConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T2; N_z, T_J and T_w are the library's defaults.

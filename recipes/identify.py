@@ -10,19 +10,12 @@ from typing import Annotated, Any
 import torch
 import tyro
 
+from rt_torchrl import Identification, IdentificationConfig, Plant, main_of, read_log, shipped_plants
 from rt_torchrl.figures import identification as charts
-from rt_torchrl.identification.identification import (
-    Identification,
-    IdentificationConfig,
-    Identified,
-    held_back,
-    measured_states,
-)
+from rt_torchrl.identification.identification import Identified, held_back, measured_states
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
-from rt_torchrl.identification.sensor_log import Column, checked, read_log
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs.run import can_compile, main_of
-from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl.identification.sensor_log import Column, checked
+from rt_torchrl.runs.run import can_compile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +55,7 @@ class Config:
 
     def make_plant(self) -> Plant:
         """The plant, with the control interval that was asked for."""
-        known = plants()
+        known = shipped_plants()
         if self.plant not in known:
             raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(known)}.")
         plant = known[self.plant]()

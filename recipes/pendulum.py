@@ -3,15 +3,19 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rt_torchrl import (
+    AssimilationConfig,
+    ExplorationConfig,
+    LearnerConfig,
+    PlannerConfig,
+    Run,
+    RunConfig,
+    ShortHorizonConfig,
+    TwinningConfig,
+    main_of,
+)
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
-from rt_torchrl.runs.run import Run, main_of
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 
 SWING_UP = TwinningConfig(
     # Half of the torque's range, for about as long as a swing takes: white noise hardly moves the rod.

@@ -7,15 +7,12 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl import ClassicalController, Plant, main_of, shipped_plants
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.identification.sensor_log import Log, logged_states
 from rt_torchrl.identification.simulated_log import ClassicalLaw, Law, policy_law, recorded
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs.run import main_of
-from rt_torchrl.runs.shipped_plants import plants
 
 CONTROLLERS: dict[str, type[ClassicalController]] = {
     "wind_turbine": JonkmanController,
@@ -55,8 +52,8 @@ class Config:
     gap: float = 0.02
 
     def __post_init__(self):
-        if self.plant not in plants():
-            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(plants())}.")
+        if self.plant not in shipped_plants():
+            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(shipped_plants())}.")
         if self.law == "classical" and self.plant not in CONTROLLERS:
             raise ValueError(f"law='classical': of {self.plant!r} no classical controller is known; use policy.")
         if not 0.0 <= self.gap < 0.5:
@@ -74,7 +71,7 @@ def main(config: Config) -> None:
 
 def make_plant(config: Config) -> Plant:
     """The plant, with the horizon that was asked for."""
-    kind = plants()[config.plant]
+    kind = shipped_plants()[config.plant]
     return kind() if config.horizon is None else kind(horizon=config.horizon)
 
 

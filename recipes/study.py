@@ -7,11 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl import ClassicalController, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
 from rt_torchrl.study import captions, report
 from rt_torchrl.study import figures as charts

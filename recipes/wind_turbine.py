@@ -9,6 +9,16 @@ from typing import Literal
 import torch
 from torch import nn
 
+from rt_torchrl import (
+    AssimilationConfig,
+    DescentConfig,
+    LearnerConfig,
+    PlannerConfig,
+    Run,
+    RunConfig,
+    TwinningConfig,
+    main_of,
+)
 from rt_torchrl.envs.wind_turbine import figures
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
@@ -17,13 +27,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.wear import worn_table
-from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.runs.run import Run, main_of
-from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.

@@ -1,33 +1,11 @@
-"""Reinforcement Twinning: a digital twin and two controllers, trained while the real system runs."""
+"""Reinforcement Twinning: a digital twin and two controllers, trained while the real system runs.
 
-from rt_torchrl.contract import PlantContractError, check_plant
-from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
-from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.config import TwinningConfig
+Every public name is imported from here. ``__init__.pyi`` lists the names and where each one is defined; a name is
+imported when it is first used, so that ``import rt_torchrl`` itself does not wait for PyTorch and TorchRL.
+"""
 
-__all__ = [
-    "Actuation",
-    "Descended",
-    "DigitalTwin",
-    "DivergenceError",
-    "Plant",
-    "PlantContractError",
-    "PlantEnv",
-    "Reading",
-    "RealSystem",
-    "ReinforcementTwinning",
-    "Rollout",
-    "Signal",
-    "Trajectory",
-    "TwinningConfig",
-    "check_plant",
-    "control_cost",
-    "identification_cost",
-]
+import lazy_loader
+
+__version__ = "0.2.0"
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,11 +10,11 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
+from rt_torchrl import shipped_plants
 from rt_torchrl.export import c_file, export_c, export_onnx, export_program, onnx_model
 from rt_torchrl.export.agreement import detached, sample_observations
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.runs.shipped_plants import plants
 
 # The same operations in double precision, at most in another order.
 ROUNDING = 1e-12
@@ -25,7 +25,7 @@ def generator():
 
 
 def policies_of_the_plants():
-    for name, kind in plants().items():
+    for name, kind in shipped_plants().items():
         plant = kind()
         yield pytest.param(plant, plant.make_policy(generator()), id=name)
 
@@ -43,7 +43,7 @@ print(extra["interface.json"])
 
 
 def test_a_program_needs_torch_alone(tmp_path):
-    plant = plants()["wind_turbine"]()
+    plant = shipped_plants()["wind_turbine"]()
     policy = SaturatedMLP(2, plant.actions, generator=generator())
     assert export_program(policy, tmp_path / "policy.pt2", plant) < ROUNDING
     rows = torch.randn(7, 2, generator=generator(), dtype=torch.float64)

@@ -11,11 +11,11 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
+from rt_torchrl import shipped_plants
 from rt_torchrl.export import c_file, export_c
 from rt_torchrl.export.c_operators import literal
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.runs.shipped_plants import plants
 
 COMPILER = next(filter(None, map(shutil.which, c_file.COMPILERS)), None)
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
@@ -52,12 +52,12 @@ def called(function, observation, n_actions):
 
 
 def policies_of_the_plants():
-    for name, kind in plants().items():
+    for name, kind in shipped_plants().items():
         plant = kind()
         yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
         mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(8, 5), generator=generator())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
-    turbine = plants()["wind_turbine"]()
+    turbine = shipped_plants()["wind_turbine"]()
     yield pytest.param(turbine, turbine.make_policy(generator(), bias=True), id="wind_turbine-bias")
 
 
@@ -77,7 +77,7 @@ def test_policies_of_the_plants(plant, policy, tmp_path):
 
 @needs_compiler
 def test_an_affine_law_is_its_closed_form(tmp_path):
-    plant = plants()["wind_turbine"]()
+    plant = shipped_plants()["wind_turbine"]()
     policy = SaturatedAffine(2, plant.actions, generator=generator())
     with torch.no_grad():
         policy.linear.weight.copy_(torch.tensor([[1.0, -2.0], [0.5, 3.0]]))
@@ -93,7 +93,7 @@ def test_an_affine_law_is_its_closed_form(tmp_path):
 
 @needs_compiler
 def test_a_program_in_c_that_includes_the_header(tmp_path):
-    plant = plants()["flapping_wing"]()
+    plant = shipped_plants()["flapping_wing"]()
     policy = SaturatedMLP(4, plant.actions, hidden=(6,), generator=generator())
     export_c(policy, tmp_path / "wing.c", plant, function="fly")
     header = (tmp_path / "wing.h").read_text()

@@ -4,7 +4,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
-from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl import shipped_plants
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -58,11 +58,11 @@ def test_every_entry_is_that_of_stepping_with_wear():
     compare(make, (1.0, 0.5, 0.0), rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", plants())
+@pytest.mark.parametrize("name", shipped_plants())
 def test_every_plant_flies_as_it_steps(name):
-    dt = plants()[name]().dt
+    dt = shipped_plants()[name]().dt
     # Rounding, amplified by the dynamics over 40 intervals.
-    compare(lambda: system(plants()[name](horizon=40 * dt)), rtol=1e-9, atol=1e-9)
+    compare(lambda: system(shipped_plants()[name](horizon=40 * dt)), rtol=1e-9, atol=1e-9)
 
 
 def test_a_flight_that_diverges_says_where():

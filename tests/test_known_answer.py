@@ -12,12 +12,12 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Rollout, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.model_free import LearnerConfig
 
 SEEDS = 0, 1, 2
 EPISODES = 20
 # All else, prioritised replay among it, is the library's default; so is the recipe of the wind turbine.
-LEARNER = ModelFreeConfig(return_steps=10)
+LEARNER = LearnerConfig(return_steps=10)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import rt_torchrl
+
 ROOT = Path(__file__).parent.parent
 MISSING = [name for name in ("build", "hatchling") if importlib.util.find_spec(name) is None]
 PROBE = """
@@ -17,6 +19,8 @@ assert plant.WindTurbine.__module__ == "rt_torchrl.envs.wind_turbine.plant"
 assert sys.modules["rt_torchrl.envs"] is envs and envs.wind_turbine is sys.modules["rt_torchrl.envs.wind_turbine"]
 assert not [name for name in sys.modules if name == "envs" or name.startswith("envs.")]
 plant.WindTurbine()
+from rt_torchrl import Plant
+assert issubclass(plant.WindTurbine, Plant)
 print(plant.__file__)
 """
 
@@ -54,10 +58,18 @@ def test_wheel_maps_the_folder_and_holds_its_data(wheel):
     data = {f"rt_torchrl/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "envs").glob("*/data/*") if p.is_file()}
     code = {p.relative_to(ROOT).as_posix() for p in (ROOT / "rt_torchrl").rglob("*.py")} - {"rt_torchrl/envs.py"}
     assert data | code <= names
+    # What type checkers read, and what ``rt_torchrl/__init__.py`` reads its public names from.
+    assert {"rt_torchrl/py.typed", "rt_torchrl/__init__.pyi"} <= names
     assert {"rt_torchrl/envs/wind_turbine/plant.py", "rt_torchrl/envs/wind_turbine/data/NOTICE.md"} <= names
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     # No distribution-wide ``envs``, ``tests`` or ``recipes``, and no shim that would shadow the folder.
     assert tops == {"rt_torchrl"} and "rt_torchrl/envs.py" not in names
+
+
+def test_wheel_has_the_version_that_the_package_states(wheel):
+    assert wheel.name.startswith(f"rt_torchrl-{rt_torchrl.__version__}-")
+    metadata = zipfile.ZipFile(wheel).read(f"rt_torchrl-{rt_torchrl.__version__}.dist-info/METADATA").decode()
+    assert f"\nVersion: {rt_torchrl.__version__}\n" in metadata and "\nClassifier: Typing :: Typed\n" in metadata
 
 
 def test_wheel_works_without_the_checkout(wheel, tmp_path):

@@ -10,13 +10,12 @@ from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import check_plant
-from rt_torchrl.runs.shipped_plants import plants
+from rt_torchrl import check_plant, shipped_plants
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-CLASSES = {"linear_quadratic": LinearQuadratic} | plants()
+CLASSES = {"linear_quadratic": LinearQuadratic} | shipped_plants()
 GREATEST_EPISODE = 2000
 
 

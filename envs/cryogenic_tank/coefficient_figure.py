@@ -1,8 +1,11 @@
 """The tank's coefficients as functions of the state, for a closure that lets them be."""
 
+from typing import cast
+
 import torch
 from matplotlib.figure import Figure
 
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.evaluation.closure_error import visited_features
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
@@ -32,7 +35,8 @@ def coefficients(snapshot: Snapshot) -> Figure:
 
     Pale is what the episode did not visit; the axes go half as far again on both sides.
     """
-    plant, seen = snapshot.plant, visited_features(snapshot.plant, snapshot.record)
+    plant = cast(CryogenicTank, snapshot.plant)
+    seen = visited_features(plant, snapshot.record)
     axes_of = (
         ("pressure [kPa]", 1e-3 * plant.set_point),
         ("liquid volume [m³]", plant.volume),

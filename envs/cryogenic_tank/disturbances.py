@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -86,7 +86,7 @@ class CyclicLoad:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
         require_request(batch, n_steps, dt)
-        like = {"dtype": torch.float64, "device": generator.device}
+        like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         t = dt * torch.arange(n_steps, **like)
         orbit = (t / self.period).floor().long()
         # Peaks of neighbouring orbits count as far as six standard deviations, e^{−18} = 1.5e-8 of their height.

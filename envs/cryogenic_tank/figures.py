@@ -1,6 +1,6 @@
 """Figures of the cryogenic tank: its days in orbit, what its vent takes away, the path of the vented fluid."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -58,7 +58,7 @@ def tank(snapshot: Snapshot) -> Figure:
     A record of more than ``POINTS`` samples is drawn in groups, with the mean of each and the range within it. The
     axes hold the real tank and no more than as much again above and below it: a twin that is far off leaves them.
     """
-    plant, record = snapshot.plant, snapshot.record
+    plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     real = _quantities(plant, record.states, record.actions, plant.closure)
     twin = _quantities(plant, snapshot.replay, record.actions, snapshot.closure)
     time, label = time_axis(plant, len(record.actions))
@@ -132,7 +132,7 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     Below, how often the last episode had each pressure drop: a twin can only know what was visited; drops outside
     their range are pale.
     """
-    plant, record = snapshot.plant, snapshot.record
+    plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     # Denser towards the shut valve, where the flow goes with the root of the drop.
     drop = plant.actions[0].high * torch.linspace(0.0, 1.0, 201, dtype=torch.float64) ** 2
     drop = drop.to(record.states.device)
@@ -173,7 +173,7 @@ def vent_path(snapshot: Snapshot) -> Figure:
     1: liquid of the tank at p. 2: behind the valve at p_1, same enthalpy. 3: all vapour at p_1, as an endless heat
     exchanger would leave it; the real one leaves it at the cross, with the share ε of the heat from 2 to 3.
     """
-    plant, record = snapshot.plant, snapshot.record
+    plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     last = slice(-min(len(record.actions), round(DAY / plant.dt)), None)
     states, drop = record.states[:-1][last], _drop(plant, record.states[:-1][last], record.actions[last]).mean()
     state = states.mean(0)
@@ -213,7 +213,7 @@ class VentPath(NamedTuple):
 
         fluid_state = CP.AbstractState("HEOS", fluid)
 
-        def at(pair: int, first: float, second: float) -> tuple[float, float, float]:
+        def at(pair: Any, first: float, second: float) -> tuple[float, float, float]:
             fluid_state.update(pair, first, second)
             return fluid_state.smass(), fluid_state.T(), fluid_state.hmass()
 

@@ -1,9 +1,12 @@
 """What the operator of a tank judges an episode by."""
 
+from typing import TYPE_CHECKING
+
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.plant import Plant
+if TYPE_CHECKING:
+    from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
 SETTLED_SHARE = 0.6
 """Share of an episode after which the pressure should be held: three of five days."""
@@ -12,7 +15,7 @@ BAND = 5e3
 
 
 def merit(
-    plant: Plant,
+    plant: "CryogenicTank",
     states: Float[Tensor, "batch samples 3"],
     applied: Float[Tensor, "batch n 1"],
     exogenous: Float[Tensor, "batch n 1"],

@@ -91,6 +91,8 @@ class CryogenicTank(Plant):
     inputs = (Signal(symbol="Q_h", name="heat_load", unit="W", low=0.0),)
     observations = (Signal(symbol="e", name="pressure_error", unit="-"),)
 
+    error_sizes: Tensor
+
     def __init__(
         self,
         *,

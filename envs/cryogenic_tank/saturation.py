@@ -65,6 +65,8 @@ class Saturation(nn.Module):
     2498 (CoolProp).
     """
 
+    table: Tensor
+
     def __init__(self, fluid: str = "Hydrogen", *, low: float = 80e3, high: float = 900e3):
         super().__init__()
         self.fluid, self.low, self.high = fluid, float(low), float(high)

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
 
 class OnOffValve(ClassicalController):
@@ -15,6 +16,7 @@ class OnOffValve(ClassicalController):
     the range.
     """
 
+    plant: CryogenicTank
     gain_units = {"opening": "Pa"}
     default_gains = (200e3,)
     half_band = 1e3  # h [Pa]
@@ -39,6 +41,7 @@ class PIValve(ClassicalController):
     of 129 W is then held 1 kPa above the target, and an integral would only overshoot after starts that are 25 kPa off.
     """
 
+    plant: CryogenicTank
     gain_units = {"K_P": "-", "K_I": "1/s"}
     placed_gains = (7.7, 4.5e-5)
     default_gains = (77.5, 6.1e-10)

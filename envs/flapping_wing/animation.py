@@ -1,12 +1,14 @@
 """The last flight as a moving picture."""
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.animation import PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array, caption, last_episode, legend_below, panels
 
@@ -51,7 +53,7 @@ class _Scene:
     """The picture at any sample of the record."""
 
     def __init__(self, snapshot: Snapshot):
-        self.plant = snapshot.plant
+        self.plant = cast(FlappingWing, snapshot.plant)
         self.place = array(snapshot.record.states)[:, :2]
         # The sample at the end has no interval of its own; it shows the last one.
         last = len(snapshot.record.actions) - 1

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -86,7 +86,7 @@ class GaussianGust:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
         require_request(batch, n_steps, dt)
-        like = {"dtype": torch.float64, "device": generator.device}
+        like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         reach = 9.0  # e^{−9²/2} = e^{−40}: where kernel and spectrum are below rounding
         period = n_steps * dt + reach * self.time_scale
         k = torch.arange(math.ceil(reach * period / (2.0 * math.pi * self.time_scale)) + 1, **like)

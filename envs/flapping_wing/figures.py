@@ -1,5 +1,7 @@
 """Figures of the flapping-wing drone: its flight, the polars of its wings, its policies."""
 
+from typing import Any, cast
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -9,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.closure_error import visited_features as features_of
 from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.snapshot import Snapshot
@@ -66,7 +69,7 @@ def flight_path(snapshot: Snapshot) -> Figure:
 
 
 def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
-    plant, real, twin = snapshot.plant, array(snapshot.record.states), array(snapshot.replay)
+    plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
     wind = array(snapshot.record.exogenous)[:, 0]
     ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label="real")
     ax.plot(*real[0, :2], "s", color=REAL, markersize=7, label="start")
@@ -76,7 +79,14 @@ def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     ax.margins(0.09)
     second = np.arange(round(1.0 / plant.dt), len(real), round(1.0 / plant.dt))
     ax.plot(*real[second, :2].T, "o", color=REAL, markersize=4.5, label="every second")
-    style = {"color": SAMPLES, "width": 0.005, "zorder": 3, "units": "width", "scale": 24.0, "scale_units": "width"}
+    style: dict[str, Any] = {
+        "color": SAMPLES,
+        "width": 0.005,
+        "zorder": 3,
+        "units": "width",
+        "scale": 24.0,
+        "scale_units": "width",
+    }
     arrows = ax.quiver(*real[second, :2].T, -wind[second - 1], np.zeros(len(second)), **style)
     key = {"labelpos": "N", "coordinates": "axes", "angle": 180.0, "fontproperties": {"size": 9}}
     ax.quiverkey(arrows, 0.9, 0.06, 2.0, "wind 2 m/s", **key)
@@ -97,28 +107,30 @@ def _label_seconds(ax: Axes, places: Float[np.ndarray, "seconds 2"]) -> None:
 
 
 def _draw_wind(ax: Axes, snapshot: Snapshot) -> None:
-    recorded, strongest = array(snapshot.record.exogenous)[:, 0], snapshot.plant.strongest_wind
-    time, _ = time_axis(snapshot.plant, len(recorded))
+    plant = cast(FlappingWing, snapshot.plant)
+    recorded, strongest = array(snapshot.record.exogenous)[:, 0], float(plant.strongest_wind)
+    time, _ = time_axis(plant, len(recorded))
     ax.plot(time, recorded, color=REAL, linewidth=1.9, label="recorded")
     if snapshot.large_scale is not None:
         ax.plot(time, array(snapshot.large_scale)[:, 0], color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
     ax.axhline(strongest, **LIMIT_LINE)
     # On the line itself, because the legend has no room for it.
-    text = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "center"}
+    text: dict[str, Any] = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "center"}
     text["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
     ax.annotate("strongest that can be held", (0.99, strongest), xycoords=("axes fraction", "data"), **text)
     ax.set_ylim(min(0.0, recorded.min()) - 0.2, 1.15 * max(strongest, recorded.max()))
-    caption(ax, snapshot.plant.inputs[0].label)
+    caption(ax, plant.inputs[0].label)
     legend_above(ax)
     ax.tick_params(labelbottom=False)
 
 
 def _draw_distance(ax: Axes, snapshot: Snapshot) -> None:
+    plant = cast(FlappingWing, snapshot.plant)
     real, twin = (
-        np.linalg.norm(array(states[:, :2] - snapshot.plant.target), axis=1)
+        np.linalg.norm(array(states[:, :2] - plant.target), axis=1)
         for states in (snapshot.record.states, snapshot.replay)
     )
-    time, label = time_axis(snapshot.plant, len(real))
+    time, label = time_axis(plant, len(real))
     ax.plot(time, real, color=REAL, linewidth=1.9, label="real")
     ax.plot(time, twin, color=TWIN, linewidth=1.0, label=twin_label(snapshot))
     ax.set_yscale("log")
@@ -136,7 +148,7 @@ def flight(snapshot: Snapshot) -> Figure:
     The stroke plane angle is under the horizontal motion that it drives, the amplitude under the vertical one. Speeds
     shake with the wing beat and actions answer them: drawn are their mean over each beat and the band they keep within.
     """
-    plant, real, twin = snapshot.plant, array(snapshot.record.states), array(snapshot.replay)
+    plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
     applied = array(snapshot.record.actions)
     time, label = time_axis(plant, len(real))
     beat = round(1.0 / (plant.frequency * plant.dt))
@@ -210,7 +222,7 @@ def polars(snapshot: Snapshot) -> Figure:
 
 def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     """(sin α_e, cos α_e) in the last real flight, at the blade element nearest to ``SPAN_SHARE`` of the span."""
-    plant = snapshot.plant
+    plant = cast(FlappingWing, snapshot.plant)
     element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
     return features_of(plant, snapshot.record)[:, element]
 
@@ -233,10 +245,11 @@ def _draw_polars(axes: np.ndarray, snapshot: Snapshot) -> None:
 
 def _coefficients(snapshot: Snapshot) -> list[str]:
     """A line for each law that has its coefficients by name."""
-    laws = {name: law for name, law in closures(snapshot).items() if hasattr(law, "named_coefficients")}
+    found = {name: getattr(law, "named_coefficients", None) for name, law in closures(snapshot).items()}
     return [
-        f"{name}: " + ", ".join(f"{letter} = {value:.4g}" for letter, value in law.named_coefficients().items())
-        for name, law in laws.items()
+        f"{name}: " + ", ".join(f"{letter} = {value:.4g}" for letter, value in named().items())
+        for name, named in found.items()
+        if named is not None
     ]
 
 

@@ -1,13 +1,16 @@
 """What the operator of a drone judges a flight by."""
 
+from typing import TYPE_CHECKING
+
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rt_torchrl.plants.plant import Plant
+if TYPE_CHECKING:
+    from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
 
 def merit(
-    plant: Plant,
+    plant: "FlappingWing",
     states: Float[Tensor, "batch samples 4"],
     applied: Float[Tensor, "batch n 2"],
     exogenous: Float[Tensor, "batch n 1"],
@@ -17,7 +20,7 @@ def merit(
     return {"final distance [m]": distance[:, -1], "least distance [m]": distance.amin(-1)}
 
 
-def categories(plant: Plant, exogenous: Float[Tensor, "batch n 1"]) -> dict[str, Bool[Tensor, " batch"]]:
+def categories(plant: "FlappingWing", exogenous: Float[Tensor, "batch n 1"]) -> dict[str, Bool[Tensor, " batch"]]:
     """Whether the stroke plane turns far enough to hold the wind of the last second, when the drone should hover.
 
     No policy stays at the target in a gust beyond that; it is blown away, and how far says nothing of the policy.

@@ -1,5 +1,7 @@
 r"""Closure of the flapping wing: a law for the lift and drag of a blade element."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -42,7 +44,7 @@ class QuasiSteadyPolar(PositiveCoefficients):
         """
         if not 0.0 <= spread < 1.0:
             raise ValueError(f"spread={spread} of QuasiSteadyPolar must be in [0, 1), a fraction of the true values.")
-        like = {"dtype": torch.float64, "device": generator.device}
+        like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         factor = 1.0 + spread * (2.0 * torch.rand(3, generator=generator, **like) - 1.0)
         return cls(torch.tensor(cls.true_coefficients, **like) * factor)
 

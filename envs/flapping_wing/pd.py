@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
 
 class TrimmedPD(ClassicalController):
@@ -22,6 +23,7 @@ class TrimmedPD(ClassicalController):
     full stroke until the target is near.
     """
 
+    plant: FlappingWing
     gain_units = {"K_Pz": "deg/m", "K_Dz": "deg s/m", "K_Px": "deg/m", "K_Dx": "deg s/m"}
     placed_gains = (16.0, 16.0, 23.0, 23.0)
     default_gains = (571.0, 397.0, 61.5, 44.0)

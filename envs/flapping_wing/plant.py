@@ -98,6 +98,14 @@ class FlappingWing(Plant):
     # ℓ [m], ℓ [m], v [m/s], v [m/s]: with these the good policies have weights of 1 to 2, found at one learning rate.
     observation_scale = (2.0, 2.0, 1.0, 1.0)
 
+    target: Tensor
+    window_peak: Tensor
+    error_scale: Tensor
+    mass: Tensor
+    weight: Tensor
+    radius: Tensor
+    strip_mass: Tensor
+
     def __init__(
         self,
         *,

@@ -33,8 +33,9 @@ def gymnasium_pendulum(
     except ImportError as error:
         raise ValueError("the pendulum needs Gymnasium: install the extra, pip install 'rt_torchrl[gym]'.") from error
     env = gymnasium.make("Pendulum-v1", g=plant.gravity, max_episode_steps=plant.n_steps)
-    if env.unwrapped.dt != plant.dt:
-        raise ValueError(f"dt={plant.dt} s of the plant must be that of Gymnasium's pendulum, {env.unwrapped.dt} s.")
+    dt = vars(env.unwrapped)["dt"]
+    if dt != plant.dt:
+        raise ValueError(f"dt={plant.dt} s of the plant must be that of Gymnasium's pendulum, {dt} s.")
     return RealSystem(
         GymWrapper(env), plant, state=Reading(of=angle_and_speed), closure=closure, seed=seed, device=device
     )

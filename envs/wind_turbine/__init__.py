@@ -1,0 +1,1 @@
+"""The NREL 5-MW wind turbine."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -118,7 +118,7 @@ class KaimalWind:
         self, batch: int, n_steps: int, dt: float, generator: torch.Generator
     ) -> Float[Tensor, "{batch} {n_steps}"]:
         """The sum of cosines for σ = 1, by an inverse real FFT."""
-        like = {"dtype": torch.float64, "device": generator.device}
+        like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         f = torch.arange(1, n_steps // 2 + 1, **like) / (n_steps * dt)
         phase = 2.0 * math.pi * torch.rand(batch, len(f), generator=generator, **like)
         amplitude = torch.sqrt(2.0 * self._unit_spectrum(f) / (n_steps * dt))

@@ -1,6 +1,6 @@
 """Figures of the wind turbine: its set-points, its power coefficient, the agreement of its twin."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     CLOSURE_LINES,
@@ -46,15 +47,16 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
 
     The reference speed follows the filtered wind, and the filtered speed is what the policies compare it with.
     """
-    plant, record = snapshot.plant, snapshot.record
+    plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
     state = record.states[:-1]
     time, label = time_axis(plant, len(state))
     omega_g = plant.gear_ratio * state[:, 0]
     figure, axes = panels(5, title=f"Power and speed, episode {last_episode(snapshot)}", size=(8.5, 9.5), sharex=True)
     wind, speed, power, torque, pitch = axes.flat
 
-    def draw(ax: Axes, values: Tensor, label: str, **style) -> None:
-        ax.plot(time, array(values), label=label, **({"color": REAL, "linewidth": 1.5} | style))
+    def draw(ax: Axes, values: Tensor, label: str, **style: Any) -> None:
+        look: dict[str, Any] = {"color": REAL, "linewidth": 1.5} | style
+        ax.plot(time, array(values), label=label, **look)
 
     draw(wind, record.exogenous[:, 0], "wind", linewidth=0.9)
     draw(wind, state[:, 2], "filtered", color=FILTERED, linewidth=2.0)
@@ -107,7 +109,7 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
 
 def scatter(snapshot: Snapshot) -> Figure:
     """Generator speed of the twin against the real one at the same instants (paper, fig. 12b)."""
-    real, twin = (array(snapshot.plant.gear_ratio * s[:, 0]) for s in (snapshot.record.states, snapshot.replay))
+    real, twin = (array(WindTurbine.gear_ratio * s[:, 0]) for s in (snapshot.record.states, snapshot.replay))
     error = twin - real
     figure, ((ax,),) = panels(1, title="Twin against real generator speed", size=(5.4, 5.6))
     ends = [min(real.min(), twin.min()), max(real.max(), twin.max())]
@@ -133,7 +135,7 @@ class _Visited(NamedTuple):
     def of(cls, snapshot: Snapshot) -> "_Visited":
         record = snapshot.record
         wind, beta = record.exogenous[:, 0], record.actions[:, 1]
-        lam = record.states[:-1, 0] * snapshot.plant.radius / wind
+        lam = record.states[:-1, 0] * WindTurbine.radius / wind
         C_p = {name: _evaluate(closure, lam, beta) for name, closure in closures(snapshot).items()}
         return cls(array(lam), array(beta), array(wind), C_p)
 

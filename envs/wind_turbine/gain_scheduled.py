@@ -1,12 +1,16 @@
 r"""A turbine controller as wind engineers build it, whose gains are trained."""
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+
+if TYPE_CHECKING:
+    from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 
 
 class GainScheduled(nn.Module):
@@ -48,9 +52,13 @@ class GainScheduled(nn.Module):
         "schedule": math.degrees(0.1099965),  # β_K [deg]
     }
 
+    nominal: Tensor
+    low: Tensor
+    high: Tensor
+
     def __init__(
         self,
-        plant: Plant,
+        plant: "InstrumentedTurbine",
         *,
         detuning: float = math.log(2.0),
         reference_speed: float = 124.5,
@@ -66,10 +74,10 @@ class GainScheduled(nn.Module):
             raise ValueError(f"switch_width={switch_width} rad/s must be positive; Jonkman's table takes about 1.")
         share = torch.rand(len(self.NOMINAL), generator=generator, dtype=torch.float64, device=generator.device)
         self.weights = nn.Parameter(detuning * (2.0 * share - 1.0))
-        like = {"dtype": torch.float64}
-        self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), **like))
-        for bound in ("low", "high"):
-            self.register_buffer(bound, torch.tensor([getattr(action, bound) for action in plant.actions], **like))
+        self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), dtype=torch.float64))
+        low, high = bounds(plant.actions)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
         self.reference_speed, self.switch_speed = reference_speed, switch_speed
         self.switch_width, self.switch_pitch = switch_width, switch_pitch
         self.dt, self.fast_filter = plant.dt, plant.fast_filter

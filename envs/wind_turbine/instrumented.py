@@ -72,6 +72,12 @@ class InstrumentedTurbine(WindTurbine):
         state = super().draw_initial_state(batch, generator)
         return torch.cat([state, self.gear_ratio * state[:, :1]], -1)
 
-    def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """A gain-scheduled law whose gains start up to twice too large or too small."""
+    def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
+        """A gain-scheduled law whose gains start up to twice too large or too small.
+
+        Raises:
+            ValueError: if a bias is asked for, which this law does not have.
+        """
+        if bias:
+            raise ValueError(f"bias={bias} must be False: a gain-scheduled law has no bias. Take WindTurbine for one.")
         return GainScheduled(self, generator=generator)

@@ -32,6 +32,7 @@ class JonkmanController(ClassicalController):
     Source: Jonkman et al., NREL/TP-500-38060, section 7; the variables are those of ``DISCON.F90``.
     """
 
+    plant: WindTurbine
     memory_size = 2
 
     def __init__(self, plant: WindTurbine, *, compiled: bool = False):

@@ -1,13 +1,16 @@
 """What a wind engineer judges an episode by."""
 
+from typing import TYPE_CHECKING
+
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.plant import Plant
+if TYPE_CHECKING:
+    from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
 
 def merit(
-    plant: Plant,
+    plant: "WindTurbine",
     states: Float[Tensor, "batch samples n_s"],
     applied: Float[Tensor, "batch n 2"],
     exogenous: Float[Tensor, "batch n 1"],

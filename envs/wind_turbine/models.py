@@ -37,6 +37,9 @@ class SaintDrenan(nn.Module):
     scales = (0.1, 10.0, 0.1, 0.01, 0.01, 1.0, 2.0, 0.01, 0.05, 0.01)
     smallest_pitch = 0.01  # ε [deg]
 
+    scale: Tensor
+    fixed: Tensor
+
     def __init__(self, coefficients: Float[Tensor, "11"], *, free_c1: bool = False):
         super().__init__()
         coefficients = torch.as_tensor(coefficients, dtype=torch.float64)

@@ -65,7 +65,6 @@ class WindTurbine(Plant):
     """
 
     name = "wind_turbine"
-
     radius = 63.0  # R [m]
     air_density = 1.225  # ρ [kg/m³]
     gear_ratio = 97.0  # N_g [-]
@@ -80,7 +79,7 @@ class WindTurbine(Plant):
     cut_in_band = 10.0  # half width of that band [rad/s]
     standstill_tip_speed_ratio = 1.0  # λ below which the blades are taken out of the flow [-]
 
-    states = (
+    states: tuple[Signal, ...] = (
         Signal(symbol=r"\omega_r", name="rotor_speed", unit="rad/s", low=0.0),
         Signal(symbol=r"\hat\omega_g", name="filtered_generator_speed", unit="rad/s"),
         Signal(symbol=r"\hat u", name="filtered_wind_speed", unit="m/s"),
@@ -90,10 +89,11 @@ class WindTurbine(Plant):
     )
     actions = states[4:]
     inputs = (Signal(symbol="u", name="wind_speed", unit="m/s", low=3.0),)
-    observations = (
+    observations: tuple[Signal, ...] = (
         Signal(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0),
         Signal(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0),
     )
+    greatest_increment: Tensor
 
     def __init__(
         self,

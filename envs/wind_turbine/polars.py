@@ -1,7 +1,7 @@
 """A blade as data: its elements, and the lift and drag of their sections over the full circle of angles of attack."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ class Polar:
     alpha: np.ndarray
     cl: np.ndarray
     cd: np.ndarray
+    _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
         columns = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("alpha", "cl", "cd")}

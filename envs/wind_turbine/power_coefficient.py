@@ -49,6 +49,14 @@ class PowerCoefficientTable(nn.Module):
     Source: C. de Boor, *A Practical Guide to Splines*, chapters IV and XVII.
     """
 
+    tip_speed_ratio: Tensor
+    pitch: Tensor
+    values: Tensor
+    _lam_knots: Tensor
+    _lam_origins: Tensor
+    _beta_origins: Tensor
+    _coefficients: Tensor
+
     def __init__(
         self,
         tip_speed_ratio: Axis,

@@ -49,7 +49,7 @@ def rosco() -> ModuleType:
 
 def examples() -> Path:
     """Where ROSCO's package keeps the reference turbines."""
-    return Path(rosco().__file__).parent.parent / "Examples"
+    return Path(str(rosco().__file__)).parent.parent / "Examples"
 
 
 @cache
@@ -230,6 +230,8 @@ class RoscoController(RealController):
     It decides at every step of the simulator; what counts as applied in a control interval is what it asks for at the
     start of it. For its arguments see :class:`RealController`.
     """
+
+    plant: WindTurbine
 
     def fly_real(self, count: int, *, seed: int) -> Trajectory:
         """The episodes that :func:`rosco_turbine` runs from the same seed."""

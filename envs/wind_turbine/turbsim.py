@@ -146,7 +146,8 @@ def read_bts(path: str | os.PathLike) -> WindRecord:
     raw = np.memmap(path, dtype="<i2", mode="r", offset=start, shape=shape)
     z = _interpolation(path, (header.hub_height - header.bottom) / header.dz, header.n_z, "height")
     y = _interpolation(path, 0.5 * (header.n_y - 1), header.n_y, "width")
-    hub = sum(a * b * raw[:, i * header.n_y + j, 0].astype(np.float64) for i, a in z for j, b in y)
+    corners = [a * b * raw[:, i * header.n_y + j, 0].astype(np.float64) for i, a in z for j, b in y]
+    hub = np.sum(corners, axis=0)
     # The interval is stored in single precision: its shortest decimal is the number that was asked for.
     dt = float(str(np.float32(header.dt)))
     return WindRecord(dt * np.arange(header.n_t), (hub - header.u_offset) / header.u_slope, str(path))

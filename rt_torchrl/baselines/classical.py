@@ -35,6 +35,8 @@ class ClassicalController(nn.Module, ABC):
     placed_gains: tuple[float, ...] | None = None
     """Gains by a rule of thumb, where a search is to start from them and not from the defaults."""
     memory_size: int = 0
+    low_action: Tensor
+    high_action: Tensor
 
     def __init__(self, plant: Plant, gains: tuple[float, ...] | None = None, *, compiled: bool = False):
         super().__init__()
@@ -89,7 +91,9 @@ class ControlledInterval(Interval):
         closure: of the system.
     """
 
-    def __init__(self, controller: ClassicalController, closure: nn.Module | None):
+    policy: ClassicalController
+
+    def __init__(self, controller: ClassicalController, closure: nn.Module):
         super().__init__(controller.plant, closure, controller)
 
     def commanded(

@@ -1,7 +1,7 @@
 """The methods of a plant with arguments that its episodes meet."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,11 +18,11 @@ class Method(NamedTuple):
     """A method as a function of named tensors: which it takes, and name and trailing shape of what it gives."""
 
     name: str
-    call: Callable[..., object]
+    call: Callable[..., Any]
     takes: tuple[str, ...]
     gives: dict[str, tuple[int, ...]]
 
-    def outputs(self, arguments: Arguments) -> tuple[object, ...]:
+    def outputs(self, arguments: Arguments) -> tuple[Any, ...]:
         """What it gives for arguments by name; others than it takes are left out."""
         found = self.call(*(arguments[name] for name in self.takes))
         return tuple(found) if self.name == "step" and isinstance(found, tuple) else (found,)
@@ -49,8 +49,9 @@ class Calls:
         state = plant.draw_initial_state(2 * episodes, generator)
         exogenous = plant.draw_exogenous(2 * episodes, generator)[:, 0]
         command = random_commands(plant, (2 * episodes,), generator)
-        rows = [x.reshape(2, episodes, -1) for x in (state, command, exogenous)]
-        return cls(plant, _named(torch.zeros(2, 1, dtype=torch.float64), *rows, rows[1]), seed)
+        state, command, exogenous = (x.reshape(2, episodes, -1) for x in (state, command, exogenous))
+        t = torch.zeros(2, 1, dtype=torch.float64)
+        return cls(plant, _named(t, state, command, exogenous, applied=command), seed)
 
     @classmethod
     @torch.no_grad()
@@ -112,5 +113,5 @@ def _commanded(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple("command" if name == "applied" else name for name in names)
 
 
-def _under(method: Callable[..., object], closure: nn.Module) -> Callable[..., object]:
+def _under(method: Callable[..., Any], closure: nn.Module) -> Callable[..., Any]:
     return lambda *arguments: method(*arguments, closure)

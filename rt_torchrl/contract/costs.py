@@ -25,7 +25,7 @@ def costs(calls: Calls) -> Iterator[str]:
         yield f"discrepancy: is {same.abs().max():.4g} between a state and itself; expected 0."
     size = 1e-9 * (1.0 + found["applied"].abs().amax((0, 1)))
     applied = plant.actuate(found["state"], found["command"])
-    step = plant.step(*(found[name] for name in ("t", "state", "command", "exogenous")), plant.closure)
+    step = plant.step(found["t"], found["state"], found["command"], found["exogenous"], plant.closure)
     if ((step.applied - applied).abs() > size).any():
         yield (
             "step: its applied action is not what actuate(state, command) gives, by up to "

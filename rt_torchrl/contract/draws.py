@@ -1,6 +1,7 @@
 """What a plant draws: initial states, inputs, closures and policies."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,7 @@ BATCH = 3
 
 
 def seeded(seed: int) -> torch.Generator:
+    """A generator of its own."""
     return torch.Generator().manual_seed(seed)
 
 
@@ -50,6 +52,7 @@ def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
 
 
 def wanted_as(shape: tuple[int, ...]) -> str:
+    """What a finding says that it expected."""
     return f"finite numbers of shape {shape} in torch.float64"
 
 
@@ -89,7 +92,7 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
             yield f"{name}: gives a {type(first).__name__}; expected a torch.nn.Module."
             continue
         yield from _single_precision(name, first)
-        yield from _other_sources(name, lambda make=make: _weights(make(seeded(seed))))
+        yield from _other_sources(name, partial(_drawn_weights, make, seed))
         if not any(weight.requires_grad for weight in first.parameters()):
             yield f"{name}: has no trainable weights; what is learned must be an nn.Parameter with requires_grad."
     if not isinstance(plant.closure, nn.Module):
@@ -99,7 +102,8 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
     yield from _commands(plant, seed)
 
 
-def _weights(module: nn.Module) -> Tensor:
+def _drawn_weights(make: Callable[[torch.Generator], nn.Module], seed: int) -> Tensor:
+    module = make(seeded(seed))
     weights = [weight.detach().double().flatten() for weight in module.state_dict().values()]
     return torch.cat(weights) if weights else torch.empty(0)
 

@@ -102,7 +102,7 @@ def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[Argum
 
     def measure(changed: Arguments) -> Tensor:
         pairs = zip(method.outputs(changed), weights, strict=True)
-        return sum((value * w).reshape(*value.shape[:2], -1).sum(-1) for value, w in pairs)
+        return torch.stack([(value * w).reshape(*value.shape[:2], -1).sum(-1) for value, w in pairs]).sum(0)
 
     return measure
 

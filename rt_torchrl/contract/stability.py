@@ -42,8 +42,9 @@ def stability(calls: Calls) -> Iterator[str]:
 
 def steps_by_runge_kutta(plant: Plant, arguments: Arguments) -> bool:
     """Whether the plant's step is that of :class:`Plant`, as it is or in a wrapping."""
-    interval = [arguments[name] for name in ("t", "state", "command", "exogenous")]
-    own, library = (step(*interval, plant.closure).state for step in (plant.step, partial(Plant.step, plant)))
+    t, state, command, exogenous = (arguments[name] for name in ("t", "state", "command", "exogenous"))
+    steps = (plant.step, partial(Plant.step, plant))
+    own, library = (step(t, state, command, exogenous, plant.closure).state for step in steps)
     return torch.allclose(own, library, rtol=1e-12, atol=1e-12)
 
 

@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -27,7 +28,7 @@ def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED)
     """
     generator, columns = torch.Generator().manual_seed(seed), []
     for signal in signals:
-        like = {"generator": generator, "dtype": torch.float64}
+        like: dict[str, Any] = {"generator": generator, "dtype": torch.float64}
         uniform, normal, exponent = torch.rand(count, **like), torch.randn(count, **like), torch.rand(count, **like)
         unbounded = normal * 0.1 * 300.0**exponent
         if math.isfinite(signal.low) and math.isfinite(signal.high):

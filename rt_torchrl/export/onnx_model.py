@@ -5,7 +5,7 @@ import importlib
 import json
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -42,18 +42,26 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     name = type(policy).__name__
     try:
         with _quiet():
-            names = {"input_names": ["observation"], "output_names": ["action"]}
-            shapes = {"dynamic_shapes": ({0: "batch"},)}
-            model = torch.onnx.export(program, (), dynamo=True, verbose=False, **names, **shapes).model_proto
+            exported = torch.onnx.export(
+                program,
+                (),
+                dynamo=True,
+                verbose=False,
+                input_names=["observation"],
+                output_names=["action"],
+                dynamic_shapes=({0: "batch"},),
+            )
     except Exception as error:  # of the exporter, of several kinds
         raise ValueError(
             f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
         ) from error
+    assert exported is not None  # the exporter of dynamo gives a program; only the older one gives none
+    model = exported.model_proto
     entry = model.metadata_props.add()
     entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
-    error = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
+    difference = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
     Path(path).write_bytes(model.SerializeToString())
-    return error
+    return difference
 
 
 def require_packages() -> None:
@@ -89,7 +97,7 @@ def _runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
 
 
 @contextlib.contextmanager
-def _quiet():
+def _quiet() -> Iterator[None]:
     """Without the exporter's notices, that torchvision is not installed and what torch itself should no longer use."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level

@@ -93,7 +93,7 @@ def exogenous(snapshot: Snapshot) -> Figure:
     )
     for k, signal in enumerate(signals):
         axes[0, k].plot(time, recorded[:, k], color=REAL, linewidth=1.0, label="recorded")
-        if snapshot.large_scale is not None:
+        if snapshot.large_scale is not None and snapshot.realisations is not None:
             samples, mean = array(snapshot.realisations), array(snapshot.large_scale)
             for sample in samples[:3]:
                 axes[1, k].plot(time, sample[:, k], color=SAMPLES, linewidth=0.8, label="_")

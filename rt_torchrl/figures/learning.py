@@ -26,17 +26,17 @@ from rt_torchrl.figures.style import (
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.twinning.referees import Role
 
-CONTROL = {
+CONTROL: dict[str, dict[str, Any]] = {
     "real_cost": {"color": REAL, "marker": "o", "label": "real system, live"},
     "J_a_unseen": {"color": REAL, "marker": "*", "linestyle": ":", "label": "live, unseen"},
     "J_a_model_based": {"color": ROLES["model_based"], "marker": "s", "label": "model-based, twin"},
     "J_a_model_free": {"color": ROLES["model_free"], "marker": "^", "label": "model-free, twin"},
 }
-IDENTIFICATION = {
+IDENTIFICATION: dict[str, dict[str, Any]] = {
     "J_p_before": {"color": "0.55", "marker": "v", "label": "before assimilation"},
     "J_p": {"color": TWIN, "marker": "o", "label": "after assimilation"},
 }
-EVENTS = {
+EVENTS: dict[str, dict[str, Any]] = {
     "swap": {"color": "0.35", "linewidth": 1.2, "linestyle": "-", "label": "swap"},
     "clone": {"color": "0.35", "linewidth": 1.4, "linestyle": ":", "label": "clone"},
 }
@@ -155,7 +155,7 @@ def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
     return np.array([np.nan if value is None else float(value) for value in values])
 
 
-def _draw_costs(ax: Axes, episodes: list[dict[str, Any]], curves: dict[str, dict[str, str]]) -> None:
+def _draw_costs(ax: Axes, episodes: list[dict[str, Any]], curves: dict[str, dict[str, Any]]) -> None:
     number = np.arange(len(episodes))
     columns = {key: _column(episodes, key) for key in curves}
     columns = {key: column for key, column in columns.items() if np.isfinite(column).any()}

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -126,7 +127,7 @@ def contours(
 
 def _scatter(ax: Axes, seen: Float[np.ndarray, "n 2"]) -> None:
     shown = seen[:: -(-len(seen) // SHOWN)]
-    style = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.4, "alpha": 0.6}
+    style: dict[str, Any] = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.4, "alpha": 0.6}
     ax.scatter(shown[:, 0], shown[:, 1], label="visited in the last episode", **style)
 
 
@@ -151,4 +152,4 @@ def _levels(fields: list[Float[np.ndarray, "m m"]]) -> Float[np.ndarray, " level
     """Round levels around everything the policies do here; a constant gets levels of its own."""
     low, high = min(field.min() for field in fields), max(field.max() for field in fields)
     margin = max(1e-6 * max(abs(low), abs(high)), 1e-12) if high - low < 1e-9 * max(abs(low), abs(high), 1e-3) else 0.0
-    return MaxNLocator(12).tick_values(low - margin, high + margin)
+    return np.asarray(MaxNLocator(12).tick_values(low - margin, high + margin))

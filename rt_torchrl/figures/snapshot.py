@@ -62,7 +62,7 @@ class Snapshot:
             live=algorithm.referee.live,
             record=record,
             replay=replay.states[0],
-            large_scale=process and process.mean,
-            realisations=process and process.sample(5, generator),
+            large_scale=None if process is None else process.mean,
+            realisations=None if process is None else process.sample(5, generator),
             episodes=episodes,
         )

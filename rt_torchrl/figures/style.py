@@ -5,11 +5,13 @@ pyplot: they need no backend or display, and are freed with their last reference
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from torch import Tensor, nn
 
 from rt_torchrl.figures.snapshot import Snapshot
@@ -29,17 +31,16 @@ STEPS = {
     "switch_policies": "#CC79A7",
 }
 
-LIMIT_LINE = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
-REFERENCE_LINE = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
-CLOSURE_LINES = {"true": "-", "twin": (0, (5, 2)), "initial twin": (0, (1, 1.5))}
+LIMIT_LINE: dict[str, Any] = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
+REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
+CLOSURE_LINES: dict[str, Any] = {"true": "-", "twin": (0, (5, 2)), "initial twin": (0, (1, 1.5))}
 
 
 def panels(
-    rows: int, columns: int = 1, *, title: str, size: tuple[float, float], **layout
+    rows: int, columns: int = 1, *, title: str, size: tuple[float, float], **layout: Any
 ) -> tuple[Figure, np.ndarray]:
     """A titled figure of ``size`` inches at 100 dpi and its axes, ``rows`` by ``columns``; ``layout`` of subplots."""
-    figure = Figure(figsize=size, dpi=100, layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.07)
+    figure = Figure(figsize=size, dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.07))
     figure.suptitle(title, fontsize=12)
     axes = figure.subplots(rows, columns, squeeze=False, **layout)
     for ax in axes.flat:
@@ -61,8 +62,8 @@ def legend_above(ax: Axes) -> None:
     entries = _entries([ax])
     if not entries:
         return
-    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0, "borderpad": 0.1}
-    ax.legend(entries.values(), entries, ncols=len(entries), fontsize=9, frameon=False, **place)
+    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0, "borderpad": 0.1}
+    ax.legend(list(entries.values()), list(entries), ncols=len(entries), fontsize=9, frameon=False, **place)
 
 
 def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
@@ -70,13 +71,14 @@ def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
     entries = _entries(axes)
     # A line's sample takes about five letters of 0.085 inch.
     width = 0.085 * (max(map(len, entries), default=0) + 5)
-    place = {"loc": "outside lower center", "ncols": max(1, min(len(entries), int(figure.get_figwidth() / width)))}
-    figure.legend(entries.values(), entries, fontsize=9.5, frameon=False, **place)
+    columns = max(1, min(len(entries), int(figure.get_figwidth() / width)))
+    handles, labels = list(entries.values()), list(entries)
+    figure.legend(handles, labels, fontsize=9.5, frameon=False, loc="outside lower center", ncols=columns)
 
 
 def _entries(axes: Sequence[Axes]) -> dict[str, Artist]:
     """What carries each label; a label that several share appears once."""
-    entries = {}
+    entries: dict[str, Artist] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
@@ -91,8 +93,8 @@ def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
 
 def veil(ax: Axes, x: np.ndarray, visited: np.ndarray) -> None:
     """Make a panel pale at every x that was not visited: what a twin says there, it was never told."""
-    whole = {"transform": ax.get_xaxis_transform(), "color": "white", "alpha": 0.65, "linewidth": 0, "zorder": 2.5}
-    ax.fill_between(x, 0.0, 1.0, where=~visited, **whole)
+    whole: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "white", "linewidth": 0}
+    ax.fill_between(x, 0.0, 1.0, where=~visited, alpha=0.65, zorder=2.5, **whole)
 
 
 def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
@@ -134,4 +136,5 @@ def twin_label(snapshot: Snapshot) -> str:
 
 
 def role_name(role: Role) -> str:
+    """What a policy is called in a figure."""
     return role.replace("_", "-")

@@ -1,5 +1,7 @@
 """How good the controllers are on episodes they were never trained on."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool
 from matplotlib.axes import Axes
@@ -43,11 +45,12 @@ def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count
 def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]) -> None:
     """One column of points per controller, spread sideways so that they do not hide each other."""
     rng = np.random.default_rng(0)
+    colours = {str(role): colour for role, colour in ROLES.items()}
     for column, (who, found) in enumerate(values.items()):
         place = column + 0.25 * rng.uniform(-1.0, 1.0, len(found))
         for marker, chosen in zip(MARKERS, kinds.values(), strict=False):
-            style = {"color": ROLES.get(who, REFERENCE), "alpha": 0.6, "markersize": 4.5, "markeredgewidth": 0.0}
-            ax.plot(place[chosen], found[chosen], marker, **style)
+            style: dict[str, Any] = {"color": colours.get(who, REFERENCE), "alpha": 0.6, "markersize": 4.5}
+            ax.plot(place[chosen], found[chosen], marker, markeredgewidth=0.0, **style)
         ax.plot([column - 0.35, column + 0.35], [found.mean()] * 2, color="0.1", linewidth=2.0)
     together = np.concatenate(list(values.values()))
     if together.min() > 0.0 and together.max() > WIDEST_LINEAR * together.min():

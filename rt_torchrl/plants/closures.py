@@ -72,6 +72,10 @@ class BoundedPerceptron(nn.Module):
         ValueError: if a range is empty or a bound is not positive.
     """
 
+    middle: Tensor
+    half_range: Tensor
+    bound: Tensor
+
     def __init__(
         self,
         ranges: Sequence[tuple[float, float]],
@@ -86,7 +90,7 @@ class BoundedPerceptron(nn.Module):
         if not (low < high).all() or not (bound > 0.0).all():
             raise ValueError(f"ranges={ranges} must each go from low to high, and bounds={bounds} must be positive.")
         self.network = mlp(len(ranges), hidden, len(bounds), generator=generator)
-        nn.init.zeros_(self.network[-1].weight)
+        nn.init.zeros_(self.network[-1].get_parameter("weight"))
         self.register_buffer("middle", 0.5 * (low + high))
         self.register_buffer("half_range", 0.5 * (high - low))
         self.register_buffer("bound", bound)
@@ -98,6 +102,7 @@ class BoundedPerceptron(nn.Module):
 @torch.no_grad()
 def named_weights(closure: nn.Module) -> dict[str, Any] | None:
     """Weights of a closure, in physical units where it has ``named_coefficients``; None if it has no weights."""
-    if hasattr(closure, "named_coefficients"):
-        return {name: float(value) for name, value in closure.named_coefficients().items()}
+    named_coefficients = getattr(closure, "named_coefficients", None)
+    if named_coefficients is not None:
+        return {name: float(value) for name, value in named_coefficients().items()}
     return {name: weight.tolist() for name, weight in closure.named_parameters()} or None

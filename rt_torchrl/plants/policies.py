@@ -26,6 +26,9 @@ class SmoothClip(nn.Module):
         ValueError: if an action has no finite range.
     """
 
+    low: Tensor
+    high: Tensor
+
     def __init__(self, actions: Sequence[Signal], *, device: torch.device | None = None):
         super().__init__()
         for action in actions:
@@ -97,7 +100,7 @@ class SaturatedMLP(nn.Module):
         super().__init__()
         self.network = mlp(n_observations, hidden, len(actions), generator=generator)
         with torch.no_grad():
-            self.network[-1].weight.mul_(output_scale)
+            self.network[-1].get_parameter("weight").mul_(output_scale)
         self.clip = SmoothClip(actions, device=generator.device)
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:

@@ -11,10 +11,10 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """A component of a state, action, exogenous input or observation.
+    r"""A component of a state, action, exogenous input or observation.
 
     Args:
-        symbol: the letter of the formulas, as matplotlib mathtext without the dollars (``r"\\omega_r"``).
+        symbol: the letter of the formulas, as matplotlib mathtext without the dollars (``r"\omega_r"``).
         name: the word of the interfaces, a valid identifier (``"rotor_speed"``).
         unit: SI unit, or the unit a correlation is defined in (``"rad/s"``, ``"deg"``, ``"-"``).
         low: least admissible value in ``unit``.
@@ -27,7 +27,7 @@ class Signal:
     low: float = -math.inf
     high: float = math.inf
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"Signal name={self.name!r} must be an identifier such as 'rotor_speed'; rename it.")
         if not self.low < self.high:
@@ -37,7 +37,7 @@ class Signal:
 
     @property
     def label(self) -> str:
-        """Axis label, such as ``rotor speed $\\omega_r$ [rad/s]``."""
+        r"""Axis label, such as ``rotor speed $\omega_r$ [rad/s]``."""
         return f"{self.name.replace('_', ' ')} ${self.symbol}$ [{self.unit}]"
 
 

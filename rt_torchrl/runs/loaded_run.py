@@ -121,8 +121,7 @@ def config_class_of(recipe: Path) -> type[RunConfig]:
 
 
 def rebuilt(kind: Any, value: Any) -> Any:
-    """A value of a type from what JSON holds of it: dataclasses from objects, tuples from lists, paths from
-    strings.
+    """A value of a type from what JSON holds of it: dataclasses from objects, tuples from lists, paths from texts.
 
     An option that is new since then has its default.
 

@@ -8,7 +8,7 @@ import rt_torchrl.envs
 from rt_torchrl.plants.plant import Plant
 
 
-def plants() -> dict[str, type[Plant]]:
+def shipped_plants() -> dict[str, type[Plant]]:
     """The plant of each folder under ``rt_torchrl.envs``, by the folder's name."""
     return {m.name: plant_of(m.name) for m in pkgutil.iter_modules(rt_torchrl.envs.__path__) if m.ispkg}
 

@@ -97,6 +97,7 @@ class Actuation:
 
 
 def in_units(values: Tensor, scale: float | Sequence[float], offset: float | Sequence[float]) -> Tensor:
+    """offset + scale · values, in double precision on the device of the values."""
     like = {"dtype": torch.float64, "device": values.device}
     return torch.as_tensor(offset, **like) + torch.as_tensor(scale, **like) * values
 

@@ -4,6 +4,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.twinning.learners.actor_critic import ActorCritic
 from rt_torchrl.twinning.learners.ddpg import DDPG
 from rt_torchrl.twinning.learners.learner import Learner, LearnerConfig, LearnerName, TD3Config
 from rt_torchrl.twinning.learners.td3 import TD3
@@ -16,4 +17,4 @@ def make_learner(plant: Plant, policy: nn.Module, config: LearnerConfig, *, gene
     return LEARNERS[config.algorithm](plant, policy, config, generator=generator)
 
 
-__all__ = ["DDPG", "TD3", "Learner", "LearnerConfig", "TD3Config", "make_learner"]
+__all__ = ["DDPG", "TD3", "ActorCritic", "Learner", "LearnerConfig", "TD3Config", "make_learner"]

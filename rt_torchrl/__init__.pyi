@@ -1,0 +1,119 @@
+"""The public names of the library: ``__init__.py`` imports them from where this file says, each at its first use."""
+
+# Plants and what may stand in them
+from .plants.closures import BoundedPerceptron, PositiveCoefficients
+from .plants.disturbance import require_request
+from .plants.integrators import rk4_step
+from .plants.plant import Plant, Transition, require_stable_step
+from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
+from .plants.signal import Signal
+from .contract import PlantContractError, check_plant
+from .baselines.classical import ClassicalController
+
+# Real systems
+from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
+from .systems.environment import PlantEnv
+from .systems.exploration import ExplorationConfig
+from .systems.real_system import Actuation, Reading, RealSystem
+from .systems.safety import SafetyConfig, SafetyEvent, SafetyLayer, SafetyReport
+from .evaluation.real_episodes import RealController
+
+# Trajectories and the twin
+from .trajectories.rollout import DivergenceError, Engine, Rollout
+from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
+from .trajectories.twin import DigitalTwin
+from .identification.identification import Identification, IdentificationConfig
+from .identification.sensor_log import read_log
+
+# The algorithm and the configurations of its steps
+from .optimisers.descent import Descended, DescentConfig
+from .twinning.algorithm import ReinforcementTwinning
+from .twinning.assimilation import AssimilationConfig
+from .twinning.config import TwinningConfig
+from .twinning.distillation import DistillationConfig
+from .twinning.exogenous import ExogenousConfig
+from .twinning.learners import DDPG, TD3, ActorCritic, Learner, LearnerConfig, TD3Config
+from .twinning.long_term_memory import LongTermMemoryConfig
+from .twinning.planners import Planner, PlannerConfig, ShortHorizon, ShortHorizonConfig, WholeEpisodes
+from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
+
+# Trainings from the command line, and what they leave
+from .runs.run import Run, main_of
+from .runs.run_config import RunConfig
+from .runs.shipped_plants import shipped_plants
+from .figures.snapshot import Snapshot
+from .export import export_c, export_onnx, export_program
+
+__version__: str
+
+__all__ = [
+    "DDPG",
+    "TD3",
+    "ActorCritic",
+    "Actuation",
+    "AssimilationConfig",
+    "BoundedPerceptron",
+    "CallingSimulator",
+    "ClassicalController",
+    "DecisionTree",
+    "Descended",
+    "DescentConfig",
+    "DigitalTwin",
+    "DistillationConfig",
+    "DivergenceError",
+    "Engine",
+    "EpisodeAbandoned",
+    "Evidence",
+    "ExogenousConfig",
+    "ExplorationConfig",
+    "Identification",
+    "IdentificationConfig",
+    "Learner",
+    "LearnerConfig",
+    "LongTermMemoryConfig",
+    "Planner",
+    "PlannerConfig",
+    "Plant",
+    "PlantContractError",
+    "PlantEnv",
+    "PositiveCoefficients",
+    "Reading",
+    "RealController",
+    "RealSystem",
+    "Referee",
+    "RefereeConfig",
+    "ReinforcementTwinning",
+    "Rollout",
+    "Run",
+    "RunConfig",
+    "SafetyConfig",
+    "SafetyEvent",
+    "SafetyLayer",
+    "SafetyReport",
+    "SaturatedAffine",
+    "SaturatedMLP",
+    "Scenario",
+    "ShortHorizon",
+    "ShortHorizonConfig",
+    "Signal",
+    "SmoothClip",
+    "Snapshot",
+    "TD3Config",
+    "Trajectory",
+    "Transition",
+    "TrustRatio",
+    "TwinningConfig",
+    "WholeEpisodes",
+    "check_plant",
+    "control_cost",
+    "export_c",
+    "export_onnx",
+    "export_program",
+    "identification_cost",
+    "main_of",
+    "read_log",
+    "require_request",
+    "require_stable_step",
+    "rk4_step",
+    "shipped_plants",
+]

@@ -1,0 +1,86 @@
+"""People import what they use from ``rt_torchrl`` itself, and wait for nothing that they do not use."""
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rt_torchrl
+
+ROOT = Path(__file__).resolve().parent.parent
+STUB = ast.parse((ROOT / "rt_torchrl" / "__init__.pyi").read_text(encoding="utf-8"))
+HOMES = {
+    alias.name: f"rt_torchrl.{node.module}"
+    for node in STUB.body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
+"""The module that each public name comes from."""
+ROOMS_OF = {
+    "export.py": {"export", "runs"},
+    "identify.py": {"identification", "figures", "runs"},
+    "record_log.py": {"identification"},
+    "study.py": {"study", "runs"},
+}
+"""Recipes that are the command line of a room, and the rooms whose internal names they use."""
+
+
+def sources():
+    """The Python that people read first: every recipe, and every code block of the README and the tutorial."""
+    for path in sorted((ROOT / "recipes").glob("*.py")):
+        yield path.name, path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", ROOT / "recipes" / "own_plant.md"):
+        blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+        assert blocks, path
+        yield path.name, "\n".join(blocks)
+
+
+def imports_of_rooms(code):
+    """Pairs of a module of the library, not a plant's, and a name that is imported from it."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            found = [(alias.name, "") for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found = [(node.module or "", alias.name) for alias in node.names]
+        else:
+            continue
+        for module, name in found:
+            parts = module.split(".")
+            if parts[0] == "rt_torchrl" and parts[1:2] not in ([], ["envs"]):
+                yield module, name
+
+
+@pytest.mark.parametrize(("file", "code"), [pytest.param(*source, id=source[0]) for source in sources()])
+def test_public_names_come_from_the_top(file, code):
+    for module, name in imports_of_rooms(code):
+        assert name not in HOMES, f"{file}: import {name} from rt_torchrl, not from {module}"
+        assert module.split(".")[1] in ROOMS_OF.get(file, ()), f"{file} imports {name} from {module}"
+
+
+@pytest.mark.parametrize("name", sorted(HOMES))
+def test_every_name_is_what_its_module_defines(name):
+    assert getattr(rt_torchrl, name) is getattr(importlib.import_module(HOMES[name]), name)
+
+
+def test_type_checkers_and_people_see_the_same_names():
+    (listed,) = (ast.literal_eval(n.value) for n in STUB.body if isinstance(n, ast.Assign))
+    assert sorted(listed) == sorted(HOMES) == sorted(rt_torchrl.__all__) == sorted(dir(rt_torchrl))
+
+
+def test_a_name_that_does_not_exist_is_refused():
+    with pytest.raises(AttributeError, match="Plnt"):
+        rt_torchrl.Plnt  # noqa: B018
+
+
+def test_the_import_waits_for_nothing():
+    """Who asks for a version, or misspells a command, needs neither PyTorch nor TorchRL."""
+    code = (
+        "import sys, rt_torchrl; rt_torchrl.__version__, dir(rt_torchrl)\n"
+        "print([name for name in ('torch', 'torchrl', 'sklearn', 'scipy', 'matplotlib') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -1,0 +1,40 @@
+"""The rooms of the library stand above each other, as ``pyproject.toml`` and the contributing page say."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+LINT = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
+
+
+def layers():
+    """The rooms by floor, the uppermost first, as ``pyproject.toml`` states them."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    (found,) = re.findall(r'containers = \["rt_torchrl"\]\nlayers = \[(.*?)\]', text, re.DOTALL)
+    return [floor.split(" | ") for floor in ast.literal_eval(f"[{found}]")]
+
+
+def test_no_room_imports_one_above_it():
+    pytest.importorskip("importlinter", reason="the order of the rooms is read by import-linter")
+    done = subprocess.run([sys.executable, "-c", LINT], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_no_module_of_the_library_imports_from_its_top():
+    """The public names of ``rt_torchrl`` come from every floor: an import of one would hide where it points to."""
+    rooms = {room for floor in layers() for room in floor} | {"envs"}
+    for path in [p for folder in ("rt_torchrl", "envs") for p in (ROOT / folder).rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module == "rt_torchrl":
+                assert {alias.name for alias in node.names} <= rooms, path
+
+
+def test_contributors_read_the_same_order():
+    text = (ROOT / "docs" / "contributing.md").read_text(encoding="utf-8")
+    table = re.findall(r"^\| `(?:rt_torchrl/)?(\w+)/` \|", text, re.MULTILINE)
+    assert table == [room for floor in layers() for room in floor]

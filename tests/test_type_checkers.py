@@ -1,0 +1,59 @@
+"""Type checkers and editors find ``rt_torchrl.envs`` and the public names in a checkout."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+LINK = ROOT / ".typings" / "rt_torchrl" / "envs"
+COMMANDS = {
+    # Nothing that is imported is checked, only found: seconds instead of a minute.
+    "mypy": ["mypy", "--follow-imports", "skip", "--cache-dir", os.devnull],
+    "basedpyright": ["basedpyright", "--pythonpath", sys.executable, "--level", "error"],
+}
+
+
+@pytest.fixture
+def probe():
+    """A file in the checkout, where an editor would read it; it is removed again."""
+    path = ROOT / "probe_of_type_checkers.py"
+    yield path
+    path.unlink(missing_ok=True)
+
+
+def checked(checker, probe, code):
+    """Exit status and output of a type checker on a file of this code."""
+    if importlib.util.find_spec(checker) is None:
+        pytest.skip(f"{checker} is not installed")
+    if not LINK.is_dir():
+        pytest.skip("this checkout has no symbolic links; docs/contributing.md says how to get them")
+    probe.write_text(code, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", *COMMANDS[checker], str(probe)], cwd=ROOT, capture_output=True, text=True
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("checker", COMMANDS)
+def test_every_module_of_the_plants_is_found(checker, probe):
+    modules = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "envs").glob("*/*.py"))
+    code = "".join(f"import rt_torchrl.{name.removesuffix('.__init__')}\n" for name in modules)
+    status, output = checked(checker, probe, code + "from rt_torchrl import Plant, Run, check_plant\n")
+    assert status == 0 and len(modules) > 30, output
+
+
+@pytest.mark.parametrize("checker", COMMANDS)
+def test_a_module_that_does_not_exist_is_reported(checker, probe):
+    """Otherwise the test above would show nothing."""
+    status, output = checked(checker, probe, "import rt_torchrl.envs.wind_turbine.plnt\n")
+    assert status == 1 and "rt_torchrl.envs.wind_turbine.plnt" in output
+
+
+def test_the_link_is_the_folder_beside_the_package():
+    if not LINK.is_dir():
+        pytest.skip("this checkout has no symbolic links; docs/contributing.md says how to get them")
+    assert LINK.resolve() == (ROOT / "envs").resolve()
