@@ -9,8 +9,9 @@ from tyro.conf import Positional
 
 from rt_torchrl.export import export_c, export_onnx, export_program
 from rt_torchrl.export.onnx_model import require_packages
-from rt_torchrl.runs.loaded_run import FinishedRun, config_class_of, read_settings
+from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import main_of
+from rt_torchrl.runs.settings import read_settings
 
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 
@@ -25,7 +26,8 @@ class Config:
         formats: some of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
         output: folder for the files; by default RUN/exported.
         name: of the files and the C function; by default PLANT_ROLE.
-        recipe: the recipe that made the run; by default the one beside this file that is named as the plant.
+        recipe: the recipe that made the run, as its file or as package.module:Config; by default the one that the run
+            names, or for a run of version 0.1 the one beside this file that is named as the plant.
     """
 
     run: Annotated[Path, Positional]
@@ -33,7 +35,7 @@ class Config:
     formats: tuple[str, ...] = ("c", "pt2")
     output: Path | None = None
     name: str | None = None
-    recipe: Path | None = None
+    recipe: str | None = None
 
     def __post_init__(self):
         unknown = [name for name in self.formats if name not in WRITERS]
@@ -48,10 +50,10 @@ class Config:
 def main(config: Config) -> None:
     if "onnx" in config.formats:
         require_packages()
-    plant = read_settings(config.run)["plant"]
-    recipe = config.recipe or Path(__file__).with_name(f"{plant}.py")
-    run = FinishedRun.load(config.run, config_class_of(recipe))
-    policy, name = run.policy(config.role), config.name or f"{plant}_{config.role}"
+    settings = read_settings(config.run)
+    beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
+    run = load_run(config.run, config.recipe or beside)
+    policy, name = run.policy(config.role), config.name or f"{run.plant.name}_{config.role}"
     output = config.output or config.run / "exported"
     try:
         output.mkdir(parents=True, exist_ok=True)

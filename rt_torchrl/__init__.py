@@ -3,6 +3,7 @@
 from rt_torchrl.contract import PlantContractError, check_plant
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs.loaded_run import LoadedRun, load_run
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
 from rt_torchrl.trajectories.trajectory import DivergenceError, Rollout, Trajectory, control_cost, identification_cost
@@ -13,6 +14,7 @@ __all__ = [
     "Actuation",
     "DigitalTwin",
     "DivergenceError",
+    "LoadedRun",
     "Plant",
     "PlantContractError",
     "PlantEnv",
@@ -26,4 +28,5 @@ __all__ = [
     "check_plant",
     "control_cost",
     "identification_cost",
+    "load_run",
 ]

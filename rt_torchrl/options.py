@@ -43,8 +43,9 @@ def require_widths(name: str, widths: Sequence[int]) -> None:
 
 
 def choices(config_class: type, name: str) -> tuple[Any, ...]:
-    """What the field of a configuration that is declared as a ``Literal`` can be."""
-    return typing.get_args(_kinds(config_class)[name])
+    """What a field of a configuration can be that is declared as a ``Literal``; nothing for any other field."""
+    kind = _kinds(config_class)[name]
+    return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
 
 
 @cache

@@ -59,6 +59,7 @@ def test_every_option_of_its_type_is_accepted():
 
 def test_the_choices_of_a_literal_are_known():
     assert choices(Example, "law") == ("affine", "cubic", "mlp")
+    assert choices(Example, "free") == choices(Example, "widths") == ()
 
 
 def test_layers_without_units_are_refused():

@@ -1,7 +1,6 @@
 """What a recipe's main calls: the algorithm with progress, dashboard, checkpoints and results around it."""
 
 import copy
-import dataclasses
 import functools
 import json
 import logging
@@ -27,6 +26,7 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.results_table import progress, results_table
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -103,7 +103,7 @@ class Run:
         Returns:
             The content of ``metrics.json``.
         """
-        settings = dataclasses.asdict(self.asked) | {"plant": self.algorithm.twin.plant.name}
+        settings = settings_of(self.asked, self.algorithm.twin.plant.name)
         (self.folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
         dashboard = Dashboard(self.folder)
         gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)
