@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from rt_torchrl.export import export_c, export_onnx, export_program
 from rt_torchrl.export.onnx_model import require_packages
+from rt_torchrl.options import check_options
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.settings import read_settings
@@ -38,6 +39,7 @@ class Config:
     recipe: str | None = None
 
     def __post_init__(self):
+        check_options(self)
         unknown = [name for name in self.formats if name not in WRITERS]
         if unknown or not self.formats:
             raise ValueError(f"formats={self.formats} must be some of {', '.join(WRITERS)}.")
