@@ -1,6 +1,6 @@
 """Reinforcement Twinning: a digital twin and two controllers, trained while the real system runs."""
 
-from rt_torchrl.contract import PlantContractError, check_plant
+from rt_torchrl.contract import ContractReport, PlantContractError, check_plant
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import LoadedRun, load_run
@@ -12,6 +12,7 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
 
 __all__ = [
     "Actuation",
+    "ContractReport",
     "DigitalTwin",
     "DivergenceError",
     "LoadedRun",
