@@ -1,13 +1,25 @@
 """Options that no option of their type can be are refused when a configuration is made in code."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import pytest
 
+from rt_torchrl.identification.identification import IdentificationConfig
+from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
+from rt_torchrl.twinning.algorithm import TwinningConfig
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.distillation import DistillationConfig
+from rt_torchrl.twinning.exogenous import ExogenousConfig
+from rt_torchrl.twinning.memory import LongTermMemoryConfig
+from rt_torchrl.twinning.model_based import ModelBasedConfig
+from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.short_horizon import ShortHorizonConfig
+from rt_torchrl.twinning.switching import SwitchConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,3 +78,36 @@ def test_layers_without_units_are_refused():
     require_widths("hidden", ())
     with pytest.raises(ValueError, match=r"hidden=\(8, 0\) must hold widths of layers, each at least 1\."):
         require_widths("hidden", (8, 0))
+
+
+CONFIGS = {
+    DescentConfig: {"optimiser": "newton", "rate": math.inf, "gradient_limit": math.nan},
+    IdentificationConfig: {"optimiser": "newton", "initial": "guessed", "rate": math.nan, "iterations": math.nan},
+    ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
+    AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
+    SwitchConfig: {"patience": math.nan, "clone_patience": math.inf, "tolerance": math.inf, "stall": math.nan},
+    LongTermMemoryConfig: {"capacity": math.inf, "offset": math.inf},
+    DistillationConfig: {"iterations": math.nan, "rounds": 1.5, "samples": math.inf},
+    ModelBasedConfig: {"iterations": math.nan, "realisations": 2.5, "experience": math.inf},
+    ModelFreeConfig: {
+        "critic_rate": math.inf,
+        "batch_size": math.nan,
+        "critic_hidden": (8, 0),
+        "reward_scale": math.inf,
+    },
+    ShortHorizonConfig: {"window": math.nan, "policy_rate": math.inf, "critic_hidden": (0,), "critic_iterations": 0.5},
+    TwinningConfig: {"arm": "modelfree", "records": math.nan, "realisations": math.inf, "virtual_episodes": 2.5},
+}
+
+
+@pytest.mark.parametrize(
+    ("config", "option", "value"),
+    [(config, option, value) for config, options in CONFIGS.items() for option, value in options.items()],
+)
+def test_every_configuration_checks_its_options(config, option, value, unchecked):
+    with pytest.raises(ValueError, match=re.escape(f"{option}={value!r} ")):
+        config(**{option: value})
+
+
+def test_a_gradient_may_be_without_a_limit():
+    assert DescentConfig(gradient_limit=math.inf).gradient_limit == math.inf

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import check_options
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -65,6 +66,7 @@ class TwinningConfig:
     distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
     def __post_init__(self):
+        check_options(self)
         for argument in ("realisations", "records", "virtual_episodes"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
+from rt_torchrl.options import check_options
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.short_horizon import ShortHorizon, ShortHorizonConfig
 
@@ -33,6 +34,7 @@ class ModelBasedConfig:
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
 
     def __post_init__(self):
+        check_options(self)
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
         if self.realisations is not None and self.realisations < 1:

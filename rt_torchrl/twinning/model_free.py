@@ -12,6 +12,7 @@ from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
+from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
@@ -36,7 +37,7 @@ class ModelFreeConfig:
         target_rate: τ of the target critic.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
-        gradient_limit: greatest norm of the policy's gradient.
+        gradient_limit: greatest norm of the policy's gradient, infinite for none.
         critic_hidden: widths of the critic's hidden layers.
     """
 
@@ -53,6 +54,8 @@ class ModelFreeConfig:
     critic_hidden: Sequence[int] = field(default=(64, 64))
 
     def __post_init__(self):
+        check_options(self, infinite=("gradient_limit",))
+        require_widths("critic_hidden", self.critic_hidden)
         for argument in ("critic_iterations", "actor_iterations"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")

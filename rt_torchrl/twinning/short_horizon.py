@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -53,6 +54,8 @@ class ShortHorizonConfig:
     critic_rate: float = 2e-3
 
     def __post_init__(self):
+        check_options(self)
+        require_widths("critic_hidden", self.critic_hidden)
         for argument, least in (("window", 0), ("critic_iterations", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from rt_torchrl.options import check_options
+
 Role = Literal["model_free", "model_based"]
 Event = Literal["keep", "swap", "clone"]
 
@@ -25,6 +27,7 @@ class SwitchConfig:
     stall: float = 0.5
 
     def __post_init__(self):
+        check_options(self)
         for argument in ("patience", "clone_patience"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
