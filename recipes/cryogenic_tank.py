@@ -75,6 +75,7 @@ class Config(RunConfig):
 
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
+    closure: Literal["paper", "mlp"] = "paper"
     dt: float = 30.0
     horizon: float = 4.32e5
     fluid: str = "Hydrogen"

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from rt_torchrl import export_c, export_onnx, export_program, main_of
+from rt_torchrl import check_options, export_c, export_onnx, export_program, load_run, main_of
 from rt_torchrl.export.onnx_model import require_packages
-from rt_torchrl.runs.loaded_run import FinishedRun, config_class_of, read_settings
+from rt_torchrl.runs.settings import read_settings
 
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 
@@ -24,7 +24,8 @@ class Config:
         formats: some of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
         output: folder for the files; by default RUN/exported.
         name: of the files and the C function; by default PLANT_ROLE.
-        recipe: the recipe that made the run; by default the one beside this file that is named as the plant.
+        recipe: the recipe that made the run, as its file or as package.module:Config; by default the one that the run
+            names, or for a run of version 0.1 the one beside this file that is named as the plant.
     """
 
     run: Annotated[Path, Positional]
@@ -32,9 +33,10 @@ class Config:
     formats: tuple[str, ...] = ("c", "pt2")
     output: Path | None = None
     name: str | None = None
-    recipe: Path | None = None
+    recipe: str | None = None
 
     def __post_init__(self):
+        check_options(self)
         unknown = [name for name in self.formats if name not in WRITERS]
         if unknown or not self.formats:
             raise ValueError(f"formats={self.formats} must be some of {', '.join(WRITERS)}.")
@@ -47,10 +49,10 @@ class Config:
 def main(config: Config) -> None:
     if "onnx" in config.formats:
         require_packages()
-    plant = read_settings(config.run)["plant"]
-    recipe = config.recipe or Path(__file__).with_name(f"{plant}.py")
-    run = FinishedRun.load(config.run, config_class_of(recipe))
-    policy, name = run.policy(config.role), config.name or f"{plant}_{config.role}"
+    settings = read_settings(config.run)
+    beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
+    run = load_run(config.run, config.recipe or beside)
+    policy, name = run.policy(config.role), config.name or f"{run.plant.name}_{config.role}"
     output = config.output or config.run / "exported"
     try:
         output.mkdir(parents=True, exist_ok=True)

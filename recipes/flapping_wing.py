@@ -56,6 +56,8 @@ NEURAL = dataclasses.replace(
 
 MASS, BELIEVED = 3e-3, 2.25e-3
 """Of the body [kg], and what the twin believes with ``--model-error``."""
+STORM = 120.0
+"""Faster wind has not been measured near the ground [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +75,7 @@ class Config(RunConfig):
     """
 
     policy: Literal["paper", "mlp"] = "paper"
+    closure: Literal["paper", "mlp"] = "paper"
     dt: float = 5e-4
     horizon: float = 5.0
     mean_wind: float = 1.0
@@ -81,6 +84,13 @@ class Config(RunConfig):
     model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if abs(self.mean_wind) > STORM:
+            raise ValueError(f"mean_wind={self.mean_wind} m/s must lie within ±{STORM:g} m/s.")
+        if not 0.0 <= self.wind_deviation <= STORM:
+            raise ValueError(f"wind_deviation={self.wind_deviation} m/s must lie in [0, {STORM:g}].")
 
     def defaults(self) -> "Config":
         return Config(twinning=NEURAL if self.closure == "mlp" else PAPER)

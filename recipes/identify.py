@@ -1,21 +1,24 @@
 """Train a plant's twin on a recorded log, without control: ``identify.py log.csv --plant wind_turbine``."""
 
+import dataclasses
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import tyro
 
-from rt_torchrl import Identification, IdentificationConfig, Plant, main_of, read_log, shipped_plants
+from rt_torchrl import Identification, IdentificationConfig, Plant, check_options, main_of, read_log
 from rt_torchrl.figures import identification as charts
 from rt_torchrl.identification.identification import Identified, held_back, measured_states
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, checked
+from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run import can_compile
+from rt_torchrl.runs.shipped_plants import plant_class
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +28,10 @@ class Config:
     Args:
         log: CSV or Parquet file with a column for the time, each action, each exogenous input and the states that are
             measured.
-        plant: name of the folder under envs that holds the physics.
-        columns: columns that are not named as their signal or have another unit, as HEADER=SIGNAL*FACTOR+OFFSET.
+        plant: the physics, by the name of a folder under envs, or as FILE.py:NAME or package.module:NAME of your own.
+        recipe: a recipe whose Config makes the plant instead, with its default options.
+        columns: columns that are not named as their signal or have another unit, as HEADER=SIGNAL[UNIT] or
+            HEADER=SIGNAL*FACTOR+OFFSET.
         drop: leave out rows with a missing value or one out of range; they become gaps.
         dt: control interval of the twin [s]; by default the plant's own.
         gap: longest time between two rows that is bridged [s]; by default three sampling intervals.
@@ -34,12 +39,13 @@ class Config:
         held_out: share at the end of the log that the twin is judged on and not trained on.
         seed: of the closure's first weights, where these are random.
         compiled: compile with torch.compile; by default for 500 control intervals or more, where this machine can.
-        folder: of the results; by default runs/identify/PLANT/TIME.
+        log_dir: folder of the results; by default runs/identify/PLANT/TIME.
         identification: how the weights are found.
     """
 
     log: Annotated[Path, tyro.conf.Positional]
-    plant: str
+    plant: str | None = None
+    recipe: Path | None = None
     columns: tuple[str, ...] = ()
     drop: bool = False
     dt: float | None = None
@@ -48,28 +54,50 @@ class Config:
     held_out: float = 0.25
     seed: int = 0
     compiled: bool | None = None
-    folder: Path | None = None
+    log_dir: Path | None = None
     identification: Annotated[IdentificationConfig, tyro.conf.arg(name="")] = field(
         default_factory=IdentificationConfig
     )
 
+    def __post_init__(self):
+        check_options(self)
+        if (self.plant is None) == (self.recipe is None):
+            raise ValueError("the physics is not known: give one of --plant and --recipe.")
+        if self.dt is not None and not self.dt > 0.0:
+            raise ValueError(f"dt={self.dt} s must be positive.")
+        if self.seed < 0:
+            raise ValueError(f"seed={self.seed} must not be negative.")
+        if self.log_dir == Path():
+            raise ValueError("log_dir='' is the current folder; name a folder of its own for the results.")
+
     def make_plant(self) -> Plant:
         """The plant, with the control interval that was asked for."""
-        known = shipped_plants()
-        if self.plant not in known:
-            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(known)}.")
-        plant = known[self.plant]()
-        if self.dt is None:
-            return plant
-        return known[self.plant](dt=self.dt, horizon=max(1, round(plant.horizon / self.dt)) * self.dt)
+        make = plant_class(self.plant) if self.plant else self._plant_of_recipe
+        try:
+            plant = make()
+            if self.dt is None:
+                return plant
+            return make(dt=self.dt, horizon=max(1, round(plant.horizon / self.dt)) * self.dt)
+        except TypeError as error:
+            source = f"plant={self.plant!r}" if self.plant else f"recipe={self.recipe}"
+            raise ValueError(
+                f"{source} cannot be made ({error}): its options must have defaults, and for --dt it needs dt and "
+                "horizon. A recipe with a method plant() can fill them in."
+            ) from error
 
-    def make_folder(self) -> Path:
+    def _plant_of_recipe(self, **options: float) -> Plant:
+        config = dataclasses.replace(config_class_of(self.recipe)(), **options)
+        if not hasattr(config, "plant"):
+            raise ValueError(f"recipe={self.recipe}: its Config has no method plant(); write one, or give --plant.")
+        return config.plant()
+
+    def make_folder(self, plant: str) -> Path:
         """The folder of the results, created."""
-        folder = self.folder or Path("runs") / "identify" / self.plant / time.strftime("%Y%m%d-%H%M%S")
+        folder = self.log_dir or Path("runs") / "identify" / plant / time.strftime("%Y%m%d-%H%M%S")
         try:
             (folder / "figures").mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ValueError(f"folder={folder} cannot be written ({error}); choose another with --folder.") from error
+            raise ValueError(f"log_dir={folder} cannot be written ({error}); choose another with --log-dir.") from error
         return folder
 
 
@@ -78,7 +106,7 @@ def main(config: Config) -> None:
     log = checked(read_log(config.log, plant, [Column.parse(text) for text in config.columns]), plant, drop=config.drop)
     parts = resample(log, plant, gap=config.gap, shortest=config.shortest)
     training, held_out = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
-    folder = config.make_folder()
+    folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
     steps = sum(len(segment.record.actions) for segment in parts.segments)
     wanted = steps >= 500 if config.compiled is None else config.compiled
@@ -93,7 +121,7 @@ def main(config: Config) -> None:
     )
     found = task.run(training, held_out)
     metrics = metrics_of(plant, measured, found, parts) | {
-        "config": asdict(config),
+        "config": dataclasses.asdict(config),
         "held_back": held_back(plant, parts.segments),
     }
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2, default=str) + "\n")

@@ -13,6 +13,7 @@ from rt_torchrl import (
     ShortHorizonConfig,
     TwinningConfig,
     main_of,
+    require_device,
 )
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
@@ -34,7 +35,7 @@ class Config(RunConfig):
     """Train twin and controllers on Gymnasium's Pendulum-v1.
 
     Args:
-        policy: paper (the plant's own perceptron of cos θ, sin θ and dθ/dt) or mlp.
+        policy: plant (its own perceptron of cos θ, sin θ and dθ/dt) or mlp.
         horizon: length of an episode T_o [s]; Gymnasium's is 10.
         gravity: g [m/s²].
         guess: share of the true mass and length that the twin starts from.
@@ -42,7 +43,6 @@ class Config(RunConfig):
             length, which is quicker and what --reference needs.
     """
 
-    policy: Literal["paper", "mlp"] = "paper"
     episodes: int = 10
     horizon: float = 10.0
     gravity: float = 10.0
@@ -57,7 +57,8 @@ class Config(RunConfig):
 def main(config: Config) -> None:
     plant = config.plant()
     known = plant.closure if config.judged_on == "plant" else None
-    Run(config, plant, env=gymnasium_pendulum(plant, seed=config.seed, closure=known, device=config.device)).train()
+    device = require_device(config.device)
+    Run(config, plant, env=gymnasium_pendulum(plant, seed=config.seed, closure=known, device=device)).train()
 
 
 if __name__ == "__main__":

@@ -7,12 +7,13 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from rt_torchrl import ClassicalController, Plant, main_of, shipped_plants
+from rt_torchrl import ClassicalController, Plant, check_options, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.identification.sensor_log import Log, logged_states
 from rt_torchrl.identification.simulated_log import ClassicalLaw, Law, policy_law, recorded
+from rt_torchrl.runs.shipped_plants import plant_class
 
 CONTROLLERS: dict[str, type[ClassicalController]] = {
     "wind_turbine": JonkmanController,
@@ -27,7 +28,7 @@ class Config:
 
     Args:
         log: the file to write, CSV or Parquet.
-        plant: name of the folder under envs.
+        plant: name of the folder under envs, or FILE.py:NAME or package.module:NAME of your own.
         law: what acts: classical for the plant's classical controller, policy for a policy.
         weights: weights.pt of a training with the paper's policy; by default a policy's first weights, at random.
         role: which policy of the training.
@@ -52,8 +53,13 @@ class Config:
     gap: float = 0.02
 
     def __post_init__(self):
-        if self.plant not in shipped_plants():
-            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(shipped_plants())}.")
+        check_options(self)
+        known = [state.name for state in logged_states(plant_class(self.plant))]
+        unknown = [name for name in self.states if name not in known]
+        if unknown:
+            raise ValueError(f"states={unknown} of {self.plant!r} do not exist; choose of {', '.join(known)}.")
+        if self.seed < 0:
+            raise ValueError(f"seed={self.seed} must not be negative.")
         if self.law == "classical" and self.plant not in CONTROLLERS:
             raise ValueError(f"law='classical': of {self.plant!r} no classical controller is known; use policy.")
         if not 0.0 <= self.gap < 0.5:
@@ -71,7 +77,7 @@ def main(config: Config) -> None:
 
 def make_plant(config: Config) -> Plant:
     """The plant, with the horizon that was asked for."""
-    kind = shipped_plants()[config.plant]
+    kind = plant_class(config.plant)
     return kind() if config.horizon is None else kind(horizon=config.horizon)
 
 

@@ -18,6 +18,7 @@ from rt_torchrl import (
     RunConfig,
     TwinningConfig,
     main_of,
+    require_device,
 )
 from rt_torchrl.envs.wind_turbine import figures
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
@@ -25,7 +26,7 @@ from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
-from rt_torchrl.envs.wind_turbine.turbsim import read_wind
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
 from rt_torchrl.envs.wind_turbine.wear import worn_table
 
 PAPER = TwinningConfig(
@@ -44,6 +45,9 @@ NEURAL = dataclasses.replace(
     ),
 )
 """What trains ``--closure mlp``."""
+
+STORM = 120.0
+"""Faster wind has not been measured at the height of a rotor [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +69,7 @@ class Config(RunConfig):
     """
 
     policy: Literal["paper", "bias", "mlp", "scheduled"] = "paper"
+    closure: Literal["paper", "mlp"] = "paper"
     dt: float = 0.5
     horizon: float = 600.0
     mean_wind: float = 11.0
@@ -74,15 +79,45 @@ class Config(RunConfig):
     real: Literal["simulation", "rosco"] = "simulation"
     twinning: TwinningConfig = field(default_factory=lambda: PAPER)
 
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0.0 < self.mean_wind <= STORM:
+            raise ValueError(f"mean_wind={self.mean_wind} m/s must be positive and at most {STORM:g} m/s.")
+        if not 0.0 <= self.turbulence <= 1.0:
+            raise ValueError(f"turbulence={self.turbulence} must lie in [0, 1], such as 0.16 for 16 %.")
+        other = self.model_free_policy
+        if "scheduled" in (self.policy, other) and other not in ("same", self.policy, "mlp"):
+            raise ValueError(
+                f"model_free_policy={other!r} does not go with policy={self.policy!r}: of the two, only the scheduled "
+                "one observes speed and pitch. Choose same, or policy scheduled and model_free_policy mlp."
+            )
+
     def defaults(self) -> "Config":
         return Config(twinning=NEURAL if self.closure == "mlp" else PAPER)
 
     def plant(self) -> WindTurbine:
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
-            wind = RecordedWind(records=[read_wind(path) for path in self.wind_files])
+            wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
         kind = InstrumentedTurbine if self.policy == "scheduled" else WindTurbine
         return kind(dt=self.dt, horizon=self.horizon, wind=wind)
+
+    @staticmethod
+    def wind_of(path: Path) -> WindRecord:
+        """The record in one of the ``wind_files``.
+
+        Raises:
+            ValueError: if the file cannot be read, or holds wind that no turbine has met.
+        """
+        try:
+            record = read_wind(path)
+        except OSError as error:
+            raise ValueError(f"wind_files: {path} cannot be read ({error}); give TurbSim files.") from error
+        if record.speed.max() > STORM:
+            raise ValueError(
+                f"wind_files: {path} holds wind of {record.speed.max():g} m/s; it must be at most {STORM:g} m/s."
+            )
+        return record
 
     def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:
         if self.policy == "bias":
@@ -99,7 +134,7 @@ class Config(RunConfig):
 def main(config: Config) -> None:
     plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
     if config.real == "rosco":
-        env = rosco_turbine(plant, seed=config.seed, device=config.device)
+        env = rosco_turbine(plant, seed=config.seed, device=require_device(config.device))
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
     Run(config, plant, plant_figures=figures.figures_of, **system).train()
 

@@ -7,7 +7,7 @@ from .plants.integrators import rk4_step
 from .plants.plant import Plant, Transition, require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.signal import Signal
-from .contract import PlantContractError, check_plant
+from .contract import ContractReport, PlantContractError, check_plant
 from .baselines.classical import ClassicalController
 
 # Real systems
@@ -38,7 +38,9 @@ from .twinning.planners import Planner, PlannerConfig, ShortHorizon, ShortHorizo
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
 
 # Trainings from the command line, and what they leave
-from .runs.run import Run, main_of
+from .options import check_options
+from .runs.loaded_run import LoadedRun, load_run
+from .runs.run import Run, main_of, require_device
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
@@ -55,6 +57,7 @@ __all__ = [
     "BoundedPerceptron",
     "CallingSimulator",
     "ClassicalController",
+    "ContractReport",
     "DecisionTree",
     "Descended",
     "DescentConfig",
@@ -70,6 +73,7 @@ __all__ = [
     "IdentificationConfig",
     "Learner",
     "LearnerConfig",
+    "LoadedRun",
     "LongTermMemoryConfig",
     "Planner",
     "PlannerConfig",
@@ -104,14 +108,17 @@ __all__ = [
     "TrustRatio",
     "TwinningConfig",
     "WholeEpisodes",
+    "check_options",
     "check_plant",
     "control_cost",
     "export_c",
     "export_onnx",
     "export_program",
     "identification_cost",
+    "load_run",
     "main_of",
     "read_log",
+    "require_device",
     "require_request",
     "require_stable_step",
     "rk4_step",

@@ -1,7 +1,7 @@
 """Plants that break the contract, each in one way, and what the check is to say of it."""
 
 import torch
-from linear_quadratic import LinearQuadratic
+from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
 
 from rt_torchrl import Signal
@@ -202,6 +202,17 @@ class Raising(LinearQuadratic):
         raise KeyError("velocity")
 
 
+class OwnSeed(LinearQuadratic):
+    def draw_exogenous(self, batch, generator):
+        own = torch.Generator().manual_seed(0)
+        return torch.rand(batch, self.n_steps, 1, generator=own, dtype=torch.float64)
+
+
+class BrokenClosure(LinearQuadratic):
+    def make_closure(self, generator):
+        return LinearClosure("matrix")
+
+
 class Branching(LinearQuadratic):
     def vector_field(self, t, state, action, exogenous, closure):
         if (state[..., 0] > 0.0).any():
@@ -252,4 +263,6 @@ BROKEN = {
     Stiff: r"dt: 0.1 s is too long for the eigenvalue -39.* 1/s .*Use dt <= 0.0\d+ s",
     Explosive: "step: plant 'linear_quadratic' diverged in realisation",
     Raising: "running_cost: raised KeyError in .*broken_plants.py",
+    OwnSeed: "draw_exogenous: draws different episodes, but the same ones for generators of another seed",
+    BrokenClosure: "make_closure: raised .*Error in .*linear_quadratic.py, line",
 }

@@ -44,6 +44,29 @@ def test_every_violation_is_told_at_once():
         check_plant(Broken(), traced=False)
 
 
+def test_a_sound_plant_is_told_what_was_checked():
+    found = check_plant(LinearQuadratic(dt=0.1), steps=10, traced=False)
+    assert found.plant == "linear_quadratic" and "one graph" not in found.checks
+    assert re.fullmatch(
+        r"plant 'linear_quadratic' fulfils its contract: signals, draws, .*gradients.*, on 4 flights of 10 intervals "
+        r"of 0.1 s",
+        str(found),
+    )
+
+
+def test_a_plant_without_chance_is_sound():
+    """The same start and no disturbance in every episode."""
+
+    class Steady(LinearQuadratic):
+        def draw_initial_state(self, batch, generator):
+            return torch.ones(batch, 2, dtype=torch.float64)
+
+        def draw_exogenous(self, batch, generator):
+            return torch.zeros(batch, self.n_steps, 1, dtype=torch.float64)
+
+    check_plant(Steady(), steps=10, traced=False)
+
+
 def test_the_check_leaves_no_trace():
     """Neither in the plant's weights nor in torch's global random numbers."""
     plant = LinearQuadratic()

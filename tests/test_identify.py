@@ -35,14 +35,14 @@ def log(tmp_path_factory):
     return path
 
 
-COLUMNS = ("rpm=rotor_speed*0.10471975511965977", "ms=time*1e-3")
+COLUMNS = ("rpm=rotor_speed[rpm]", "ms=time*1e-3")
 
 
 def test_a_log_is_identified_and_the_results_are_written(log, tmp_path, capsys):
     identify = recipe("identify")
     config = IdentificationConfig(iterations=2)
     identify.main(
-        identify.Config(log=log, plant="wind_turbine", columns=COLUMNS, folder=tmp_path, identification=config)
+        identify.Config(log=log, plant="wind_turbine", columns=COLUMNS, log_dir=tmp_path, identification=config)
     )
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     # Dai's coefficients are wrong by some rad/s within half a minute; two steps take most of that away.
@@ -69,18 +69,66 @@ def test_a_log_is_identified_and_the_results_are_written(log, tmp_path, capsys):
         ({"columns": ("rpm=rotor_speed*1000", COLUMNS[1]), "held_out": 2.0}, "held_out=2.0"),
         ({"columns": (COLUMNS[0], "ms=time*1e-6")}, "no part of 10"),
         ({"dt": 60.0}, "unstable"),
+        ({"dt": 0.0}, "dt=0.0 s must be positive"),
+        ({"seed": -1}, "seed=-1 must not be negative"),
+        ({"plant": None}, "give one of --plant and --recipe"),
+        ({"recipe": RECIPES / "wind_turbine.py"}, "give one of --plant and --recipe"),
+        ({"plant": "gone.py:Room"}, "gone.py does not exist"),
+        ({"plant": "rt_torchrl:Signal"}, "plant='rt_torchrl:Signal' is no class derived from Plant"),
+        ({"plant": None, "recipe": RECIPES / "identify.py"}, "has no class Config derived from RunConfig"),
+        ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
 )
 def test_what_cannot_be_identified_is_refused(log, tmp_path, options, message):
     identify = recipe("identify")
-    given = {"log": log, "plant": "wind_turbine", "columns": COLUMNS, "folder": tmp_path} | options
+    given = {"log": log, "plant": "wind_turbine", "columns": COLUMNS, "log_dir": tmp_path} | options
     with pytest.raises(ValueError, match=message):
         identify.main(identify.Config(**given))
     assert not list(tmp_path.iterdir())
 
 
+OWN = """
+from dataclasses import dataclass
+from rt_torchrl.runs.run_config import RunConfig
+from own_turbine import Own
+@dataclass(frozen=True, kw_only=True)
+class Config(RunConfig):
+    dt: float = 0.5
+    horizon: float = 30.0
+    def plant(self):
+        return Own(dt=self.dt, horizon=self.horizon)
+def main(config):
+    pass
+"""
+OWN_PLANT = """
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+class Own(WindTurbine):
+    name = "own"
+class Demanding(WindTurbine):
+    def __init__(self, blades):
+        super().__init__()
+"""
+
+
+def test_an_own_plant_is_made_by_its_file_or_its_recipe(tmp_path):
+    (tmp_path / "own_turbine.py").write_text(OWN_PLANT), (tmp_path / "own_recipe.py").write_text(OWN)
+    identify, file = recipe("identify"), tmp_path / "own_turbine.py"
+    for options in ({"plant": f"{file}:Own"}, {"recipe": tmp_path / "own_recipe.py"}):
+        own = identify.Config(log=file, **options).make_plant()
+        faster = identify.Config(log=file, dt=0.25, **options).make_plant()
+        assert own.name == faster.name == "own" and (own.dt, faster.dt) == (0.5, 0.25)
+        assert own.horizon == faster.horizon
+    with pytest.raises(ValueError, match="cannot be made .*blades.*its options must have defaults"):
+        identify.Config(log=file, plant=f"{file}:Demanding").make_plant()
+
+
 def test_what_cannot_be_recorded_is_refused(tmp_path):
     record = recipe("record_log")
-    for options, message in (({"plant": "windmill"}, "windmill"), ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5")):
+    for options, message in (
+        ({"plant": "windmill"}, "windmill"),
+        ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5"),
+        ({"plant": "wind_turbine", "states": ("foo",)}, r"states=\['foo'\].*choose of rotor_speed"),
+        ({"plant": "wind_turbine", "law": "random"}, "law='random' does not exist; choose classical or policy"),
+    ):
         with pytest.raises(ValueError, match=message):
             record.Config(log=tmp_path / "log.csv", **options)

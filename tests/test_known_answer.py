@@ -9,10 +9,12 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import root
 
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import Rollout, control_cost
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
-from rt_torchrl.twinning.model_free import LearnerConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
 
 SEEDS = 0, 1, 2
 EPISODES = 20
@@ -32,7 +34,7 @@ def test_expected_cost_is_the_mean_of_episodes(answer, share):
     with torch.no_grad():
         start, exogenous = plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
         flown = Rollout(plant, plant.closure, policy)(start, exogenous)
-        costs = control_cost(plant, flown, exogenous)
+        costs = control_cost(plant, flown)
     error = costs.std().item() / count**0.5
     # The standard error is 0.5 % of the cost; RK4 and the matrix exponential differ by 1e-6.
     expected = answer.cost(share * answer.gain)
@@ -79,7 +81,7 @@ def half_alone(gain, *, seed):
         DigitalTwin(plant, plant.closure),
         model_free=LinearGain(gain),
         model_based=LinearGain(gain),
-        config=TwinningConfig(arm="model_free", model_free=LEARNER),
+        config=TwinningConfig(arm="model_free", learner=LEARNER),
         generator=torch.Generator().manual_seed(seed),
     )
 

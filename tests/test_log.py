@@ -13,9 +13,10 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.identification.resampling import hold_means, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, Log, checked, logged_signals, read_log
 from rt_torchrl.identification.simulated_log import policy_law, recorded
+from rt_torchrl.identification.units import converted
 from rt_torchrl.trajectories.rollout import Rollout
 
-pytest.importorskip("pandas")
+pytest.importorskip("pandas"), pytest.importorskip("pint")
 PLANT = LinearQuadratic(dt=0.1)
 TABLE = "t,x_mm,velocity,force,disturbance,note\n0,1000,0.1,1,0,a\n100,2000,0.2,1,0,b\n250,3000,0.3,-1,0.5,c\n"
 MAPPING = [Column.parse("t=time*0.001"), Column.parse("x_mm=position*1e-3+2")]
@@ -36,18 +37,22 @@ def jittered(n, dt=0.1, seed=0):
 @pytest.mark.parametrize(
     "text, expected",
     [
-        ("omega=rotor_speed", ("omega", "rotor_speed", 1.0, 0.0)),
-        ("rpm=rotor_speed*0.10472", ("rpm", "rotor_speed", 0.10472, 0.0)),
-        ("T [C]=wall_temperature+273.15", ("T [C]", "wall_temperature", 1.0, 273.15)),
-        ("p=pressure*1e5-2.5", ("p", "pressure", 1e5, -2.5)),
-        ("a=b=force*-1e-3+1e2", ("a=b", "force", -1e-3, 1e2)),
+        ("omega=rotor_speed", ("omega", "rotor_speed", 1.0, 0.0, None)),
+        ("rpm=rotor_speed*0.10472", ("rpm", "rotor_speed", 0.10472, 0.0, None)),
+        ("T [C]=wall_temperature+273.15", ("T [C]", "wall_temperature", 1.0, 273.15, None)),
+        ("p=pressure*1e5-2.5", ("p", "pressure", 1e5, -2.5, None)),
+        ("a=b=force*-1e-3+1e2", ("a=b", "force", -1e-3, 1e2, None)),
+        ("T [C]=wall_temperature[degC]", ("T [C]", "wall_temperature", 1.0, 0.0, "degC")),
+        ("a=b=flow[m^3/s]", ("a=b", "flow", 1.0, 0.0, "m^3/s")),
     ],
 )
-def test_columns_are_declared_with_factor_and_offset(text, expected):
+def test_columns_are_declared_with_a_unit_or_factor_and_offset(text, expected):
     assert dataclasses.astuple(Column.parse(text)) == expected
 
 
-@pytest.mark.parametrize("text", ["omega", "=force", "x=force*", "x=force*two", "x=force+1+2", "x=force*2*3"])
+@pytest.mark.parametrize(
+    "text", ["omega", "=force", "x=force*", "x=force*two", "x=force+1+2", "x=force*2*3", "x=force[]", "x=force[N]*2"]
+)
 def test_columns_that_are_not_understood_are_refused(text):
     with pytest.raises(ValueError, match="not understood"):
         Column.parse(text)
@@ -57,6 +62,57 @@ def test_columns_that_are_not_understood_are_refused(text):
 def test_units_that_lose_the_signal_are_refused(text):
     with pytest.raises(ValueError, match="finite"):
         Column.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("unit", "signal", "number", "expected"),
+    [
+        ("rpm", "rad/s", 30.0, math.pi),
+        ("turn/s", "rad/s", 1.0, 2.0 * math.pi),
+        ("deg", "rad", 180.0, math.pi),
+        ("°F", "K", 451.0, (451.0 + 459.67) * 5.0 / 9.0),
+        ("degC", "K", -40.0, 233.15),
+        ("delta_degF", "K", 9.0, 5.0),
+        ("kN m", "N m", 1.5, 1500.0),
+        ("%", "-", 12.0, 0.12),
+        ("L", "m³", 2.0, 2e-3),
+        ("L/min", "m^3/s", 60.0, 1e-3),
+        ("mbar", "Pa", 1013.25, 101325.0),
+        ("ms", "s", 250.0, 0.25),
+    ],
+)
+def test_units_are_converted(unit, signal, number, expected):
+    # Factors of some digits are multiplied: rounding only.
+    assert converted(np.array([number]), unit, signal) == pytest.approx([expected], rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("unit", "signal", "message"),
+    [
+        ("Hz", "rad/s", r"'Hz' \(base units 1 / second\) and 'rad/s' \(radian / second\) do not measure the same"),
+        ("rad", "-", "do not measure the same"),
+        ("N", "N m", "do not measure the same"),
+        ("furlongs_of_old", "m", "unit 'furlongs_of_old' is not known"),
+        ("k*(", "m", r"unit 'k\*\(' is not understood"),
+        ("5 m", "m", "unit '5 m' is not understood"),
+    ],
+)
+def test_units_that_measure_something_else_are_refused(unit, signal, message):
+    with pytest.raises(ValueError, match=message):
+        converted(np.ones(2), unit, signal)
+
+
+def test_columns_are_converted_by_their_units(tmp_path):
+    (tmp_path / "log.csv").write_text(TABLE)
+    columns = [Column.parse(text) for text in ("t=time[ms]", "x_mm=position[mm]", "velocity=velocity[km/h]")]
+    log = checked(read_log(tmp_path / "log.csv", PLANT, columns), PLANT)
+    assert log.times.tolist() == pytest.approx([0.0, 0.1, 0.25])
+    assert log.columns["position"].tolist() == pytest.approx([1.0, 2.0, 3.0])
+    assert log.columns["velocity"].tolist() == pytest.approx([0.1 / 3.6, 0.2 / 3.6, 0.3 / 3.6])
+    with pytest.raises(ValueError, match=r"column 'x_mm' of .* for signal 'position': 'kg' .* and 'm' .*"):
+        read_log(tmp_path / "log.csv", PLANT, [columns[0], Column.parse("x_mm=position[kg]")])
+    with pytest.raises(ValueError, match="give one or the other"):
+        Column(header="x", signal="position", factor=2.0, unit="mm")
 
 
 def test_a_csv_file_is_read_in_the_signals_units(tmp_path):
@@ -104,6 +160,7 @@ def test_dates_are_counted_from_the_first_row(tmp_path):
         (TABLE.replace("-1,0.5", ",0.5"), MAPPING, "force is nan N in row 2"),
         (TABLE.replace("-1,0.5", "-2.5,0.5"), MAPPING, "force is -2.5 N in row 2 .* from -2 to 2 N"),
         (TABLE.splitlines()[0] + "\n", ["t=time"], "0 rows"),
+        ("time,force\n2024-03-31,1\n2024-04-01,1\n", ["time=time[s]"], "holds dates; leave its unit 's' away"),
     ],
 )
 def test_logs_that_cannot_drive_a_twin_are_refused(tmp_path, table, columns, message):

@@ -2,12 +2,15 @@
 
 import dataclasses
 import json
+import math
+from pathlib import Path
 
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from rt_torchrl import PlantContractError
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
@@ -137,7 +140,7 @@ def test_the_model_free_policy_may_be_of_another_kind(tmp_path):
     unseen = run.train()["summary"]["unseen"]
     for key, role in (("J_a_before", "model_based"), ("J_a_before_model_free", "model_free")):
         assert unseen[key]["mean"] == run.unseen.control_costs(run.initial_policies[role]).mean().item()
-    with pytest.raises(ValueError, match="policy='cubic' does not exist"):
+    with pytest.raises(ValueError, match="model_free_policy='cubic' does not exist"):
         small_run(tmp_path / "other", model_free_policy="cubic")
 
 
@@ -262,11 +265,39 @@ def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
         ({"unseen": 1}, "unseen=1"),
         ({"threads": -1}, "threads=-1"),
         ({"resume": True}, "resume needs log_dir"),
+        ({"seed": -1}, "seed=-1 must be at least 0"),
+        ({"seed": 2**63}, "seed=9223372036854775808 must be at most 9223372036854775806"),
+        ({"hidden": (8, 0)}, r"hidden=\(8, 0\) must hold widths of layers"),
+        ({"closure_hidden": (0,)}, r"closure_hidden=\(0,\) must hold widths of layers"),
+        ({"policy": "cubic"}, "policy='cubic' does not exist; choose plant or mlp"),
+        ({"model_free_policy": "x"}, "model_free_policy='x' does not exist; choose same, plant or mlp"),
+        ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
+        ({"engine": "fast"}, "engine='fast' does not exist; choose parallel, odeint_adjoint or autograd"),
+        ({"noise": -0.1}, "noise=-0.1 must not be negative"),
+        ({"noise": math.inf}, "noise=inf must be a finite number"),
+        ({"episodes": 2.5}, "episodes=2.5 must be a whole number"),
+        ({"log_dir": Path("")}, "log_dir='' is the current folder"),
     ],
 )
-def test_bad_options_are_refused(options, message):
+def test_bad_options_are_refused(options, message, unchecked):
     with pytest.raises(ValueError, match=message):
         RunConfig(**options)
+
+
+def test_the_greatest_seed_is_a_seed(tmp_path):
+    small_run(tmp_path, seed=RunConfig(seed=2**63 - 2).seed)
+
+
+def test_a_plant_that_breaks_its_contract_is_refused(tmp_path):
+    class Forgetful(LinearQuadratic):
+        def observe(self, t, state, exogenous):
+            return state.detach()
+
+    config = RunConfig(log_dir=tmp_path / "run", compiled=False, twinning=SMALL)
+    for plants in ((Forgetful(), None), (LinearQuadratic(), Forgetful())):
+        with pytest.raises(PlantContractError, match="observe: autograd finds no dependence on state 'position'"):
+            Run(config, plants[0], believed=plants[1])
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_unknown_device_is_refused(tmp_path):

@@ -39,7 +39,7 @@ class Pendulum(Plant):
         guess: share of the true mass and length that the twin starts from.
 
     Raises:
-        ValueError: if ``gravity`` or ``guess`` is not positive.
+        ValueError: if ``gravity`` or ``guess`` is not positive, or above 1000.
 
     Source: gymnasium, ``classic_control/pendulum.py``.
     """
@@ -74,8 +74,8 @@ class Pendulum(Plant):
     ):
         super().__init__(dt=dt, horizon=horizon, closure=UniformRod.true() if closure is None else closure)
         for argument, value in (("gravity", gravity), ("guess", guess)):
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{argument}={value} of the pendulum must be positive and finite.")
+            if not 0.0 < value <= 1000.0:
+                raise ValueError(f"{argument}={value} of the pendulum must be positive and at most 1000.")
         self.gravity, self.guess = gravity, guess
 
     # The system

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 from rt_torchrl.contract.calls import Calls
 from rt_torchrl.contract.costs import costs
@@ -13,6 +14,40 @@ from rt_torchrl.contract.stability import stability
 from rt_torchrl.contract.tracing import forward_mode, tracing
 from rt_torchrl.plants.plant import Plant
 
+Check = Callable[[Calls], Iterable[str]]
+ON_FLIGHTS: dict[str, Check] = {
+    "shapes and purity": methods,
+    "costs": costs,
+    "stability of the step": stability,
+    "gradients": gradients,
+    "forward mode": forward_mode,
+    "one graph": tracing,
+}
+
+
+class ContractReport(NamedTuple):
+    """What :func:`check_plant` looked at and found to be right; ``print`` shows it in words.
+
+    Args:
+        plant: its name.
+        checks: what was checked.
+        episodes: number of flights.
+        steps: control intervals of each.
+        dt: control interval [s].
+    """
+
+    plant: str
+    checks: tuple[str, ...]
+    episodes: int
+    steps: int
+    dt: float
+
+    def __str__(self) -> str:
+        return (
+            f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}, on {self.episodes} flights of "
+            f"{self.steps} intervals of {self.dt:g} s"
+        )
+
 
 class PlantContractError(ValueError):
     """A plant does not fulfil its contract; ``violations`` holds a message for each way in which it does not."""
@@ -23,7 +58,9 @@ class PlantContractError(ValueError):
         super().__init__(f"plant {plant!r} breaks its contract in {len(violations)} ways:\n{lines}")
 
 
-def check_plant(plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int = 0, traced: bool = True) -> None:
+def check_plant(
+    plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int = 0, traced: bool = True
+) -> ContractReport:
     """Find what of the :class:`Plant` contract a plant does not fulfil: everything at once, not the first alone.
 
     Looked at, on states that ``episodes`` short flights under random commands visit: signals and their ranges; shapes,
@@ -40,6 +77,9 @@ def check_plant(plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int =
         traced: also trace the methods into one graph. It takes seconds, and methods that are checked at run time by
             jaxtyping cannot be traced.
 
+    Returns:
+        What was checked; nothing is printed.
+
     Raises:
         PlantContractError: with a message for each violation: the method, what was found, what is expected, and what
             to change.
@@ -49,13 +89,16 @@ def check_plant(plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int =
         if value < 2:
             raise ValueError(f"{argument}={value} of the check must be at least 2.")
     found = list(signals(plant)) or list(attempt(draws, plant, seed)) + list(attempt(modules, plant, seed))
+    checks = ON_FLIGHTS if traced else {name: check for name, check in ON_FLIGHTS.items() if check is not tracing}
+    steps = min(steps, plant.n_steps)
     if not found:
-        found = _on_flights(plant, episodes, min(steps, plant.n_steps), seed, traced)
+        found = _on_flights(plant, episodes, steps, seed, checks.values())
     if found:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
+    return ContractReport(plant.name, ("signals", "draws", "closures and policy", *checks), episodes, steps, plant.dt)
 
 
-def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, traced: bool) -> list[str]:
+def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iterable[Check]) -> list[str]:
     """The checks that need states; each only where those before it have left something to check."""
     calls = Calls.at_the_start(plant, episodes, seed)
     found = [*attempt(methods, calls), *attempt(stability, calls)]
@@ -65,7 +108,6 @@ def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, traced: bool
         calls = Calls.in_flight(plant, episodes, steps, seed)
     except FloatingPointError as error:
         return [f"step: {error}"]
-    checks = [methods, costs, stability, gradients, forward_mode, *([tracing] if traced else [])]
     return [text for check in checks for text in attempt(check, calls)]
 
 
@@ -74,9 +116,23 @@ def attempt(check: Callable[..., Iterable[str]], *arguments) -> Iterator[str]:
     try:
         yield from check(*arguments)
     except Exception as error:
-        raised = inspect.trace()[-1]
+        method, place = _blamed(inspect.trace(), arguments[0])
         yield (
-            f"{raised.function}: raised {type(error).__name__} in {raised.filename}, line {raised.lineno}: "
+            f"{method}: raised {type(error).__name__} in {place.filename}, line {place.lineno}: "
             f"{str(error).splitlines()[0] if str(error) else ''}. It must work for every leading dimension, under "
             "forward and reverse differentiation."
         )
+
+
+def _blamed(trace: list[inspect.FrameInfo], checked: Plant | Calls) -> tuple[str, inspect.FrameInfo]:
+    """The method of the plant that was called when an error came up, and the last line of the user's code before it.
+
+    Without a frame of the plant, the last one: that call itself failed.
+    """
+    plant = checked.plant if isinstance(checked, Calls) else checked
+    own = [frame for frame in trace if frame.frame.f_locals.get("self") is plant and hasattr(plant, frame.function)]
+    if not own:
+        return trace[-1].function, trace[-1]
+    inside = trace[trace.index(own[-1]) :]
+    theirs = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
+    return own[-1].function, (theirs or inside)[-1]

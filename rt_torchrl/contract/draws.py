@@ -21,21 +21,22 @@ def draws(plant: Plant, seed: int) -> Iterator[str]:
     """Shape, precision, range and source of the initial states and of the inputs."""
     n_s, n_z = len(plant.states), len(plant.inputs)
     wanted = {
-        "draw_initial_state": (lambda: plant.draw_initial_state(BATCH, seeded(seed)), (BATCH, n_s), plant.states),
-        "draw_exogenous": (
-            lambda: plant.draw_exogenous(BATCH, seeded(seed)),
-            (BATCH, plant.n_steps, n_z),
-            plant.inputs,
-        ),
+        "draw_initial_state": (partial(plant.draw_initial_state, BATCH), (BATCH, n_s), plant.states),
+        "draw_exogenous": (partial(plant.draw_exogenous, BATCH), (BATCH, plant.n_steps, n_z), plant.inputs),
     }
-    for name, (draw, shape, group) in wanted.items():
+    for name, (of, shape, group) in wanted.items():
+
+        def draw(of=of) -> Tensor:
+            return of(seeded(seed))
+
         drawn = draw()
         problem = misshapen(drawn, shape)
         if problem:
             yield f"{name}: gives {problem} for batch={BATCH}, n_steps={plant.n_steps}; expected {wanted_as(shape)}."
             continue
         yield from _out_of_range(name, drawn, group)
-        yield from _other_sources(name, draw)
+        sources = list(_other_sources(name, draw))
+        yield from sources or _ignored_generator(name, drawn, of(seeded(seed + 1)))
 
 
 def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
@@ -81,6 +82,15 @@ def _other_sources(name: str, draw: Callable[[], Tensor]) -> Iterator[str]:
         )
     elif not unmoved:
         yield f"{name}: depends on torch's global random numbers; pass generator=generator to every random function."
+
+
+def _ignored_generator(name: str, drawn: Tensor, other: Tensor) -> Iterator[str]:
+    """Draws may be the same in every episode; episodes that differ, but not by the seed, have numbers of their own."""
+    if torch.equal(drawn, other) and not torch.equal(drawn, drawn[:1].expand_as(drawn)):
+        yield (
+            f"{name}: draws different episodes, but the same ones for generators of another seed; take every random "
+            "number from the generator that is passed in."
+        )
 
 
 def modules(plant: Plant, seed: int) -> Iterator[str]:

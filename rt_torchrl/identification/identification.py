@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from rt_torchrl.identification.output_error import NOISE_TOLERANCE, InitialState
 from rt_torchrl.identification.sensor_log import Log, logged_states
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -39,12 +40,11 @@ class IdentificationConfig:
     initial: Literal["estimated", "measured"] = "estimated"
 
     def __post_init__(self):
+        check_options(self)
         if self.iterations < 1:
             raise ValueError(f"iterations={self.iterations} of the identification must be at least 1.")
-        if self.optimiser not in get_args(Optimiser):
-            raise ValueError(f"optimiser={self.optimiser!r} does not exist; choose one of {get_args(Optimiser)}.")
-        if self.initial not in ("estimated", "measured"):
-            raise ValueError(f"initial={self.initial!r} does not exist; choose estimated or measured.")
+        if not self.rate > 0.0:
+            raise ValueError(f"rate={self.rate} of the identification must be positive.")
 
 
 class Judgement(NamedTuple):

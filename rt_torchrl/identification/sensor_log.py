@@ -9,36 +9,45 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rt_torchrl.identification.units import converted
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 TIME = "time"
 NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
 COLUMN = re.compile(
-    rf"(?P<header>.+)=(?P<signal>\w+)(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?", re.DOTALL
+    rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
+    re.DOTALL,
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    r"""Which column of a file holds which signal, and in which unit: value = factor·number + offset.
+    r"""Which column of a file holds which signal, and in which unit: by its name, or value = factor·number + offset.
 
     Args:
         header: of the column in the file.
         signal: name of the plant's signal, or ``time``.
         factor: signal's unit over the column's.
         offset: in the signal's unit.
+        unit: of the column, see :func:`converted`; None for that of the signal, or where there are factor and offset.
 
     Raises:
-        ValueError: if the factor is zero, or one of the two numbers is not finite.
+        ValueError: if the factor is zero, one of the two numbers is not finite, or there is a unit beside them.
     """
 
     header: str
     signal: str
     factor: float = 1.0
     offset: float = 0.0
+    unit: str | None = None
 
     def __post_init__(self):
+        if self.unit is not None and (self.factor, self.offset) != (1.0, 0.0):
+            raise ValueError(
+                f"column {self.header!r} has unit={self.unit!r}, and factor={self.factor} and offset={self.offset} "
+                "beside it; give one or the other."
+            )
         if not (np.isfinite(self.factor) and self.factor != 0.0 and np.isfinite(self.offset)):
             raise ValueError(
                 f"column {self.header!r} has factor={self.factor} and offset={self.offset}; both must be finite and "
@@ -47,7 +56,7 @@ class Column:
 
     @classmethod
     def parse(cls, text: str) -> "Column":
-        """From ``HEADER=SIGNAL``, ``HEADER=SIGNAL*FACTOR`` or ``HEADER=SIGNAL*FACTOR+OFFSET``.
+        """From ``HEADER=SIGNAL``, ``HEADER=SIGNAL[UNIT]`` or ``HEADER=SIGNAL*FACTOR+OFFSET``.
 
         Raises:
             ValueError: if the text has another form.
@@ -57,10 +66,12 @@ class Column:
             factor, offset = (float(found[key] or default) for key, default in (("factor", 1.0), ("offset", 0.0)))
         except (TypeError, ValueError):
             raise ValueError(
-                f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL*FACTOR or "
-                "HEADER=SIGNAL*FACTOR+OFFSET, such as rpm=rotor_speed*0.10472 or T=wall_temperature+273.15."
+                f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL[UNIT] or "
+                "HEADER=SIGNAL*FACTOR+OFFSET, such as n=rotor_speed[rpm] or T=wall_temperature*0.5556+255.37."
             ) from None
-        return cls(header=found["header"], signal=found["signal"], factor=factor, offset=offset)
+        return cls(
+            header=found["header"], signal=found["signal"], factor=factor, offset=offset, unit=found["unit"] or None
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +128,7 @@ class Log:
             frame.to_csv(path, index=False)
 
 
-def logged_states(plant: Plant) -> tuple[Signal, ...]:
+def logged_states(plant: Plant | type[Plant]) -> tuple[Signal, ...]:
     """States with a column of their own; one that remembers an action or input by its name has none."""
     driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
     return tuple(state for state in plant.states if state.name not in driven)
@@ -139,7 +150,7 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Log:
 
     Raises:
         ValueError: if the file cannot be read, a column is missing, of an unknown signal or not numeric, or the times
-            are not increasing.
+            are not increasing, or the unit of a column measures something else than its signal's.
     """
     frame = _read(path)
     names = [signal.name for signal in logged_signals(plant)]
@@ -156,7 +167,8 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Log:
     chosen = by_name | declared
     if TIME not in chosen:
         raise ValueError(f"{path} has no column 'time'; say which it is, such as --columns t=time.")
-    values = {signal: _values(frame[column.header], column, path) for signal, column in chosen.items()}
+    units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
+    values = {name: _values(frame[column.header], column, units[name], path) for name, column in chosen.items()}
     return Log(times=values.pop(TIME), columns=values)
 
 
@@ -205,20 +217,29 @@ def _read(path: Path) -> Any:
         raise ValueError(f"log {path} cannot be read: {error}") from error
 
 
-def _values(series: Any, column: Column, path: Path) -> Float[np.ndarray, " rows"]:
+def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndarray, " rows"]:
     """Numbers of a column in the signal's unit; a date becomes the seconds since the first."""
     pd = pandas()
     if series.empty:
         return np.empty(0)
+    dates = column.signal == TIME and not pd.api.types.is_numeric_dtype(series)
+    if dates and column.unit is not None:
+        raise ValueError(f"column {column.header!r} of {path} holds dates; leave its unit {column.unit!r} away.")
     try:
-        if column.signal == TIME and not pd.api.types.is_numeric_dtype(series):
+        if dates:
             instants = pd.to_datetime(series, utc=True, format="ISO8601")
             numbers = (instants - instants.iloc[0]).dt.total_seconds()
         else:
             numbers = pd.to_numeric(series)
     except (ValueError, TypeError) as error:
         raise ValueError(f"column {column.header!r} of {path} holds what is no number: {error}") from error
-    return column.factor * numbers.to_numpy(dtype=np.float64, na_value=np.nan) + column.offset
+    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
+    if column.unit is None:
+        return column.factor * values + column.offset
+    try:
+        return converted(values, column.unit, unit)
+    except ValueError as error:
+        raise ValueError(f"column {column.header!r} of {path} for signal {column.signal!r}: {error}") from error
 
 
 def pandas() -> Any:

@@ -3,10 +3,12 @@
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+from rt_torchrl.options import check_options
 
 Optimiser = Literal["adam", "lbfgs"]
 
@@ -24,7 +26,8 @@ class DescentConfig:
     Args:
         optimiser: ``adam``, or ``lbfgs`` with a strong-Wolfe line search, every trial point counting as an iteration.
         rate: learning rate of Adam; first step length of L-BFGS.
-        gradient_limit: greatest norm of the (relative) gradient that Adam sees; L-BFGS has its line search instead.
+        gradient_limit: greatest norm of the (relative) gradient that Adam sees, infinite for none; L-BFGS has its line
+            search instead.
         second_moment: β₂ of Adam.
     """
 
@@ -34,10 +37,7 @@ class DescentConfig:
     second_moment: float = 0.9
 
     def __post_init__(self):
-        if self.optimiser not in get_args(Optimiser):
-            raise ValueError(
-                f"optimiser={self.optimiser!r} does not exist; choose one of {', '.join(get_args(Optimiser))}."
-            )
+        check_options(self, infinite=("gradient_limit",))
         for argument in ("rate", "gradient_limit"):
             if not getattr(self, argument) > 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")

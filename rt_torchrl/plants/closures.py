@@ -36,7 +36,7 @@ class PositiveCoefficients(nn.Module):
             wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.names.items())
             raise ValueError(
                 f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and finite; "
-                f"those of the paper are {self.true_coefficients}."
+                f"those of the real system are {self.true_coefficients}."
             )
         self.log_coefficients = nn.Parameter(coefficients.log())
 

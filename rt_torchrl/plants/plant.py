@@ -22,6 +22,9 @@ from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
 
+MOST_STEPS = 10_000_000
+"""Control intervals of the longest episode; a hundred numbers of each take 8 GB."""
+
 
 class Transition(NamedTuple):
     """What one control interval did: the state at its end and the action the actuators applied during it."""
@@ -47,7 +50,8 @@ class Plant(nn.Module, ABC):
             coefficients.
 
     Raises:
-        ValueError: if ``dt`` or ``horizon`` is not positive, or ``horizon`` is no multiple of ``dt``.
+        ValueError: if ``dt`` or ``horizon`` is not positive, or ``horizon`` is no multiple of ``dt`` or is more than
+            ``MOST_STEPS`` of them.
     """
 
     name: str
@@ -63,6 +67,11 @@ class Plant(nn.Module, ABC):
         for argument, value in (("dt", dt), ("horizon", horizon)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{argument}={value} s of plant {self.name!r} must be positive and finite.")
+        if not horizon / dt <= MOST_STEPS:
+            raise ValueError(
+                f"horizon={horizon} s of plant {self.name!r} is {horizon / dt:.3g} steps dt={dt} s; it must be at most "
+                f"{MOST_STEPS:.0e}, because an episode is kept in memory."
+            )
         self.dt = float(dt)
         self.n_steps = round(horizon / dt)
         if self.n_steps < 1 or abs(self.n_steps * dt - horizon) > 1e-6 * dt:

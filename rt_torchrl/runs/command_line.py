@@ -1,9 +1,6 @@
 """A recipe as a module: what a file with a ``Config`` and a ``main`` defines."""
 
-import importlib.util
-import sys
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
@@ -11,6 +8,7 @@ from typing import TypeVar
 import tyro
 
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.user_code import module_of
 
 Configuration = TypeVar("Configuration")
 
@@ -27,7 +25,6 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
     return config
 
 
-@cache
 def load_recipe(path: Path) -> ModuleType:
     """The recipe in a file, imported once.
 
@@ -36,11 +33,7 @@ def load_recipe(path: Path) -> ModuleType:
     """
     if not path.is_file():
         raise ValueError(f"recipe={path} does not exist; give the file of a recipe.")
-    name = f"rt_torchrl_recipe_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    # Known by its name, because the command line looks up the source of its options for their help.
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = module_of(path)
     found = getattr(module, "Config", None)
     if not (isinstance(found, type) and issubclass(found, RunConfig)):
         raise ValueError(f"recipe={path} has no class Config derived from RunConfig.")

@@ -1,11 +1,6 @@
 """A run folder read back: the plant, the trained policies and the closure, without training anything."""
 
-import dataclasses
-import json
 import pickle
-import types
-import typing
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +11,16 @@ from torch import nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import class_of, config_of, read_settings, require_config
+from rt_torchrl.runs.user_code import named
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinishedRun:
-    """What a run left, on the CPU.
+class LoadedRun:
+    """What a run left, on the CPU; see :func:`load_run`.
 
     Args:
-        config: options of the run.
+        config: options of the run, as they were asked for.
         plant: the real system in simulation, new.
         policies: as trained, by role: ``model_based`` and ``model_free``.
         closure: of the twin, as trained.
@@ -33,42 +30,6 @@ class FinishedRun:
     plant: Plant
     policies: dict[str, nn.Module]
     closure: nn.Module
-
-    @classmethod
-    def load(cls, folder: Path, config_class: type[RunConfig]) -> "FinishedRun":
-        """Read ``config.json`` and ``weights.pt`` of a run folder.
-
-        Args:
-            folder: the run folder.
-            config_class: the ``Config`` of the recipe that made it, see :func:`config_class_of`.
-
-        Raises:
-            ValueError: if the folder holds no finished run, or one that the recipe of today cannot rebuild.
-        """
-        settings, weights = read_settings(folder), _read_weights(folder)
-        name = settings.pop("plant")
-        if not hasattr(config_class, "plant"):
-            raise ValueError(
-                f"{config_class.__qualname__} has no method plant() that makes the plant from its options."
-            )
-        try:
-            config = rebuilt(config_class, settings)
-            plant = config.plant()
-        except (ValueError, TypeError, OSError) as error:
-            raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error
-        if plant.name != name:
-            raise ValueError(
-                f"{folder} is a run of plant {name!r}, the recipe is of {plant.name!r}; use the run's own."
-            )
-        generator = torch.Generator().manual_seed(config.seed)
-        parts = {role: config.make_policy(plant, generator) for role in weights if role != "closure"}
-        parts["closure"] = plant.make_closure(generator)
-        for role, part in parts.items():
-            try:
-                part.load_state_dict(weights[role])
-            except (RuntimeError, KeyError) as error:
-                raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
-        return cls(config=config, plant=plant, closure=parts.pop("closure"), policies=parts)
 
     def policy(self, role: str) -> nn.Module:
         """The trained policy of a role.
@@ -81,25 +42,76 @@ class FinishedRun:
         return self.policies[role]
 
 
-def read_settings(folder: Path) -> dict[str, Any]:
-    """The options a run was asked for, and the name of its ``plant``.
+def load_run(
+    folder: Path | str, recipe: Path | str | type[RunConfig] | None = None, *, plant: Plant | None = None
+) -> LoadedRun:
+    """Read the plant, the policies and the closure of a finished run back from its folder.
+
+    ``config.json`` names the recipe that made the run, and that recipe is imported, which runs its code. A recipe that
+    lies in the run folder itself is not imported unless it is given here.
+
+    Args:
+        folder: the run folder, with ``config.json`` and ``weights.pt``.
+        recipe: the recipe, where it has moved or the run does not name it: its file, ``package.module:Config``, or the
+            class itself. By default the one that the run names.
+        plant: the plant of the run, where the recipe's ``Config`` has no method ``plant()`` that makes it.
 
     Raises:
-        ValueError: if the folder is not that of a run.
+        ValueError: if the folder holds no finished run, its recipe is not found, or one that the recipe of today cannot
+            rebuild.
     """
-    file = folder / "config.json"
-    if not file.is_file():
+    folder = Path(folder)
+    settings = read_settings(folder)
+    config_class = class_of(folder, settings) if recipe is None else config_class_of(recipe)
+    weights = _read_weights(folder)
+    config, plant = _rebuilt(folder, settings, config_class, plant)
+    parts = _parts(config, plant)
+    for role, part in parts.items():
+        try:
+            part.load_state_dict(weights[role])
+        except (RuntimeError, KeyError) as error:
+            raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
+    return LoadedRun(config=config, plant=plant, closure=parts.pop("closure"), policies=parts)
+
+
+def _rebuilt(
+    folder: Path, settings: dict[str, Any], config_class: type[RunConfig], plant: Plant | None
+) -> tuple[RunConfig, Plant]:
+    """Configuration and plant of the settings of a run; the plant may be given."""
+    if plant is None and not hasattr(config_class, "plant"):
         raise ValueError(
-            f"{folder} is no run folder: it has no config.json. Give the folder that a recipe printed at its end, such "
-            "as runs/wind_turbine/TIME-seed-0."
+            f"{config_class.__qualname__} has no method plant() that makes the plant from its options; write one, or "
+            "give load_run the plant."
         )
+    options = {key: value for key, value in settings.items() if key not in ("plant", "recipe")}
     try:
-        settings = json.loads(file.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
-    if not isinstance(settings, dict) or "plant" not in settings:
-        raise ValueError(f"{file} is not that of a run: it does not name a plant.")
-    return settings
+        config = config_of(config_class, options)
+        plant = config.plant() if plant is None else plant
+    except (ValueError, TypeError, OSError) as error:
+        raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error
+    name = settings["plant"]
+    if plant.name != name:
+        raise ValueError(f"{folder} is a run of plant {name!r}, the recipe is of {plant.name!r}; use the run's own.")
+    return config, plant
+
+
+def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
+    """The configuration's class of a recipe: the class itself, ``Config`` of a file, or ``package.module:Config``.
+
+    Raises:
+        ValueError: if there is no such file or module, or what it defines is no recipe; see :func:`load_recipe`.
+    """
+    if isinstance(recipe, type):
+        return require_config(recipe, recipe.__qualname__)
+    if isinstance(recipe, str) and ":" in recipe and not Path(recipe).is_file():
+        return require_config(named(recipe), recipe)
+    return load_recipe(Path(recipe)).Config
+
+
+def _parts(config: RunConfig, plant: Plant) -> dict[str, nn.Module]:
+    """Policies and closure as a run makes them before it trains them."""
+    generator = torch.Generator().manual_seed(config.seed)
+    return {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
 
 
 def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:
@@ -113,33 +125,3 @@ def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:
         return torch.load(file, weights_only=True, map_location="cpu")
     except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise ValueError(f"{file} is damaged: {error}") from error
-
-
-def config_class_of(recipe: Path) -> type[RunConfig]:
-    """The class ``Config`` of a recipe, which is imported for it; see :func:`load_recipe` for errors."""
-    return load_recipe(recipe).Config
-
-
-def rebuilt(kind: Any, value: Any) -> Any:
-    """A value of a type from what JSON holds of it: dataclasses from objects, tuples from lists, paths from texts.
-
-    An option that is new since then has its default.
-
-    Raises:
-        ValueError: if a dataclass has no option of that name, or refuses its value.
-    """
-    if dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        unknown = sorted(set(value) - {field.name for field in dataclasses.fields(kind)})
-        if unknown:
-            raise ValueError(f"{kind.__name__} has no option {', '.join(unknown)}; it is of another version or recipe.")
-        return kind(**{name: rebuilt(hints[name], entry) for name, entry in value.items()})
-    arguments = typing.get_args(kind)
-    if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        (kind,) = (argument for argument in arguments if argument is not type(None))
-        return None if value is None else rebuilt(kind, value)
-    if typing.get_origin(kind) in (tuple, Sequence):
-        alike = typing.get_origin(kind) is Sequence or arguments[-1] is Ellipsis
-        kinds = arguments[:1] * len(value) if alike else arguments
-        return tuple(rebuilt(each, entry) for each, entry in zip(kinds, value, strict=True))
-    return Path(value) if kind is Path else value

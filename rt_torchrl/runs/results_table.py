@@ -69,12 +69,12 @@ def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def closure_lines(closure: dict[str, Any]) -> list[str]:
-    """Weights found, beside the true ones where the real plant has the same closure."""
+    """Weights found, beside the true ones where the real plant has some of the same names."""
     if not closure["found"] or not all(isinstance(value, float) for value in closure["found"].values()):
         return []
-    true = closure.get("true") or {}
-    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}{'true':>12}"]
+    true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
+    lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'true':>12}" if true else "")]
     for name, value in closure["found"].items():
-        known = f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"
+        known = "" if not true else f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"
         lines.append(f"  {name:<22}{closure['start'][name]:>12.5g}{value:>12.5g}{known}")
     return lines

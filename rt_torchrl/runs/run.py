@@ -1,7 +1,6 @@
 """What a recipe's main calls: the algorithm with progress, dashboard, checkpoints and results around it."""
 
 import copy
-import dataclasses
 import functools
 import json
 import logging
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from rt_torchrl import figures
+from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.real_episodes import Baseline, RealController, RealEpisodes
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, exact_optimum, untrained_costs
@@ -27,6 +27,7 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.results_table import progress, results_table
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import settings_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -35,6 +36,8 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.referees import Role
 
+CHECKED_STEPS = 10
+"""Control intervals that a plant is checked on before a run; ``check_plant`` alone looks at more."""
 PlantFigures = Callable[[Snapshot], dict[str, Figure]]
 
 
@@ -54,6 +57,8 @@ class Run:
         animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
+        PlantContractError: before any work, if a plant breaks its contract; what takes seconds to find, ``check_plant``
+            finds.
         ValueError: before any work, if the device does not exist, the run folder cannot be written or is taken, the
             checkpoint to resume from does not fit, or options need a plant in simulation and there is an ``env``.
     """
@@ -75,6 +80,8 @@ class Run:
         device = require_device(config.device)
         compiled = can_compile(device) if config.compiled is None else config.compiled
         require_simulation(config, plant, env, baselines)
+        for physics in filter(None, (plant, believed)):
+            check_plant(physics, steps=CHECKED_STEPS, traced=False)
         if config.threads:
             torch.set_num_threads(config.threads)
         logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -103,7 +110,7 @@ class Run:
         Returns:
             The content of ``metrics.json``.
         """
-        settings = dataclasses.asdict(self.asked) | {"plant": self.algorithm.twin.plant.name}
+        settings = settings_of(self.asked, self.algorithm.twin.plant.name)
         (self.folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
         dashboard = Dashboard(self.folder)
         gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import nn
 
+from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.trajectories.rollout import Engine
@@ -17,6 +18,8 @@ from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.referees import Role
 
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
+GREATEST_SEED = 2**63 - 2
+"""Torch takes whole numbers of 64 bits with a sign; the sensors of a simulated system take the next one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,12 +27,13 @@ class RunConfig:
     """Options every recipe has.
 
     Args:
-        policy: paper for the plant's own, or mlp.
+        policy: plant for the plant's own, or mlp. A recipe may call its plant's own policy paper, and offer others.
         hidden: widths of the hidden layers of an mlp policy.
         model_free_policy: another of these for the model-free policy alone; same for that of the model-based one, from
             the same initial weights.
-        closure: paper for the plant's own law in the twin, or mlp for a law with a perceptron in it, which has other
-            defaults of twinning.records and twinning.assimilation: NEURAL in the recipe.
+        closure: plant for the plant's own law in the twin, or mlp for a law with a perceptron in it. A recipe may call
+            the plant's own law paper, and train an mlp with other defaults of twinning.records and
+            twinning.assimilation: its NEURAL.
         closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number of real episodes n_e.
         seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
@@ -52,12 +56,15 @@ class RunConfig:
         unseen_every: judge the live policy on the unseen episodes after every so many episodes; 0 only at the end.
         noise: standard deviation of the real system's sensors, as a share of what they read.
         twinning: hyper-parameters of the six steps.
+
+    Raises:
+        ValueError: if an option is out of its range, or is none of its choices.
     """
 
-    policy: str = "paper"
+    policy: Literal["plant", "mlp"] = "plant"
     hidden: tuple[int, ...] = (32, 32)
     model_free_policy: str = "same"
-    closure: Literal["paper", "mlp"] = "paper"
+    closure: Literal["plant", "mlp"] = "plant"
     closure_hidden: tuple[int, ...] = (16, 16)
     episodes: int = 20
     seed: int = 0
@@ -79,8 +86,20 @@ class RunConfig:
     twinning: TwinningConfig = field(default_factory=TwinningConfig)
 
     def __post_init__(self):
+        check_options(self)
+        known = choices(type(self), "policy")
+        if known and self.model_free_policy not in ("same", *known):
+            raise ValueError(
+                f"model_free_policy={self.model_free_policy!r} does not exist; choose same, {' or '.join(known)}."
+            )
+        for argument in ("hidden", "closure_hidden"):
+            require_widths(argument, getattr(self, argument))
+        self._check_ranges()
+
+    def _check_ranges(self) -> None:
         for argument, least in (
             ("episodes", 1),
+            ("seed", 0),
             ("threads", 0),
             ("unseen", 2),
             ("untrained", 0),
@@ -89,32 +108,35 @@ class RunConfig:
         ):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
+        if self.seed > GREATEST_SEED:
+            raise ValueError(f"seed={self.seed} must be at most {GREATEST_SEED}.")
+        if self.noise < 0.0:
+            raise ValueError(f"noise={self.noise} must not be negative; it is a share of what the sensors read.")
+        if self.log_dir == Path():
+            raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
 
     def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
-        """The policy asked for, with random initial weights; override it for policies of your own.
+        """The policy asked for, with random initial weights.
 
-        Raises:
-            ValueError: if there is no policy of that name.
+        Override it, and the ``Literal`` that ``policy`` is declared as, for policies of your own.
         """
-        if self.policy == "paper":
-            return plant.make_policy(generator)
         if self.policy == "mlp":
             return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
-        raise ValueError(f"policy={self.policy!r} does not exist; choose paper or mlp.")
+        return plant.make_policy(generator)
 
     def make_closure(self, plant: Plant, generator: torch.Generator) -> nn.Module:
-        """The twin's closure asked for, w_p⁰; override it for closures of your own.
+        """The twin's closure asked for, w_p⁰.
+
+        Override it, and the ``Literal`` that ``closure`` is declared as, for closures of your own.
 
         Raises:
-            ValueError: if the plant has no neural closure, or there is no closure of that name.
+            ValueError: if the plant has no neural closure.
         """
-        if self.closure == "paper":
-            return plant.make_closure(generator)
         if self.closure == "mlp":
             return plant.make_neural_closure(generator, self.closure_hidden)
-        raise ValueError(f"closure={self.closure!r} does not exist; choose paper or mlp.")
+        return plant.make_closure(generator)
 
     def make_policies(self, plant: Plant, generator: torch.Generator) -> dict[Role, nn.Module]:
         """π_mb and π_mf: with the same initial weights where they are of the same kind."""

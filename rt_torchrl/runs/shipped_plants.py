@@ -1,4 +1,4 @@
-"""Finds the plants that are installed, by their folders: there is no registry to edit."""
+"""Finds plants by their folders, or by where they are defined: there is no registry to edit."""
 
 import importlib
 import inspect
@@ -6,11 +6,32 @@ import pkgutil
 
 import rt_torchrl.envs
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.user_code import named
 
 
 def shipped_plants() -> dict[str, type[Plant]]:
     """The plant of each folder under ``rt_torchrl.envs``, by the folder's name."""
     return {m.name: plant_of(m.name) for m in pkgutil.iter_modules(rt_torchrl.envs.__path__) if m.ispkg}
+
+
+def plant_class(name: str) -> type[Plant]:
+    """A plant by the name of its folder under ``rt_torchrl.envs``, or as ``FILE.py:NAME`` or ``package.module:NAME``.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    known = shipped_plants()
+    if ":" not in name:
+        if name not in known:
+            raise ValueError(
+                f"plant={name!r} does not exist; choose one of {', '.join(known)}, or name one of your own as "
+                "FILE.py:NAME or package.module:NAME."
+            )
+        return known[name]
+    found = named(name)
+    if not (inspect.isclass(found) and issubclass(found, Plant)):
+        raise ValueError(f"plant={name!r} is no class derived from Plant.")
+    return found
 
 
 def plant_of(folder: str) -> type[Plant]:

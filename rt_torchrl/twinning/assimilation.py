@@ -18,6 +18,7 @@ from rt_torchrl.identification.output_error import (
 )
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -59,6 +60,7 @@ class AssimilationConfig:
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self):
+        check_options(self)
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
         if not 0.0 <= self.stop_ratio < 1.0:

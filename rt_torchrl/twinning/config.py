@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rt_torchrl.options import check_options
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
@@ -45,6 +46,7 @@ class TwinningConfig:
     distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
     def __post_init__(self):
+        check_options(self)
         for argument in ("realisations", "records", "virtual_episodes"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchrl.objectives import BCLoss
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -42,6 +43,7 @@ class DistillationConfig:
     samples: int = 5000
 
     def __post_init__(self):
+        check_options(self)
         for argument in ("iterations", "rounds", "samples"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the distillation must be at least 1.")

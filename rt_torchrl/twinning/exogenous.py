@@ -9,6 +9,7 @@ from jaxtyping import Float
 from sklearn.svm import SVR
 from torch import Tensor
 
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.signal import Signal, bounds
 
 
@@ -29,6 +30,7 @@ class ExogenousConfig:
     tube: float = 0.05
 
     def __post_init__(self):
+        check_options(self)
         if self.knots < 8:
             raise ValueError(f"knots={self.knots} must be at least 8 for a regression of the large scale.")
         for argument in ("kernel_width", "penalty", "tube"):

@@ -10,6 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplayBuffer, Writer
 
+from rt_torchrl.options import check_options
+
 AT_ONCE = 100
 """Batches drawn in one call: enough for its overhead not to matter, and few enough for their copies to be small."""
 
@@ -31,6 +33,7 @@ class LongTermMemoryConfig:
     offset: float = 1e-3
 
     def __post_init__(self):
+        check_options(self)
         if self.capacity < 1:
             raise ValueError(f"capacity={self.capacity} of the long-term memory must be at least 1.")
         for argument in ("prioritisation", "correction"):

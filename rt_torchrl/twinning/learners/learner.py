@@ -8,6 +8,7 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.twinning.long_term_memory import LongTermMemoryConfig
 
 LearnerName = Literal["ddpg", "td3"]
@@ -65,6 +66,7 @@ class TD3Config:
     smoothing_limit: float = 0.5
 
     def __post_init__(self):
+        check_options(self)
         if self.delay < 1:
             raise ValueError(f"delay={self.delay} of TD3 must be at least 1 critic iteration.")
         for argument in ("smoothing", "smoothing_limit"):
@@ -90,7 +92,7 @@ class LearnerConfig:
         target_rate: τ of the target critic, and of TD3's target policy.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
-        gradient_limit: greatest norm of the policy's gradient.
+        gradient_limit: greatest norm of the policy's gradient, infinite for none.
         critic_hidden: widths of the critic's hidden layers.
         memory: D_L.
         td3: what TD3 has beside these.
@@ -112,6 +114,8 @@ class LearnerConfig:
     td3: TD3Config = field(default_factory=TD3Config)
 
     def __post_init__(self):
+        check_options(self, infinite=("gradient_limit",))
+        require_widths("critic_hidden", self.critic_hidden)
         for argument in ("critic_iterations", "actor_iterations"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")

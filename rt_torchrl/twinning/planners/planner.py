@@ -6,6 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 from torch import nn
 
 from rt_torchrl.optimisers.descent import Descended, DescentConfig
+from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.trajectories.trajectory import Scenario
 
 
@@ -67,6 +68,8 @@ class ShortHorizonConfig:
     critic_rate: float = 2e-3
 
     def __post_init__(self):
+        check_options(self)
+        require_widths("critic_hidden", self.critic_hidden)
         for argument, least in (("window", 0), ("critic_iterations", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")
@@ -100,6 +103,7 @@ class PlannerConfig:
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
 
     def __post_init__(self):
+        check_options(self)
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
         if self.realisations is not None and self.realisations < 1:

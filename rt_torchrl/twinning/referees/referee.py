@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
+from rt_torchrl.options import check_options
+
 Role = Literal["model_free", "model_based"]
 Event = Literal["keep", "swap", "clone"]
 RefereeName = Literal["decision_tree", "trust_ratio"]
@@ -33,6 +35,7 @@ class RefereeConfig:
     band: tuple[float, float] = (0.0, 40.0)
 
     def __post_init__(self):
+        check_options(self)
         for argument in ("patience", "clone_patience"):
             if getattr(self, argument) < 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")

@@ -1,0 +1,85 @@
+"""Checks the options of a configuration against the types that its class declares."""
+
+import dataclasses
+import math
+import numbers
+import types
+import typing
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Literal
+
+
+def check_options(config: Any, *, infinite: Sequence[str] = ()) -> None:
+    """Refuse options that no option of their type can be, when a configuration is made.
+
+    A dataclass does not check its types itself. This function checks every field that is declared as a ``Literal``, a
+    number, or an optional or a tuple of these. It leaves other fields alone. A configuration calls it first in its
+    ``__post_init__``, before the checks of its own ranges, which a nan would pass.
+
+    Args:
+        config: an instance of a dataclass.
+        infinite: names of the fields that may be infinite; all other numbers are finite.
+
+    Raises:
+        ValueError: with the option, its value, and what is allowed.
+    """
+    for name, kind in _kinds(type(config)).items():
+        _check(name, getattr(config, name), kind, finite=name not in infinite)
+
+
+def require_widths(name: str, widths: Sequence[int]) -> None:
+    """Refuse a hidden layer without units.
+
+    Args:
+        name: of the option, for the message.
+        widths: of the hidden layers.
+
+    Raises:
+        ValueError: if a width is below 1.
+    """
+    if any(width < 1 for width in widths):
+        raise ValueError(f"{name}={tuple(widths)} must hold widths of layers, each at least 1.")
+
+
+def choices(config_class: type, name: str) -> tuple[Any, ...]:
+    """What a field of a configuration can be that is declared as a ``Literal``; nothing for any other field."""
+    kind = _kinds(config_class)[name]
+    return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
+
+
+@cache
+def _kinds(config_class: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(config_class)
+    return {field.name: hints[field.name] for field in dataclasses.fields(config_class)}
+
+
+def _check(name: str, value: Any, kind: Any, *, finite: bool) -> None:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        if value not in arguments:
+            raise ValueError(f"{name}={value!r} does not exist; choose {_listed(arguments)}.")
+    elif origin in (typing.Union, types.UnionType):
+        others = [argument for argument in arguments if argument is not type(None)]
+        if len(others) == 1 and value is not None:
+            _check(name, value, others[0], finite=finite)
+    elif origin in (tuple, Sequence) and isinstance(value, (tuple, list)):
+        kinds = arguments if origin is tuple and arguments[-1] is not Ellipsis else arguments[:1] * len(value)
+        for place, (entry, each) in enumerate(zip(value, kinds, strict=False)):
+            _check(f"{name}[{place}]", entry, each, finite=finite)
+    elif kind is int and not _is(value, numbers.Integral):
+        raise ValueError(f"{name}={value!r} must be a whole number.")
+    elif kind is float and not _is(value, numbers.Real):
+        raise ValueError(f"{name}={value!r} must be a number.")
+    elif kind is float and (math.isnan(value) or (finite and math.isinf(value))):
+        raise ValueError(f"{name}={value} must be {'a finite number' if finite else 'a number or infinite'}.")
+
+
+def _is(value: Any, kind: type) -> bool:
+    """Whether a value is a number of that kind; Python takes True for one."""
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def _listed(values: Sequence[Any]) -> str:
+    *others, last = map(str, values)
+    return f"{', '.join(others)} or {last}" if others else last

@@ -1,0 +1,165 @@
+"""The file ``config.json`` of a run folder: the options of the run, its plant, and the recipe that made it."""
+
+import dataclasses
+import importlib.util
+import json
+import sys
+import typing
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import cattrs
+
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.user_code import PREFIX, attribute, module_of
+
+FILE = "config.json"
+GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
+
+
+def settings_of(config: RunConfig, plant: str) -> dict[str, Any]:
+    """What ``config.json`` holds of a run.
+
+    Args:
+        config: as asked for.
+        plant: name of the plant.
+
+    Returns:
+        Every option; ``plant``; and ``recipe``, which says where the class of the configuration is defined: ``class``,
+        ``module`` (null for a script) and ``file`` (null for an interactive session).
+    """
+    return dataclasses.asdict(config) | {"plant": plant, "recipe": _origin(type(config))}
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """What :func:`settings_of` gave when the run of a folder was made; runs of version 0.1 have no ``recipe``.
+
+    Raises:
+        ValueError: if the folder is not that of a run.
+    """
+    file = folder / FILE
+    if not file.is_file():
+        raise ValueError(
+            f"{folder} is no run folder: it has no {FILE}. Give the folder that a recipe printed at its end, such "
+            "as runs/wind_turbine/TIME-seed-0."
+        )
+    try:
+        settings = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+    if not isinstance(settings, dict) or not isinstance(settings.get("plant"), str):
+        raise ValueError(f"{file} is not that of a run: it does not name a plant.")
+    return settings
+
+
+def config_of(config_class: type[RunConfig], options: dict[str, Any]) -> RunConfig:
+    """A configuration from its options as JSON holds them; an option that is new since then has its default.
+
+    Raises:
+        ValueError: if the class, or one that it holds, has no such option, or refuses its value.
+    """
+    try:
+        return _converter().structure(options, config_class)
+    except cattrs.BaseValidationError as error:
+        raise ValueError("; ".join(cattrs.transform_error(error, "options", _told))) from error
+
+
+def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
+    """The configuration's class that the settings of a run name; its module is imported.
+
+    Raises:
+        ValueError: if they name none, or what they name is not there any more, is none, or lies in the run folder.
+    """
+    origin, place = settings.get("recipe"), folder / FILE
+    try:
+        name, module, file = (origin[key] for key in ("class", "module", "file"))
+    except (TypeError, KeyError):
+        raise ValueError(f"{place} does not say which recipe made the run; {GIVE}.") from None
+    if "<locals>" in name or not (module or file):
+        raise ValueError(f"the class {name} that made the run in {folder} was defined on the way; {GIVE}.")
+    if file and (not Path(file).is_absolute() or Path(file).resolve().is_relative_to(folder.resolve())):
+        raise ValueError(f"recipe {file} in {place} is not run: it came with the folder. To trust it, {GIVE}.")
+    try:
+        return require_config(attribute(_module(module, file), name), name)
+    except (ValueError, ImportError) as error:
+        raise ValueError(f"the recipe that {place} names is not to be had: {error} If it has moved, {GIVE}.") from error
+
+
+def require_config(found: Any, name: str) -> type[RunConfig]:
+    """Refuse what is no class derived from ``RunConfig``.
+
+    Args:
+        found: what may be one.
+        name: what it is called, for the message.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    if not (isinstance(found, type) and issubclass(found, RunConfig)):
+        raise ValueError(f"{name} is no class derived from RunConfig.")
+    return found
+
+
+def _origin(config_class: type) -> dict[str, str | None]:
+    module = sys.modules.get(config_class.__module__)
+    file, name = getattr(module, "__file__", None), config_class.__module__
+    if name == "__main__":
+        name = getattr(getattr(module, "__spec__", None), "name", None)  # a script has none, python -m has one
+    if file and name and name.startswith(PREFIX):
+        name = None
+    return {"class": config_class.__qualname__, "module": name, "file": str(Path(file).resolve()) if file else None}
+
+
+def _module(name: str | None, file: str | None) -> ModuleType:
+    """By its name where that leads to the file, or the file is not here; the script under way is not run again."""
+    for loaded in (sys.modules.get("__main__"), sys.modules.get(name or "")):
+        if file and loaded and _same(getattr(loaded, "__file__", None), file):
+            return loaded
+    if name and (not file or not Path(file).is_file() or _same(_found(name), file)):
+        return importlib.import_module(name)
+    return module_of(Path(file))
+
+
+def _found(name: str) -> str | None:
+    try:
+        return getattr(importlib.util.find_spec(name), "origin", None)
+    except (ImportError, ValueError):
+        return None
+
+
+def _same(one: str | None, other: str) -> bool:
+    return one is not None and Path(one).resolve() == Path(other).resolve()
+
+
+@cache
+def _converter() -> cattrs.Converter:
+    """Strict: cattrs alone would make a number of a string, and a truth of anything."""
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    for kind in (bool, int, float, str):
+        converter.register_structure_hook(kind, _primitive)
+    converter.register_structure_hook(Path, lambda value, _: Path(_primitive(value, str)))
+    # The class says best itself what it refuses.
+    converter.register_structure_hook_func(lambda kind: typing.get_origin(kind) is Literal, lambda value, _: value)
+    converter.register_structure_hook_func(
+        lambda kind: typing.get_origin(kind) is Sequence,
+        lambda value, kind: converter.structure(value, tuple[typing.get_args(kind)[0], ...]),
+    )
+    return converter
+
+
+def _primitive(value: Any, kind: type) -> Any:
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise ValueError(f"{value!r} is not of type {kind.__name__}.")
+    return value
+
+
+def _told(error: BaseException, kind: type | None) -> str:
+    if isinstance(error, cattrs.ForbiddenExtraKeysError):
+        unknown = ", ".join(sorted(error.extra_fields))
+        return f"{error.cl.__name__} has no option {unknown}; it is of another version or recipe."
+    return f"option {error} is missing" if isinstance(error, KeyError) else str(error)

@@ -1,0 +1,176 @@
+"""Every run that a recipe can make is loaded again, and the recipe is found by what the run says of it."""
+
+import contextlib
+import io
+import itertools
+import json
+import runpy
+import sys
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from test_export_recipe import RECIPES, leave_run, recipe
+
+from rt_torchrl import load_run
+from rt_torchrl.options import choices
+from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.runs.loaded_run import config_class_of
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import settings_of
+
+PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
+WITHOUT_NEURAL_CLOSURE = ("pendulum",)
+
+
+def combinations():
+    """Plant, closure, policy and model-free policy; without what the recipes refuse."""
+    for plant in PLANTS:
+        kind = config_class_of(RECIPES / f"{plant}.py")
+        closures, policies = choices(kind, "closure"), choices(kind, "policy")
+        for closure, policy, other in itertools.product(closures, policies, ("same", *policies)):
+            apart = "scheduled" in (policy, other) and other not in ("same", policy, "mlp")
+            if not apart and not (closure == "mlp" and plant in WITHOUT_NEURAL_CLOSURE):
+                yield plant, closure, policy, other
+
+
+@pytest.mark.parametrize(("plant", "closure", "policy", "other"), list(combinations()))
+def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, policy, other, tmp_path):
+    options = {"policy": policy, "closure": closure, "model_free_policy": other, "hidden": (3,), "closure_hidden": (2,)}
+    config, parts = leave_run(tmp_path, plant, **options)
+    run = load_run(tmp_path)
+    assert run.config == config and set(run.policies) == {"model_based", "model_free"}
+    for role, part in parts.items():
+        found = run.closure if role == "closure" else run.policy(role)
+        assert type(found) is type(part)
+        assert all(torch.equal(found.state_dict()[key], value) for key, value in part.state_dict().items())
+    assert isinstance(run.policy("model_free"), SaturatedMLP) >= (other == "mlp")
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_a_run_with_two_kinds_of_policies_and_a_neural_closure_is_exported(plant, tmp_path):
+    closure = {} if plant in WITHOUT_NEURAL_CLOSURE else {"closure": "mlp"}
+    _, parts = leave_run(tmp_path, plant, model_free_policy="mlp", hidden=(3,), **closure)
+    export = recipe("export")
+    for role in ("model_based", "model_free"):
+        export.main(export.Config(run=tmp_path, role=role, formats=("pt2",)))
+        written = torch.export.load(tmp_path / "exported" / f"{plant}_{role}.pt2").module()
+        observations = len(load_run(tmp_path).plant.observations)
+        seen = torch.rand(4, observations, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        # The same operations on the same numbers; a compiler may put sums in another order.
+        torch.testing.assert_close(written(seen), parts[role](seen), rtol=1e-12, atol=1e-12)
+
+
+def test_policies_of_two_turbines_are_refused():
+    config = config_class_of(RECIPES / "wind_turbine.py")
+    for policy, other in (("paper", "scheduled"), ("scheduled", "bias"), ("mlp", "scheduled")):
+        with pytest.raises(ValueError, match=f"model_free_policy='{other}' does not go with policy='{policy}'"):
+            config(policy=policy, model_free_policy=other)
+
+
+ROOM = """
+from linear_quadratic import LinearQuadratic
+class Room(LinearQuadratic):
+    name = "room"
+"""
+TRAIN = """
+import json, sys
+from pathlib import Path
+import torch
+from dataclasses import dataclass
+from room import Room
+from rt_torchrl import load_run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import settings_of
+print("runs")
+@dataclass(frozen=True, kw_only=True)
+class Config(RunConfig):
+    horizon: float = 3.0
+    def plant(self):
+        return Room(horizon=self.horizon)
+def main(config):
+    folder, plant = Path(sys.argv[1]), config.plant()
+    generator = torch.Generator().manual_seed(0)
+    parts = {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
+    torch.save({role: part.state_dict() for role, part in parts.items()}, folder / "weights.pt")
+    (folder / "config.json").write_text(json.dumps(settings_of(config, plant.name), default=str))
+    assert type(load_run(folder).plant) is Room
+if __name__ == "__main__":
+    main(Config(horizon=2.0))
+"""
+
+
+@pytest.fixture(scope="module")
+def own_run(tmp_path_factory):
+    """A run of a script of the user's own, whose plant lies in a file beside it; both are forgotten again."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "room.py").write_text(ROOM)
+    (folder / "train.py").write_text(TRAIN)
+    (folder / "run").mkdir()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as shown:
+        patch.syspath_prepend(folder)
+        patch.setattr("sys.argv", ["train.py", str(folder / "run")])
+        runpy.run_path(str(folder / "train.py"), run_name="__main__")
+    del sys.modules["room"]
+    assert shown.getvalue() == "runs\n"  # load_run has not run the script again that is under way
+    return folder
+
+
+def test_a_run_of_an_own_script_is_loaded_without_naming_it(own_run):
+    run = load_run(str(own_run / "run"))
+    assert run.plant.name == "room" and run.plant.horizon == run.config.horizon == 2.0
+
+
+def test_an_own_recipe_is_exported_with_the_plant_beside_it(own_run, tmp_path):
+    export = recipe("export")
+    for given in (None, str(own_run / "train.py"), f"{own_run / 'train.py'}:Config"):
+        export.main(export.Config(run=own_run / "run", recipe=given, formats=("pt2",), output=tmp_path))
+        (tmp_path / "room_model_based.pt2").unlink()
+
+
+class Own(RunConfig):
+    """In an importable module, without a plant."""
+
+
+def test_a_plant_that_no_recipe_makes_is_given(tmp_path):
+    _, parts = leave_run_of(tmp_path, Own())
+    with pytest.raises(ValueError, match=r"Own has no method plant\(\).*give load_run the plant"):
+        load_run(tmp_path)
+    run = load_run(tmp_path, plant=LinearQuadratic())
+    assert type(run.config) is Own and torch.equal(run.policy("model_free").gain, parts["model_free"].gain)
+
+
+def leave_run_of(folder, config):
+    plant, generator = LinearQuadratic(), torch.Generator().manual_seed(7)
+    parts = {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
+    torch.save({role: part.state_dict() for role, part in parts.items()}, folder / "weights.pt")
+    (folder / "config.json").write_text(json.dumps(settings_of(config, plant.name), default=str))
+    return config, parts
+
+
+def test_recipes_that_cannot_be_found_are_told(tmp_path):
+    leave_run_of(tmp_path, Own())
+    settings = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "evil.py").write_text("raise SystemExit('run')")
+    local = {"class": "make.<locals>.Config", "module": "room", "file": None}
+    for origin, message in {
+        None: "does not say which recipe made the run; give the recipe: its file",
+        json.dumps(local): "was defined on the way; give the recipe",
+        json.dumps({"class": "Config", "module": None, "file": str(tmp_path / "evil.py")}): "came with the folder",
+        json.dumps({"class": "Config", "module": None, "file": "evil.py"}): "came with the folder",
+        json.dumps({"class": "Config", "module": None, "file": "/gone.py"}): "/gone.py does not exist.*If it has moved",
+        json.dumps({"class": "Config", "module": "gone", "file": None}): "No module named 'gone'.*If it has moved",
+        json.dumps({"class": "Config", "module": "rt_torchrl", "file": None}): "defines no Config.*If it has moved",
+        json.dumps({"class": "Plant", "module": "rt_torchrl", "file": None}): "Plant is no class derived from RunConf",
+    }.items():
+        changed = settings | {"recipe": json.loads(origin) if origin else 0}
+        (tmp_path / "config.json").write_text(json.dumps(changed))
+        with pytest.raises(ValueError, match=message):
+            load_run(tmp_path, plant=LinearQuadratic())
+    for given, message in {
+        "gone:Config": "'gone:Config' cannot be imported",
+        "rt_torchrl:Plant": "rt_torchrl:Plant is no class derived from RunConfig",
+        "gone.py:Config": "gone.py does not exist",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            load_run(tmp_path, given)
