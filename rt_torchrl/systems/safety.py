@@ -30,10 +30,10 @@ class SafetyConfig:
         low: least actions, where they are to be above the system's own.
         high: greatest actions, where they are to be below the system's own.
         rates: greatest change of each action [unit/s]; infinity does not limit it.
-        rest: action that the first one of an episode is limited from; without it the first is free.
+        rest: action that the first one of an episode is limited from, within the range; without it the first is free.
         ranges: admissible values of entries of the observation, by name: (low, high), each a number or one a component.
         deadline: longest wall-clock time from an action to the observation of what it did [s].
-        hold: time without a fault after which the policy acts again [s].
+        hold: time without a fault after which the policy acts again [s]; infinity for never in the same episode.
         patience: time of uninterrupted fallback after which the episode is truncated [s].
         log: file to which every event is appended, one JSON object a line.
     """
@@ -110,12 +110,12 @@ class SafetyLayer(EnvBase):
     Args:
         env: the real system, one at a time: batch size empty or 1.
         config: see :class:`SafetyConfig`.
-        fallback: an action, or a controller that makes one from the TensorDict of the last observation.
+        fallback: an action within the range, or a controller that makes one from the TensorDict of the last observation.
         clock: wall clock [s].
 
     Raises:
         ValueError: if there is more than one system or action entry, the action is not continuous, or a number does not
-            fit the actions.
+            fit the actions, or ``rest`` or a constant ``fallback`` lies outside their range.
     """
 
     def __init__(
@@ -141,8 +141,8 @@ class SafetyLayer(EnvBase):
         self.limits = ActionLimits(
             env.action_spec, interval=config.interval, low=config.low, high=config.high, rates=config.rates
         )
-        self._rest = None if config.rest is None else self.limits.constant("rest", config.rest)
-        self._fallback = fallback if callable(fallback) else self.limits.constant("fallback", fallback)
+        self._rest = None if config.rest is None else self.limits.sendable("rest", config.rest)
+        self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
         if config.log is not None:
             config.log.parent.mkdir(parents=True, exist_ok=True)
             config.log.touch()
