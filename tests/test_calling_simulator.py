@@ -10,7 +10,8 @@ from linear_quadratic import LinearQuadratic
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl.systems.calling_simulator import CallingSimulator
-from rt_torchrl.systems.real_system import Reading, RealSystem
+from rt_torchrl.systems.reading import Reading
+from rt_torchrl.systems.real_system import RealSystem
 
 PLANT = LinearQuadratic(horizon=2.0)
 CALLS: list[str] = []

@@ -19,7 +19,8 @@ class ActionLimits:
         rates: greatest change r of each action [unit/s]; infinity does not limit it.
 
     Raises:
-        ValueError: if a number does not fit the actions, the range is empty, or the interval is not positive and finite.
+        ValueError: if a number does not fit the actions, the range is empty, or the interval is not positive or not
+            finite.
     """
 
     def __init__(

@@ -110,7 +110,8 @@ class SafetyLayer(EnvBase):
     Args:
         env: the real system, one at a time: batch size empty or 1.
         config: see :class:`SafetyConfig`.
-        fallback: an action within the range, or a controller that makes one from the TensorDict of the last observation.
+        fallback: an action within the range, or a controller that makes an action from the TensorDict of the last
+            observation.
         clock: wall clock [s].
 
     Raises:
@@ -195,7 +196,7 @@ class SafetyLayer(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._step_count == 0:
-            # Here, because a collector may reset more than once before it steps.
+            # Here, because a reset need not be followed by a step.
             self.reports.append(SafetyReport())
         t, end = (self.config.interval * k for k in (self._step_count, self._step_count + 1))
         asked = tensordict["action"]
