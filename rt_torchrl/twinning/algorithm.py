@@ -16,8 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
-from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.trajectory import DivergenceError, Record
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -74,12 +73,15 @@ class ReinforcementTwinning:
     """The algorithm; call :meth:`episode` once per real episode.
 
     Args:
-        env: the real system; a :class:`PlantEnv` of batch size 1, or a :class:`RealSystem` around any environment.
+        env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
         model_free: π_mf, trained in place; starts live.
         model_based: π_mb, trained in place.
         config: see :class:`TwinningConfig`.
         generator: source of everything random except what the real system draws itself.
+
+    Raises:
+        ValueError: if the real system is not one of batch size 1.
     """
 
     def __init__(
@@ -103,10 +105,7 @@ class ReinforcementTwinning:
         self.processes: deque[ExogenousProcess] = deque(maxlen=max(config.records, config.model_based.experience))
         self.switch = PolicySwitch(config.switch, live="model_based" if config.arm == "model_based" else "model_free")
         self.actor = LivePolicy(twin.plant, self.policies[self.switch.live], config.exploration, generator=generator)
-        simulated = isinstance(env, PlantEnv)
-        self.collector = (
-            FlightCollector(env, self.actor) if simulated else EpisodeCollector(env, self.actor, twin.plant.n_steps)
-        )
+        self.collector = collector_of(env, self.actor, twin.plant)
         self.episodes_done = 0
         self._earlier_closure: dict[str, Any] | None = None
 
@@ -131,7 +130,7 @@ class ReinforcementTwinning:
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
         self.actor.begin(self.policies[self.switch.live], strength=self.config.exploration.strength(self.episodes_done))
-        episode = next(iter(self.collector))[0]
+        episode = self.collector.rollout()[0]
         # What is learned from is the action that was applied.
         episode["action"] = episode["next", "applied"]
         transitions = self.model_free.transitions(episode)
