@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Binary, Bounded, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
@@ -74,7 +74,17 @@ class RealSystem(EnvBase):
             require_numbers("real system", exogenous=self._exogenous)
         self._seed, self._episodes = seed, 0
         declare_specs(self, plant)
+        self._declare_refusals()
         self._require_fit()
+
+    def _declare_refusals(self) -> None:
+        """Pass on which readings a safety layer has refused, where there is one."""
+        declared = self.env.full_observation_spec.get("refused", None)
+        self._judged = isinstance(declared, Binary)
+        if self._judged:
+            observed = self.observation_spec.clone()
+            observed["refused"] = Binary(n=1, shape=(1, 1), dtype=torch.bool, device=self.device)
+            self.observation_spec = observed
 
     def _require_fit(self) -> None:
         """Refuse before the first step what would fail in it; nothing real is moved."""
@@ -192,4 +202,5 @@ class RealSystem(EnvBase):
         found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
         found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag)}
         found |= {} if applied is None else {"applied": applied}
+        found |= {"refused": self._reported["refused"].reshape(1, 1)} if self._judged else {}
         return TensorDict(found, batch_size=self.batch_size, device=self.device)

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.systems.refusal import finite_errors, note_refusal
 from rt_torchrl.trajectories.trajectory import DivergenceError, Record
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
@@ -128,17 +129,30 @@ class ReinforcementTwinning:
         return report.update({"seconds": findings(**seconds)})
 
     def interact(self) -> TensorDict:
-        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
-        self.actor.begin(self.policies[self.switch.live], strength=self.config.exploration.strength(self.episodes_done))
-        episode = self.collector.rollout()[0]
+        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
+
+        An episode with readings that cannot be learned from is flown again, and the report says how many were, and why.
+
+        Raises:
+            ValueError: if several episodes in a row cannot be learned from; nothing of them is in a memory.
+        """
+        strength, refused = self.config.exploration.strength(self.episodes_done), []
+        while True:
+            self.actor.begin(self.policies[self.switch.live], strength=strength)
+            episode = self.collector.rollout()[0]
+            if not note_refusal(refused, episode):
+                break
         # What is learned from is the action that was applied.
         episode["action"] = episode["next", "applied"]
         transitions = self.model_free.transitions(episode)
-        self.long_term.store(transitions, self.model_free.td_errors(transitions))
+        self.long_term.store(transitions, finite_errors(self.model_free.td_errors(transitions)))
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
         self.short_term.append(Record(states, episode["exogenous"], episode["action"]))
         reward = episode["next", "reward"].mean()
-        return findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        if refused:
+            report.update(findings(episodes_refused=float(len(refused)))).set_non_tensor("refusal", "; ".join(refused))
+        return report
 
     def update_model_free(self) -> TensorDict:
         """Step 2: n_Q updates of the critic, then n_A of π_mf."""
