@@ -114,7 +114,7 @@ class RealSystem(EnvBase):
             self._require_range(spec)
 
     def _require_time(self) -> None:
-        """Refuse a time limit of Gymnasium's that ends every episode early; others show only when they end one."""
+        """Refuse Gymnasium's time limit where it is below the horizon; other ends show when they come."""
         limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)
         if limit is not None and limit < self.plant.n_steps:
             raise ValueError(
