@@ -14,7 +14,8 @@ from .baselines.classical import ClassicalController
 from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
 from .systems.environment import PlantEnv
 from .systems.exploration import ExplorationConfig
-from .systems.real_system import Actuation, Reading, RealSystem
+from .systems.reading import Actuation, Reading
+from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyEvent, SafetyLayer, SafetyReport
 from .evaluation.real_episodes import RealController
 

@@ -10,7 +10,8 @@ from linear_quadratic import LinearQuadratic
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl.systems.calling_simulator import CallingSimulator
-from rt_torchrl.systems.real_system import Reading, RealSystem
+from rt_torchrl.systems.reading import Reading
+from rt_torchrl.systems.real_system import RealSystem
 
 PLANT = LinearQuadratic(horizon=2.0)
 CALLS: list[str] = []
@@ -79,6 +80,45 @@ def test_what_fails_in_the_simulator_is_told_where_it_is_stepped():
         env.step(start.set("action", torch.zeros(1, dtype=torch.float64)))
     with pytest.raises(RuntimeError, match="without calling its controller"):
         environment(lambda seed, controller: None).reset()
+
+
+def within(seconds, call):
+    """What a call raises, from a thread that may hang."""
+    raised = []
+
+    def run():
+        try:
+            call()
+        except Exception as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    assert not thread.is_alive(), "it hangs"
+    return raised[0]
+
+
+def test_a_step_without_an_episode_is_refused():
+    """Before the first reset, after the end, and after a failure; a reset begins anew."""
+
+    def breaks(seed, controller):
+        controller({"place and rate": np.zeros(2)})
+        raise ZeroDivisionError("blade gone")
+
+    still = lambda td: td.set("action", torch.zeros(1, dtype=torch.float64))  # noqa: E731
+    env = environment()
+    before = within(5.0, lambda: env.step(still(env.fake_tensordict().exclude("next"))))
+    ended = env.rollout(1000, still)[-1]
+    after = within(5.0, lambda: env.step(still(ended.exclude("next"))))
+    assert len(env.rollout(1000, still)) == PLANT.n_steps + 1
+    broken = environment(breaks)
+    start = still(broken.reset())
+    with pytest.raises(RuntimeError, match="blade gone"):
+        broken.step(start)
+    failed = within(5.0, lambda: broken.step(start))
+    for error in (before, after, failed):
+        assert isinstance(error, RuntimeError) and "no episode is running; reset" in str(error)
 
 
 @pytest.mark.parametrize("reported", [{"place": np.zeros(2)}, {"place and rate": np.zeros(3)}])

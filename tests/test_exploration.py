@@ -58,7 +58,8 @@ def test_an_episode_does_not_begin_with_the_noise_of_the_last_one():
     assert (firsts[0] - firsts[1]).abs().min() > 1e-2
 
 
-@pytest.mark.parametrize(("argument", "value"), [("spread", -1.0), ("episodes", -1), ("correlation_time", -1.0)])
-def test_negative_parameters_are_refused(argument, value):
-    with pytest.raises(ValueError, match=f"{argument}=-1"):
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("argument", ["spread", "episodes", "correlation_time"])
+def test_parameters_out_of_range_are_refused(argument, value, unchecked):
+    with pytest.raises(ValueError, match=f"{argument}={value}"):
         ExplorationConfig(**{argument: value})

@@ -8,7 +8,8 @@ from torchrl.envs import GymWrapper
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.real_system import Actuation, Reading, RealSystem
+from rt_torchrl.systems.reading import Actuation, Reading
+from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning

@@ -6,6 +6,7 @@ other keys. A training on it must be the training on the plant itself.
 
 import dataclasses
 import json
+import re
 
 import pytest
 import torch
@@ -13,10 +14,12 @@ from linear_quadratic import LinearQuadratic
 from tensordict import TensorDict
 from test_run import SMALL
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.pendulum.real import angle_and_speed
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
@@ -27,9 +30,9 @@ MILLIMETRES = torch.tensor([1e3, 1e3], dtype=torch.float64)
 class Rig(EnvBase):
     """The oracle plant behind a foreign interface: mm and mm/s, a volt for every half newton from 1 V up, no batch."""
 
-    def __init__(self, plant, ends_after=None, **options):
+    def __init__(self, plant, ends_after=None, terminates=False, **options):
         super().__init__(batch_size=[])
-        self.inner, self.ends_after = PlantEnv(plant, **options), ends_after
+        self.inner, self.ends_after, self.terminates = PlantEnv(plant, **options), ends_after, terminates
         one = Unbounded(shape=(1,), dtype=torch.float64)
         two = Unbounded(shape=(2,), dtype=torch.float64)
         self.observation_spec = Composite(sensors=Composite(encoder=two, wind=one.clone()), motor=one.clone())
@@ -52,7 +55,8 @@ class Rig(EnvBase):
         self.found = self.inner.step(self.found.set("action", force[None]))["next"].exclude("reward")
         self.count += 1
         done = torch.tensor([self.count == self.ends_after])
-        return TensorDict({**self._told(self.found), "reward": torch.zeros(1).double(), "done": done})
+        ends = {"done": done, "terminated": done & self.terminates}
+        return TensorDict({**self._told(self.found), "reward": torch.zeros(1).double(), **ends})
 
 
 STATE = Reading(keys=(("sensors", "encoder"),), scale=1e-3)
@@ -212,8 +216,44 @@ def test_what_is_no_environment_of_torchrl_is_refused(unchecked):
 def test_an_episode_that_ends_early_is_refused():
     plant = LinearQuadratic(horizon=2.0)
     system = connected(plant, rig=Rig(plant, ends_after=7))
-    with pytest.raises(ValueError, match=r"ended the episode after 7 of 20 intervals .* at most 0.7 s"):
+    with pytest.raises(ValueError, match=r"truncated the episode after 7 of 20 control intervals .* at most 0.7 s"):
         system.rollout(20)
+
+
+class Forgetful(Rig):
+    """Reports nothing of one kind from its third step on."""
+
+    def __init__(self, plant, forgets):
+        super().__init__(plant)
+        self.forgets = forgets
+
+    def _step(self, tensordict):
+        found = super()._step(tensordict)
+        return found.exclude(self.forgets) if self.count >= 3 else found
+
+
+@pytest.mark.parametrize(
+    ("forgets", "what", "options"),
+    [
+        (("sensors", "encoder"), "state", {}),
+        (("sensors", "wind"), "exogenous", {}),
+        ("motor", "applied", {"applied": Reading(keys=("motor",))}),
+    ],
+)
+def test_a_step_that_does_not_report_what_is_read_is_refused(forgets, what, options):
+    plant = LinearQuadratic(horizon=2.0)
+    system = connected(plant, rig=Forgetful(plant, forgets), **options)
+    with pytest.raises(ValueError, match=f"{what} is read from .*does not report; it has"):
+        system.rollout(20)
+    assert system.env.count == 3
+
+
+def test_a_time_limit_below_the_horizon_is_refused_before_anything_moves():
+    gymnasium = pytest.importorskip("gymnasium")
+    plant = Pendulum(horizon=10.0)
+    env = GymWrapper(gymnasium.make("Pendulum-v1", max_episode_steps=150))
+    with pytest.raises(ValueError, match=r"truncates an episode after 150 of the 200 .* at most 7.5 s"):
+        RealSystem(env, plant, state=Reading(of=angle_and_speed))
 
 
 def test_a_reading_that_is_not_finite_is_refused():
@@ -230,6 +270,19 @@ def test_a_reading_that_is_not_finite_is_refused():
 def test_a_scale_of_zero_is_refused():
     with pytest.raises(ValueError, match=r"scale=\(1.0, 0.0\)"):
         Actuation(scale=(1.0, 0.0))
+
+
+@pytest.mark.parametrize("kind", [Reading, Actuation])
+@pytest.mark.parametrize("argument", ["scale", "offset"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), (1.0, float("-inf"))])
+def test_units_that_are_no_numbers_are_refused(kind, argument, value):
+    with pytest.raises(ValueError, match=f"{argument}={re.escape(str(value))} of the {kind.__name__.lower()}"):
+        kind(**{argument: value})
+
+
+def test_a_constant_input_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"exogenous=\(nan,\)"):
+        connected(LinearQuadratic(), exogenous=(float("nan"),))
 
 
 @pytest.mark.parametrize("options", [{"noise": 0.1}, {"reference": True}])

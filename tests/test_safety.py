@@ -1,15 +1,18 @@
 """The safety layer: limits by their formulas, the watchdog under a clock of the test, and what is learned from."""
 
 import json
+import math
 
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
+from rt_torchrl.systems.action_limits import ActionLimits
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -87,6 +90,16 @@ def test_the_system_gets_what_is_applied():
     bare = fly(PlantEnv(LinearQuadratic(horizon=2.0), seed=0), applied(episode))
     assert torch.equal(episode["next", "state"], bare["next", "state"])
     assert applied(episode) != asked
+
+
+@pytest.mark.parametrize("last", [9.0, -9.0, 1.9])
+def test_what_the_rate_allows_still_lies_in_the_range(last):
+    spec = Bounded(low=-2.0, high=2.0, shape=(1,), dtype=torch.float64)
+    limits = ActionLimits(spec, interval=0.05, rates=(10.0,))
+    sent, held = limits(torch.tensor([0.0], dtype=torch.float64), torch.tensor([last], dtype=torch.float64))
+    # Half a unit towards zero, or the end of the range where that is still outside.
+    assert sent.item() == pytest.approx(math.copysign(min(2.0, abs(last) - 0.5), last), abs=1e-14)
+    assert set(held) == ({"rate"} if abs(last) < 2.0 else {"range", "rate"})
 
 
 def test_nothing_is_touched_within_the_limits():
@@ -235,9 +248,19 @@ def test_what_the_layer_does_not_have_is_the_systems():
         ({"low": (3.0,)}, "low"),
         ({"fallback": (float("nan"),)}, "fallback"),
         ({"rest": (0.0, 0.0)}, "rest"),
+        ({"rest": (9.0,), "rates": (10.0,)}, r"rest=\(9.0,\) .*-2.0.* to .*2.0"),
+        ({"rest": (1.5,), "high": (1.0,)}, r"rest=\(1.5,\)"),
+        ({"rest": (float("inf"),)}, r"rest=\(inf,\)"),
+        ({"fallback": (-2.5,)}, r"fallback=\(-2.5,\)"),
+        ({"low": (float("nan"),)}, r"low=\(nan,\)"),
+        ({"rates": (float("nan"),)}, r"rates=\(nan,\)"),
         ({"deadline": 0.0}, "deadline=0.0"),
+        ({"deadline": float("nan")}, "deadline=nan"),
         ({"hold": -1.0}, "hold=-1.0"),
+        ({"hold": float("nan")}, "hold=nan"),
         ({"patience": -1.0}, "patience=-1.0"),
+        ({"patience": float("nan")}, "patience=nan"),
+        ({"ranges": {"observation": (float("nan"), 1.0)}}, "range of 'observation'"),
         ({"ranges": {"observation": (1.0, 1.0)}}, "range of 'observation'"),
         ({"ranges": {"speed": (0.0, 1.0)}}, "speed"),
     ],
@@ -250,8 +273,13 @@ def test_options_out_of_range_are_refused(options, message):
 def test_what_cannot_be_guarded_is_refused():
     with pytest.raises(ValueError, match="batch_size=\\(2,\\)"):
         layer(PlantEnv(LinearQuadratic(), batch_size=2))
-    with pytest.raises(ValueError, match="interval=0.0"):
-        SafetyConfig(interval=0.0)
+    for interval in (0.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"interval={interval}"):
+            SafetyConfig(interval=interval)
+    unlimited = Unbounded(shape=(1,), dtype=torch.float64)
+    for options in ({"interval": float("nan")}, {"interval": DT, "low": (float("inf"),)}):
+        with pytest.raises(ValueError, match="interval=nan|low=.inf"):
+            ActionLimits(unlimited, **options)
     with pytest.raises(ValueError, match="begins with a fault"):
         layer(ranges={"observation": (100.0, 101.0)}).reset()
     with pytest.raises(ValueError, match="fallback gave"):

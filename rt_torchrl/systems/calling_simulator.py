@@ -25,13 +25,15 @@ class EpisodeAbandoned(BaseException):
 class Conversation:
     """One episode of a simulator in a thread of its own, and the calls of its controller handed over to this one.
 
+    ``ended`` is true once the simulator has returned or failed: nobody listens to an answer any more.
+
     Args:
         simulate: runs the episode.
         seed: of the episode.
     """
 
     def __init__(self, simulate: Simulation, seed: int):
-        self._simulate, self._seed = simulate, seed
+        self._simulate, self._seed, self.ended = simulate, seed, False
         self._reports: SimpleQueue[Report | BaseException | None] = SimpleQueue()
         self._actions: SimpleQueue[np.ndarray | None] = SimpleQueue()
         self._thread = Thread(target=self._run, daemon=True)
@@ -60,6 +62,7 @@ class Conversation:
             RuntimeError: if the simulator has failed; with its own error as the cause.
         """
         found = self._reports.get()
+        self.ended = found is None or isinstance(found, BaseException)
         if isinstance(found, BaseException):
             raise RuntimeError(f"the simulator failed: {type(found).__name__}: {found}") from found
         return found
@@ -92,7 +95,8 @@ class CallingSimulator(EnvBase):
 
     Raises:
         ValueError: if nothing is reported or asked for, or a report lacks a name or has another size.
-        RuntimeError: if the simulator fails, or an episode has no call.
+        RuntimeError: if the simulator fails, an episode has no call, or a step is asked for where no episode runs:
+            before the first reset, and after an episode's end or failure.
     """
 
     def __init__(self, simulate: Simulation, reports: Mapping[str, int], actions: Sequence[Signal], *, seed: int = 0):
@@ -122,6 +126,8 @@ class CallingSimulator(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The next call of the controller; the last report once more, and done, where the simulator has ended."""
+        if self._conversation is None or self._conversation.ended:
+            raise RuntimeError("no episode is running; reset the environment before it is stepped.")
         self._conversation.answer(tensordict["action"].numpy().copy())
         reported = self._conversation.listen()
         if reported is not None:

@@ -1,15 +1,14 @@
-"""Whole real episodes in simulation by one scan, behind TorchRL's collector."""
+"""Whole real episodes, one a time: stepped, or in simulation by one scan."""
 
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.engines.compilation import compiled_if
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
@@ -40,31 +39,38 @@ class ExploringInterval(Interval):
         return (self.policy(observation) + noise).clamp(self.low, self.high)
 
 
-class EpisodeCollector(Collector):
-    """TorchRL's collector of one whole episode a time, from its reset on.
+class EpisodeCollector:
+    """Whole episodes by TorchRL's own rollout: each begins with its one reset, whatever became of the last one.
 
     Args:
         env: the real system.
         actor: what acts on it.
-        n_steps: control intervals of an episode.
+        plant: gives the length of an episode.
     """
 
-    def __init__(self, env: EnvBase, actor: LivePolicy, n_steps: int):
-        super().__init__(
-            env,
-            TensorDictModule(actor, in_keys=["observation"], out_keys=["action"]),
-            frames_per_batch=n_steps * env.batch_size.numel(),
-            total_frames=-1,
-            reset_at_each_iter=True,
-            auto_register_policy_transforms=False,
-        )
+    def __init__(self, env: EnvBase, actor: LivePolicy, plant: Plant):
+        self.env, self._plant = env, plant
+        self._actor = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
+
+    @torch.no_grad()
+    def rollout(self) -> TensorDict:
+        """One episode, ``batch n``.
+
+        Raises:
+            ValueError: if the system ends it before its horizon.
+        """
+        pass_over(self.env)
+        episode = self.env.rollout(self._plant.n_steps, self._actor)
+        if episode.shape[-1] < self._plant.n_steps:
+            raise ended_early(episode[..., -1]["next"], episode.shape[-1], self._plant)
+        return episode
 
 
-class FlightCollector(EpisodeCollector):
+class FlightCollector:
     """The same for a :class:`PlantEnv`: the same entries and draws, without a Python step per interval.
 
     A step of an environment costs some 0.4 ms, an interval in a compiled scan a tenth of it; an episode of the drone or
-    the tank has 10 000 of them.
+    the tank has 10 000 of them. Only for :class:`PlantEnv` itself: the scan never calls the step of a subclass.
 
     Args:
         env: the real system in simulation.
@@ -72,14 +78,14 @@ class FlightCollector(EpisodeCollector):
     """
 
     def __init__(self, env: PlantEnv, actor: LivePolicy):
-        super().__init__(env, actor, env.plant.n_steps)
-        self.actor = actor
+        self.env, self.actor = env, actor
         self._march = compiled_if(env.compiled, march_by_scan, march)
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
         """One episode, ``batch n``."""
-        env: PlantEnv = self.env
+        env = self.env
+        pass_over(env)
         env.reset()
         closure, (initial_state, exogenous, factor) = env.begin_episode(), env.drawn
         n, plant = exogenous.shape[1], env.plant
@@ -90,10 +96,35 @@ class FlightCollector(EpisodeCollector):
         ends = self._march(interval, initial_state, drive)
         require_finite(plant, ends, initial_state, [closure, self.actor.policy])
         states = torch.cat([initial_state.unsqueeze(0), ends])
-        episode = flown(interval, states, drive, factors.transpose(0, 1)).transpose(0, 1)
-        # As stepping does at the end of an episode, so that the next one is drawn alike.
-        env.reset()
-        return episode
+        return flown(interval, states, drive, factors.transpose(0, 1)).transpose(0, 1)
+
+
+def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollector | FlightCollector:
+    """What flies the algorithm's real episodes: a scan for :class:`PlantEnv` itself, steps for everything else.
+
+    Args:
+        env: the real system.
+        actor: what acts on it.
+        plant: gives the length of an episode.
+
+    Raises:
+        ValueError: if the system is not one of batch size 1.
+    """
+    if env.batch_size != torch.Size([1]):
+        raise ValueError(
+            f"batch_size={tuple(env.batch_size)} of the real system must be (1,): Reinforcement Twinning learns after "
+            "every one episode of one system. Use PlantEnv(..., batch_size=1), or put an environment without a batch "
+            "into a RealSystem."
+        )
+    if type(env) is PlantEnv:  # a subclass may override any part of a step
+        return FlightCollector(env, actor)
+    return EpisodeCollector(env, actor, plant)
+
+
+def pass_over(env: EnvBase) -> None:
+    """Let a simulation, also one behind a safety layer, pass over one draw before an episode."""
+    if hasattr(env, "pass_over"):
+        env.pass_over()
 
 
 def flown(

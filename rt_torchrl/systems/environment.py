@@ -27,6 +27,8 @@ class Draw(NamedTuple):
 class PlantEnv(EnvBase):
     r"""A plant with its true closure, stepped by commands.
 
+    The algorithm flies it by a compiled scan, and a subclass, which may override a step, in steps, ten times as slowly.
+
     Entries of its TensorDict, each with the batch size in front:
 
     =====================================  ======  ===================================================================
@@ -97,10 +99,22 @@ class PlantEnv(EnvBase):
         self._sensors.set_state(state["sensors"])
         self._episodes = state["episodes"]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _draw(self) -> tuple[Tensor, Tensor]:
+        """Initial states and exogenous inputs of the next episodes."""
         batch = self.batch_size[0]
-        state = self.plant.draw_initial_state(batch, self._generator)
-        exogenous = self.plant.draw_exogenous(batch, self._generator)
+        return self.plant.draw_initial_state(batch, self._generator), self.plant.draw_exogenous(batch, self._generator)
+
+    def pass_over(self) -> None:
+        """Draw what a reset would draw, and use it for nothing.
+
+        The algorithm does so before each of its episodes: they are every second draw of a seed, as they were in version
+        0.1, whose collector reset twice an episode. So its figures still hold.
+        """
+        self._draw()
+        self.sensor_factor()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        batch, (state, exogenous) = self.batch_size[0], self._draw()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():
             self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
@@ -117,7 +131,7 @@ class PlantEnv(EnvBase):
     def begin_episode(self) -> nn.Module:
         """Count an episode and give the closure it has.
 
-        Not counted by a reset, because a collector may reset more than once before it flies.
+        Not counted by a reset, because a reset need not be followed by a flight.
         """
         self._episodes += 1
         return self.closure
@@ -163,10 +177,10 @@ class PlantEnv(EnvBase):
 
     def sensor_factor(self) -> Float[Tensor, "batch n_s"]:
         """What the sensors multiply the state by at the next reading, 1 + noise·w."""
+        shape, like = (self.batch_size[0], len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
-            return torch.ones_like(self._state)
-        like = {"dtype": torch.float64, "device": self.device}
-        return 1.0 + self._noise * torch.randn(self._state.shape, generator=self._sensors, **like)
+            return torch.ones(shape, **like)
+        return 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
 
     def _time(self) -> Float[Tensor, " batch"]:
         # An integer times a float would be single precision.
@@ -201,6 +215,22 @@ def declare_specs(env: EnvBase, plant: Plant) -> None:
     env.reward_spec = unbounded(1)
     flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
     env.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, device=device)
+
+
+def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:
+    """The error that an environment has ended an episode before the horizon.
+
+    Args:
+        found: what it has reported at the end.
+        count: control intervals until then.
+        plant: whose horizon was to be reached.
+    """
+    terminated = "terminated" in found and found["terminated"].any()
+    return ValueError(
+        f"the environment {'terminated' if terminated else 'truncated'} the episode after {count} of {plant.n_steps} "
+        f"control intervals of plant {plant.name!r}. Reinforcement Twinning needs whole episodes and does not treat "
+        f"termination yet: use a horizon of at most {count * plant.dt:g} s, or an environment that goes on."
+    )
 
 
 def _transition(

@@ -24,6 +24,9 @@ class ExplorationConfig:
         spread: standard deviation of the noise on each action, as a share of half its range, in the first episode.
         episodes: number of episodes until ξ is zero; 0 explores in none.
         correlation_time: τ [s]; 0, as in the paper, for noise that is new at each control interval.
+
+    Raises:
+        ValueError: if a number is negative or not finite.
     """
 
     spread: float = 0.2
@@ -32,8 +35,10 @@ class ExplorationConfig:
 
     def __post_init__(self):
         for argument in ("spread", "episodes", "correlation_time"):
-            if not getattr(self, argument) >= 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the exploration must not be negative.")
+            if not 0 <= getattr(self, argument) < math.inf:
+                raise ValueError(
+                    f"{argument}={getattr(self, argument)} of the exploration must be finite and not negative."
+                )
 
     def strength(self, episode: int) -> float:
         """ξ of an episode, counted from 0."""

@@ -1,105 +1,18 @@
 """The real system where it is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Binary, Bounded, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
-from rt_torchrl.systems.environment import declare_specs
-
-
-def joined(*entries: Tensor) -> Tensor:
-    """The entries one behind the other."""
-    return torch.cat(entries, -1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """Where a vector of the plant stands in what an environment reports: offset + scale·of(entries).
-
-    Args:
-        keys: entries of the environment's TensorDict.
-        of: makes the vector of them, handed over in that order in double precision, features last; by default they are
-            joined as they are. For an angle of which sine and cosine are reported, it is an arc tangent.
-        scale: unit of the vector in the plant's units; a number for all signals, or one for each.
-        offset: what the plant reads where the vector is zero, in the plant's units; likewise.
-    """
-
-    keys: tuple[NestedKey, ...] = ("observation",)
-    of: Callable[..., Tensor] = joined
-    scale: float | Sequence[float] = 1.0
-    offset: float | Sequence[float] = 0.0
-
-    def read(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
-        """The vector in the plant's units.
-
-        Raises:
-            ValueError: as :meth:`vector`, or if the vector is not finite.
-        """
-        found = self.vector(reported, signals, what)
-        if not found.isfinite().all():
-            names = [signal.name for signal in signals]
-            raise ValueError(f"{what} {names}, read from {list(self.keys)}, is not finite: {found[0].tolist()}.")
-        return found
-
-    def vector(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
-        """The vector in the plant's units, whatever its values.
-
-        Raises:
-            ValueError: if an entry is missing, or the vector has not the shape of the signals.
-        """
-        missing = [key for key in self.keys if reported.get(key, None) is None]
-        if missing:
-            known = sorted(map(str, reported.keys(include_nested=True, leaves_only=True)))
-            raise ValueError(f"{what} is read from {missing}, which the environment does not report; it has {known}.")
-        found = self.of(*(reported.get(key).double() for key in self.keys))
-        names = [signal.name for signal in signals]
-        if tuple(found.shape) != (*reported.batch_size, len(signals)):
-            raise ValueError(
-                f"{what}, read from {list(self.keys)}, has shape {tuple(found.shape)}; the plant needs "
-                f"{(*reported.batch_size, len(signals))}, which is {names}: give the reading a function `of` them."
-            )
-        return in_units(found, self.scale, self.offset).reshape(1, len(signals))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Actuation:
-    """Where an environment takes its action; the plant's command is offset + scale·action.
-
-    Args:
-        key: entry of the environment's TensorDict.
-        scale: unit of the environment's action in the plant's units; a number for all actions, or one for each.
-        offset: command of the plant that the environment knows as zero; likewise.
-    """
-
-    key: NestedKey = "action"
-    scale: float | Sequence[float] = 1.0
-    offset: float | Sequence[float] = 0.0
-
-    def __post_init__(self):
-        if not (np.asarray(self.scale) != 0.0).all():
-            raise ValueError(f"scale={self.scale} of the actuation must not be zero.")
-
-    def action(self, command: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
-        """What the environment is told for a command in the plant's units."""
-        scale, offset = (
-            torch.as_tensor(x, dtype=torch.float64, device=command.device) for x in (self.scale, self.offset)
-        )
-        return (command - offset) / scale
-
-
-def in_units(values: Tensor, scale: float | Sequence[float], offset: float | Sequence[float]) -> Tensor:
-    """offset + scale · values, in double precision on the device of the values."""
-    like = {"dtype": torch.float64, "device": values.device}
-    return torch.as_tensor(offset, **like) + torch.as_tensor(scale, **like) * values
+from rt_torchrl.systems.environment import declare_specs, ended_early
+from rt_torchrl.systems.reading import Actuation, Reading, in_units, require_numbers
 
 
 def episode_seed(seed: int, number: int) -> int:
@@ -112,7 +25,9 @@ class RealSystem(EnvBase):
 
     State and exogenous input are read from what it reports; observation and reward are the plant's own functions of
     them, and so mean the same on the real system and on its twin. An episode has the length of the plant's; the
-    environment must not end it before.
+    environment must not end it before, neither at a time limit of its own nor in a state where it terminates, because
+    the algorithm does not treat termination yet. The environment's own reward is not used. An episode takes one reset,
+    at its beginning.
 
     Args:
         env: a TorchRL environment of one system (batch size () or (1,)); a Gymnasium one in TorchRL's ``GymWrapper``.
@@ -129,8 +44,9 @@ class RealSystem(EnvBase):
         device: where its entries go.
 
     Raises:
-        ValueError: if the environment is none of TorchRL or a batch, an entry is missing or misshapen, or its limits on
-            the action do not contain the plant's.
+        ValueError: if the environment is none of TorchRL or a batch, an entry is missing or misshapen, a constant input
+            is not finite, its limits on the action do not contain the plant's, or its time limit is shorter than the
+            plant's horizon; in a step, if what is read is not reported, or the episode ends before the horizon.
     """
 
     def __init__(
@@ -154,9 +70,21 @@ class RealSystem(EnvBase):
         self.env, self.plant, self.closure = env, plant.to(device), closure
         self._state, self._applied, self._actuation = state, applied, actuation or Actuation()
         self._exogenous = () if exogenous is None else exogenous
+        if not isinstance(self._exogenous, Reading):
+            require_numbers("real system", exogenous=self._exogenous)
         self._seed, self._episodes = seed, 0
         declare_specs(self, plant)
+        self._declare_refusals()
         self._require_fit()
+
+    def _declare_refusals(self) -> None:
+        """Pass on which readings a safety layer has refused, where there is one."""
+        declared = self.env.full_observation_spec.get("refused", None)
+        self._judged = isinstance(declared, Binary)
+        if self._judged:
+            observed = self.observation_spec.clone()
+            observed["refused"] = Binary(n=1, shape=(1, 1), dtype=torch.bool, device=self.device)
+            self.observation_spec = observed
 
     def _require_fit(self) -> None:
         """Refuse before the first step what would fail in it; nothing real is moved."""
@@ -173,6 +101,7 @@ class RealSystem(EnvBase):
                 "the environment reports what it has applied, as a safety layer does, and nobody would read it: give "
                 'applied=Reading(keys=("applied",)), in the plant\'s units.'
             )
+        self._require_time()
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
         if key not in self.env.action_keys:
             raise ValueError(
@@ -183,6 +112,16 @@ class RealSystem(EnvBase):
             raise ValueError(f"the environment's action is {spec}; the plant needs continuous ones for {names}.")
         if isinstance(spec, Bounded):
             self._require_range(spec)
+
+    def _require_time(self) -> None:
+        """Refuse Gymnasium's time limit where it is below the horizon; other ends show when they come."""
+        limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)
+        if limit is not None and limit < self.plant.n_steps:
+            raise ValueError(
+                f"the environment truncates an episode after {limit} of the {self.plant.n_steps} control intervals of "
+                f"plant {self.plant.name!r}; use a horizon of at most {limit * self.plant.dt:g} s, or make the "
+                "environment with a greater max_episode_steps."
+            )
 
     def _require_range(self, spec: Bounded) -> None:
         ends = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
@@ -219,7 +158,7 @@ class RealSystem(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         if self._seed is not None:
-            # Of the episode, not of the reset: a collector may reset more than once before it steps.
+            # Of the episode, not of the reset: a reset need not be followed by a step.
             self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
         self._reported, self._step_count = self.env.reset(), 0
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64)
@@ -235,12 +174,9 @@ class RealSystem(EnvBase):
         stepped = self.env.step(self._reported.set(self._actuation.key, action))
         self._step_count += 1
         last = self._step_count >= self.plant.n_steps
+        self._require_reported(stepped["next"])
         if stepped["next", "done"].any() and not last:
-            raise ValueError(
-                f"the environment ended the episode after {self._step_count} of {self.plant.n_steps} intervals of "
-                f"plant {self.plant.name!r}; use a horizon of at most {self._step_count * self.plant.dt:g} s, or an "
-                "environment that goes on."
-            )
+            raise ended_early(stepped["next"], self._step_count, self.plant)
         self._reported = self.env.step_mdp(stepped)
         if self._applied is None:
             applied = self.plant.actuate(before["state"], command)
@@ -249,6 +185,13 @@ class RealSystem(EnvBase):
         t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
         cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
         return self._entries(applied, ended=last).set("reward", -cost.unsqueeze(-1))
+
+    def _require_reported(self, found: TensorDictBase) -> None:
+        """Refuse a step that leaves out what is read: the values of the step before would stand in for it unseen."""
+        readings = {"state": self._state, "exogenous": self._exogenous, "applied": self._applied}
+        for what, reading in readings.items():
+            if isinstance(reading, Reading):
+                reading.require(found, what)
 
     def _entries(self, applied: Tensor | None, *, ended: bool) -> TensorDict:
         """What is reported now, in the plant's terms."""
@@ -259,4 +202,5 @@ class RealSystem(EnvBase):
         found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
         found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag)}
         found |= {} if applied is None else {"applied": applied}
+        found |= {"refused": self._reported["refused"].reshape(1, 1)} if self._judged else {}
         return TensorDict(found, batch_size=self.batch_size, device=self.device)

@@ -18,6 +18,9 @@ from torchrl.envs import EnvBase
 from rt_torchrl.systems.action_limits import ActionLimits
 from rt_torchrl.systems.watchdog import Range, Watchdog
 
+WRONG = frozenset({"not finite", "out of range"})
+"""Faults by which an observation is not what the system did; a late one is."""
+
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
 
 
@@ -30,10 +33,10 @@ class SafetyConfig:
         low: least actions, where they are to be above the system's own.
         high: greatest actions, where they are to be below the system's own.
         rates: greatest change of each action [unit/s]; infinity does not limit it.
-        rest: action that the first one of an episode is limited from; without it the first is free.
+        rest: action that the first one of an episode is limited from, within the range; without it the first is free.
         ranges: admissible values of entries of the observation, by name: (low, high), each a number or one a component.
         deadline: longest wall-clock time from an action to the observation of what it did [s].
-        hold: time without a fault after which the policy acts again [s].
+        hold: time without a fault after which the policy acts again [s]; infinity for never in the same episode.
         patience: time of uninterrupted fallback after which the episode is truncated [s].
         log: file to which every event is appended, one JSON object a line.
     """
@@ -90,15 +93,17 @@ class SafetyLayer(EnvBase):
 
     An action goes through range and rate, :math:`|a_k - a_{k-1}| \le r\,\Delta t`, both of which hold for the fallback
     too, because they are the machine's. While the watchdog is tripped the fallback acts. Observations are passed on as
-    they are, but for values that are not finite: the last finite ones take their place, because a policy and a memory
-    make nothing of NaN; the event says so. Two entries are added:
+    they are, but for values that are not finite: the last finite ones take their place, because a policy makes nothing
+    of NaN; the event says so. The system's reward is passed on as it is and never a fault. Three entries are added:
 
     ==================  ======  ======================================================================================
     ``applied``         n_a     what was sent to the system; where the system has an entry of that name, its own is kept
     ``tripped``         1       whether the watchdog is tripped by this observation or still holds
+    ``refused``         1       whether this observation is not finite or out of range, and so not to be learned from
     ==================  ======  ======================================================================================
 
-    What is to be learned from is ``("next", "applied")``, not the ``action`` that the policy asked for.
+    What is to be learned from is ``("next", "applied")``, not the ``action`` that the policy asked for. From an episode
+    with a refused observation ``ReinforcementTwinning`` learns nothing; it flies another one.
 
     A shutdown truncates the episode, it does not terminate it: where rewards are negative costs, a return that ends
     with the shutdown would make it the policy's goal. ``ReinforcementTwinning`` needs whole episodes: leave
@@ -110,12 +115,13 @@ class SafetyLayer(EnvBase):
     Args:
         env: the real system, one at a time: batch size empty or 1.
         config: see :class:`SafetyConfig`.
-        fallback: an action, or a controller that makes one from the TensorDict of the last observation.
+        fallback: an action within the range, or a controller that makes an action from the TensorDict of the last
+            observation.
         clock: wall clock [s].
 
     Raises:
         ValueError: if there is more than one system or action entry, the action is not continuous, or a number does not
-            fit the actions.
+            fit the actions, or ``rest`` or a constant ``fallback`` lies outside their range.
     """
 
     def __init__(
@@ -141,8 +147,8 @@ class SafetyLayer(EnvBase):
         self.limits = ActionLimits(
             env.action_spec, interval=config.interval, low=config.low, high=config.high, rates=config.rates
         )
-        self._rest = None if config.rest is None else self.limits.constant("rest", config.rest)
-        self._fallback = fallback if callable(fallback) else self.limits.constant("fallback", fallback)
+        self._rest = None if config.rest is None else self.limits.sendable("rest", config.rest)
+        self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
         if config.log is not None:
             config.log.parent.mkdir(parents=True, exist_ok=True)
             config.log.touch()
@@ -154,7 +160,8 @@ class SafetyLayer(EnvBase):
             raise ValueError(f"ranges has {sorted(unknown)}; the system observes {sorted(observation.keys())}.")
         if "applied" not in observation:
             observation["applied"] = Unbounded(shape=action.shape, dtype=action.dtype, device=self.device)
-        observation["tripped"] = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        for flag in ("tripped", "refused"):
+            observation[flag] = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
         self.observation_spec = observation
         self.action_spec, self.reward_spec = action.clone(), self.env.reward_spec.clone()
         done = self.env.full_done_spec.clone()
@@ -180,7 +187,7 @@ class SafetyLayer(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
-        faults = self.watchdog.faults({key: found[key] for key in self._watched}, 0.0)
+        faults = self._faults(found, 0.0, "after its reset")
         if faults:
             raise ValueError(f"the system begins with a fault, {faults}: {found}; nothing was sent to it.")
         self.watchdog.begin()
@@ -188,26 +195,27 @@ class SafetyLayer(EnvBase):
         self._remember(found)
         if "applied" not in found:
             found["applied"] = self.action_spec.zero() if self._rest is None else self._rest.clone()
-        found["tripped"] = self._flag(False)
+        found["tripped"], found["refused"] = self._flag(False), self._flag(False)
         found["truncated"] = found.get("truncated", self._flag(False))
         return found
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._step_count == 0:
-            # Here, because a collector may reset more than once before it steps.
+            # Here, because a reset need not be followed by a step.
             self.reports.append(SafetyReport())
         t, end = (self.config.interval * k for k in (self._step_count, self._step_count + 1))
         asked = tensordict["action"]
         applied, reasons = self._chosen(t, tensordict)
         start = self._clock()
-        found = self.env.step(tensordict.exclude("next", "tripped").set("action", applied.clone()))["next"]
-        faults = self.watchdog.faults({key: found[key] for key in self._entries()}, self._clock() - start)
+        found = self.env.step(tensordict.exclude("next", "tripped", "refused").set("action", applied.clone()))["next"]
+        faults = self._faults(found, self._clock() - start, f"at the end of interval {self._step_count}")
         self.watchdog.note(end, bool(faults))
         found = self._remember(found.copy())
         if "applied" not in self.env.full_observation_spec:
             found["applied"] = applied.clone()
         found["tripped"] = self._flag(self.watchdog.tripped(end))
+        found["refused"] = self._flag(not WRONG.isdisjoint(faults))
         reasons |= faults
         found["truncated"] = found.get("truncated", self._flag(False))
         if self.watchdog.exhausted(end):
@@ -233,17 +241,28 @@ class SafetyLayer(EnvBase):
         applied, held = self.limits(action, self._last)
         return applied, reasons | held
 
+    def _faults(self, found: TensorDictBase, elapsed: float, when: str) -> dict[str, str]:
+        """What is wrong with an observation, by kind.
+
+        Raises:
+            ValueError: if entries are missing that the system declares.
+        """
+        missing = [key for key in self._watched if key not in found]
+        if missing:
+            raise ValueError(
+                f"the system does not report {missing} {when}, although it declares to observe it; it has "
+                f"{sorted(found.keys())}. Mend the system's step, or take the entry out of its observation_spec."
+            )
+        return self.watchdog.faults({key: found[key] for key in self._watched}, elapsed)
+
     def _remember(self, found: TensorDictBase) -> TensorDictBase:
-        """The last finite values in place of what is not finite; before the first reward that is zero."""
-        for key in self._entries(found):
+        """The last finite values in place of what is not finite."""
+        for key in self._watched:
             value = found[key]
             good = self._good.get(key, torch.zeros_like(value))
             self._good[key] = torch.where(value.isfinite(), value, good)
             found[key] = self._good[key]
         return found
-
-    def _entries(self, found: TensorDictBase | None = None) -> list[str]:
-        return [*self._watched, "reward"] if found is None or "reward" in found else self._watched
 
     def _note(self, t: float, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
         if not reasons:

@@ -18,7 +18,7 @@ class Watchdog:
     Args:
         ranges: least and greatest admissible value of entries, for all components or one by one.
         deadline: longest wall-clock time from an action to the observation of what it did [s].
-        hold: time without a fault after which it is released [s].
+        hold: time without a fault after which it is released [s]; infinity for never.
         patience: time after which :meth:`exhausted` if it has been tripped all along [s].
 
     Raises:
@@ -37,7 +37,7 @@ class Watchdog:
             raise ValueError(f"deadline={deadline} s must be positive; infinity waits for ever.")
         for argument, value in (("hold", hold), ("patience", patience)):
             if not value >= 0.0:
-                raise ValueError(f"{argument}={value} s must not be negative.")
+                raise ValueError(f"{argument}={value} s must be a number that is not negative; infinity is one.")
         self._ranges = {
             entry: tuple(torch.as_tensor(end, dtype=torch.float64) for end in ends) for entry, ends in ranges.items()
         }

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_map_only
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
-from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
+from rt_torchrl.systems.refusal import note_refusal
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -37,7 +37,7 @@ class ReinforcementTwinning:
     """The algorithm; call :meth:`episode` once per real episode.
 
     Args:
-        env: the real system; a :class:`PlantEnv` of batch size 1, or a :class:`RealSystem` around any environment.
+        env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
         model_free: π_mf, trained in place; starts live.
         model_based: π_mb, trained in place.
@@ -48,7 +48,8 @@ class ReinforcementTwinning:
         referee: step 6; that of ``config.referee`` by default.
 
     Raises:
-        ValueError: if a learner or planner is given that trains another policy.
+        ValueError: if the real system is not one of batch size 1, or a learner or planner is given that trains another
+            policy.
     """
 
     def __init__(
@@ -78,10 +79,7 @@ class ReinforcementTwinning:
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
-        simulated = isinstance(env, PlantEnv)
-        self.collector = (
-            FlightCollector(env, self.actor) if simulated else EpisodeCollector(env, self.actor, twin.plant.n_steps)
-        )
+        self.collector = collector_of(env, self.actor, twin.plant)
         self.episodes_done = 0
         self._earlier_closure: dict[str, Any] | None = None
 
@@ -108,10 +106,19 @@ class ReinforcementTwinning:
         return report.update({"seconds": findings(**seconds)})
 
     def interact(self) -> TensorDict:
-        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
-        live = self.referee.live
-        self.actor.begin(self.policies[live], strength=self.config.exploration.strength(self.episodes_done))
-        episode = next(iter(self.collector))[0]
+        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
+
+        An episode with readings that cannot be learned from is flown again, and the report says how many were, and why.
+
+        Raises:
+            ValueError: if several episodes in a row cannot be learned from; nothing of them is in a memory.
+        """
+        live, strength, refused = self.referee.live, self.config.exploration.strength(self.episodes_done), []
+        while True:
+            self.actor.begin(self.policies[live], strength=strength)
+            episode = self.collector.rollout()[0]
+            if not note_refusal(refused, episode):
+                break
         # What is learned from is the action that was applied.
         episode["action"] = episode["next", "applied"]
         self.learner.store(episode)
@@ -120,7 +127,10 @@ class ReinforcementTwinning:
         reward = episode["next", "reward"].mean()
         self.short_term.append(record)
         self.track_record.append(record, live, -reward.item())
-        return findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        if refused:
+            report.update(findings(episodes_refused=float(len(refused)))).set_non_tensor("refusal", "; ".join(refused))
+        return report
 
     def update_model_free(self) -> TensorDict:
         """Step 2: the learner improves π_mf."""

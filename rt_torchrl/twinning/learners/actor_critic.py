@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.systems.refusal import finite_errors
 from rt_torchrl.twinning.learners.learner import LearnerConfig
 from rt_torchrl.twinning.long_term_memory import LongTermMemory
 
@@ -114,9 +115,13 @@ class ActorCritic(ABC):
         return [ValueOperator(critic, in_keys=["observation", "action"]) for critic in self.critics]
 
     def store(self, episode: TensorDictBase) -> None:
-        """Keep the transitions of a real episode, by their TD errors."""
+        """Keep the transitions of a real episode, by their TD errors.
+
+        Raises:
+            ValueError: if a TD error is not finite, because the critic has diverged.
+        """
         transitions = self.transitions(episode)
-        self.memory.store(transitions, self.td_errors(transitions))
+        self.memory.store(transitions, finite_errors(self.td_errors(transitions)))
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
         """What D_L keeps of an episode, a TensorDict: (e_k, a_k, return, e_{k+m}) of the intervals with m after them.
