@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 from rt_torchrl.contract.calls import Calls
 from rt_torchrl.contract.costs import costs
@@ -69,7 +70,7 @@ def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, traced: bool
     return [text for check in checks for text in attempt(check, calls)]
 
 
-def attempt(check: Callable[..., Iterable[str]], *arguments) -> Iterator[str]:
+def attempt(check: Callable[..., Iterable[str]], *arguments: Any) -> Iterator[str]:
     """The violations that a check finds; what the plant itself raises is one more."""
     try:
         yield from check(*arguments)
