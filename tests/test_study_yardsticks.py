@@ -29,7 +29,7 @@ def test_a_damaged_yardstick_is_computed_again(tmp_path, left):
 
 
 def test_a_system_with_model_error_ends_as_its_recipe_says():
-    turbine, drone, tank = (plants()[name]() for name in ("wind_turbine", "flapping_wing", "cryogenic_tank"))
+    turbine, drone, tank = (shipped_plants()[name]() for name in ("wind_turbine", "flapping_wing", "cryogenic_tank"))
     recipes = [RECIPES / f"{name}.py" for name in ("wind_turbine", "flapping_wing", "cryogenic_tank")]
     worn = changed_closure(turbine, recipes[0], ())
     speeds, pitch = torch.tensor([[7.6]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
@@ -55,6 +55,6 @@ def test_a_plan_on_training_episodes_is_judged_on_unseen_ones(monkeypatch):
 def test_yardsticks_are_measured_on_the_plant_of_the_trainings():
     short = configured(RECIPES / "flapping_wing.py", ("--quick", "--horizon", "1.25"))
     assert short.plant().horizon == pytest.approx(1.25) and short.episodes == 3
-    for name, default in plants().items():
+    for name, default in shipped_plants().items():
         if (RECIPES / f"{name}.py").exists():
             assert configured(RECIPES / f"{name}.py", ()).plant().extra_repr() == default().extra_repr()

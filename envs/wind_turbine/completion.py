@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
-from scipy.signal import lfilter
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -50,6 +49,8 @@ def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:
 
 def lag(start: Tensor, driving: Float[Tensor, " n"], steps: float) -> Float[Tensor, " samples"]:
     """First-order lag from ``start``, with dt ``steps`` of its time constant."""
+    from scipy.signal import lfilter  # here, because it takes a second to load and only logs need it
+
     decay = math.exp(-steps)
     ends, _ = lfilter([1.0 - decay], [1.0, -decay], driving.numpy(), zi=[decay * start.item()])
     return torch.cat([start.reshape(1), torch.from_numpy(ends)])

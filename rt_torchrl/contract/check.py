@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rt_torchrl.contract.calls import Calls
 from rt_torchrl.contract.costs import costs
@@ -111,7 +111,7 @@ def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iter
     return [text for check in checks for text in attempt(check, calls)]
 
 
-def attempt(check: Callable[..., Iterable[str]], *arguments) -> Iterator[str]:
+def attempt(check: Callable[..., Iterable[str]], *arguments: Any) -> Iterator[str]:
     """The violations that a check finds; what the plant itself raises is one more."""
     try:
         yield from check(*arguments)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from rt_torchrl.contract.calls import Arguments, Calls
+from rt_torchrl.contract.calls import Arguments, Calls, Method
 from rt_torchrl.trajectories.engines.compilation import raised_limits
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise
@@ -45,7 +45,7 @@ def tracing(calls: Calls) -> Iterator[str]:
     arguments = calls.some(MANY)
     for method in calls.methods():
 
-        def traced(arguments: Arguments, method=method) -> tuple[Tensor, ...]:
+        def traced(arguments: Arguments, method: Method = method) -> tuple[Tensor, ...]:
             return method.outputs(arguments)
 
         try:

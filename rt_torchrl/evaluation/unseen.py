@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.stats import bootstrap
 from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
@@ -179,6 +178,8 @@ def exact_optimum(
 
 def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:
     """Mean and percentile-bootstrap confidence interval (2000 resamples), as it is written into ``metrics.json``."""
+    from scipy.stats import bootstrap  # here, because it takes a second to load and only results need it
+
     numbers = values.detach().cpu().numpy().astype(np.float64)
     mean = float(numbers.mean())
     if np.ptp(numbers) == 0.0:

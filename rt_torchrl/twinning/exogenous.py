@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from sklearn.svm import SVR
 from torch import Tensor
 
 from rt_torchrl.options import check_options
@@ -120,6 +119,8 @@ def sample_experience(
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
     """d̃ at every sample, from a regression on block means; time is counted in knot spacings."""
+    from sklearn.svm import SVR  # here, because it takes a second to load and only step 3 needs it
+
     spread = values.std()
     if spread == 0.0:
         return values.copy()
