@@ -5,6 +5,7 @@ import torch
 from handwritten_study import RECIPES
 
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.runs.shipped_plants import shipped_plants
 from rt_torchrl.study import yardsticks
 from rt_torchrl.study.yardsticks import Yardstick, changed_closure, configured, cost_over_episodes
 
