@@ -8,6 +8,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.interruption import safe_point
+
 Optimiser = Literal["adam", "lbfgs"]
 
 
@@ -122,6 +124,7 @@ class _Seen:
     def __call__(self) -> Tensor:
         if self.count == self._iterations:
             raise _Finished
+        safe_point()
         with torch.enable_grad():
             self._module.zero_grad(set_to_none=True)
             cost = self._cost()

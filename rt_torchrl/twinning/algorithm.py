@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -122,6 +123,7 @@ class ReinforcementTwinning:
         steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
+            safe_point()
             start = time.perf_counter()
             report.update(self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start

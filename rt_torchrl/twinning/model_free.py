@@ -12,6 +12,7 @@ from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
@@ -172,6 +173,7 @@ class ModelFree:
         size, scale = min(self.config.batch_size, episode_length), self.config.reward_scale
         found = {key: [] for key in ("critic_loss", "td_error", "critic_gradient", "value", "actor_gradient")}
         for _ in range(self.config.critic_iterations):
+            safe_point()
             batch = memory.sample(size)
             loss, td_error = _critic_loss(self.loss, batch)
             self.critic_optimiser.zero_grad(set_to_none=True)
@@ -183,6 +185,7 @@ class ModelFree:
             for key, value in zip(found, (loss.detach() / scale**2, td_error.mean() / scale, norm), strict=False):
                 found[key].append(value)
         for batch in memory.samples(size, self.config.actor_iterations):
+            safe_point()
             loss = _actor_loss(self.loss, batch)
             self.actor_optimiser.zero_grad(set_to_none=True)
             loss.backward()

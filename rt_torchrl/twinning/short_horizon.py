@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -125,6 +126,7 @@ class ShortHorizon:
         inputs = exogenous[:, : count * n].unflatten(1, (count, n))
         rows, norms = torch.arange(batch, device=exogenous.device), []
         for shift in range(count):
+            safe_point()
             phase = (rows + shift) % count
             start = plant.dt * n * phase.double()
             norms.append(self._window(flown.states[rows, phase * n], inputs[rows, phase], start))
