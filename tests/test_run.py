@@ -6,35 +6,15 @@ import json
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from small_runs import SMALL, small_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.trajectory import Rollout, identification_cost
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning, TwinningConfig
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.memory import LongTermMemoryConfig
-from rt_torchrl.twinning.model_free import ModelFreeConfig
-from rt_torchrl.twinning.switching import SwitchConfig
-
-SMALL = TwinningConfig(
-    realisations=2,
-    virtual_episodes=2,
-    exploration=ExplorationConfig(episodes=2),
-    long_term=LongTermMemoryConfig(capacity=500),
-    model_free=ModelFreeConfig(critic_iterations=3, actor_iterations=3, batch_size=8, critic_hidden=(8,)),
-    # No patience, so that swaps and clones happen within the few episodes of a test.
-    switch=SwitchConfig(patience=0, clone_patience=0, stall=10.0),
-)
-
-
-def small_run(folder, episodes=3, **options):
-    config = RunConfig(
-        episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options
-    )
-    return Run(config, LinearQuadratic(horizon=2.0))
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):
@@ -244,7 +224,7 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
     small_run(tmp_path, episodes=1).train()
     wider = dataclasses.replace(SMALL, model_free=dataclasses.replace(SMALL.model_free, critic_hidden=(9,)))
-    with pytest.raises(ValueError, match="weights do not fit"):
+    with pytest.raises(ValueError, match=r"critic_hidden is \[9\] here and was \[8\] in the run"):
         Run(RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
 
 

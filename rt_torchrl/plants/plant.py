@@ -22,6 +22,9 @@ from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
 
+MOST_STEPS = 1e8
+"""Control intervals of an episode that could be kept in memory: a gigabyte for every signal."""
+
 
 class Transition(NamedTuple):
     """What one control interval did: the state at its end and the action the actuators applied during it."""
@@ -63,6 +66,11 @@ class Plant(nn.Module, ABC):
         for argument, value in (("dt", dt), ("horizon", horizon)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{argument}={value} s of plant {self.name!r} must be positive and finite.")
+        if not horizon / dt <= MOST_STEPS:
+            raise ValueError(
+                f"horizon={horizon} s of plant {self.name!r} is {horizon / dt:.3g} steps of dt={dt} s; an episode is "
+                f"kept in memory and may have {MOST_STEPS:.0e}: shorten it, or take longer steps."
+            )
         self.dt = float(dt)
         self.n_steps = round(horizon / dt)
         if self.n_steps < 1 or abs(self.n_steps * dt - horizon) > 1e-6 * dt:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import pickle
 import types
 import typing
 from collections.abc import Sequence
@@ -16,6 +15,8 @@ from torch import nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_settings import RAN
+from rt_torchrl.runs.tensor_file import load_tensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +100,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{file} is damaged: {error}") from error
     if not isinstance(settings, dict) or "plant" not in settings:
         raise ValueError(f"{file} is not that of a run: it does not name a plant.")
+    settings.pop(RAN, None)
     return settings
 
 
@@ -109,10 +111,7 @@ def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:
             f"the run in {folder} has no weights.pt: it is not finished. Go on with it by --resume; Ctrl-C ends it "
             "and leaves the weights of the episodes done."
         )
-    try:
-        return torch.load(file, weights_only=True, map_location="cpu")
-    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
+    return load_tensors(file)
 
 
 def config_class_of(recipe: Path) -> type[RunConfig]:

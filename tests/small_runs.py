@@ -1,0 +1,28 @@
+"""Whole runs on the oracle plant that take seconds."""
+
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.twinning.algorithm import TwinningConfig
+from rt_torchrl.twinning.memory import LongTermMemoryConfig
+from rt_torchrl.twinning.model_free import ModelFreeConfig
+from rt_torchrl.twinning.switching import SwitchConfig
+
+SMALL = TwinningConfig(
+    realisations=2,
+    virtual_episodes=2,
+    exploration=ExplorationConfig(episodes=2),
+    long_term=LongTermMemoryConfig(capacity=500),
+    model_free=ModelFreeConfig(critic_iterations=3, actor_iterations=3, batch_size=8, critic_hidden=(8,)),
+    # No patience, so that swaps and clones happen within the few episodes of a test.
+    switch=SwitchConfig(patience=0, clone_patience=0, stall=10.0),
+)
+
+
+def small_run(folder, episodes=3, **options):
+    config = RunConfig(
+        episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options
+    )
+    return Run(config, LinearQuadratic(horizon=2.0))
