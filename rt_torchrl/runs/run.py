@@ -44,6 +44,8 @@ PlantFigures = Callable[[Snapshot], dict[str, Figure]]
 class Run:
     """One training with everything around it.
 
+    It holds its folder from its construction to the end of :meth:`train`: no other training may write there.
+
     Args:
         config: see :class:`RunConfig`.
         plant: the real system in simulation, and the twin's physics.
@@ -57,8 +59,9 @@ class Run:
         animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
-        ValueError: before any work, if the device does not exist, the run folder cannot be written or is taken, the
-            checkpoint to resume from does not fit, or options need a plant in simulation and there is an ``env``.
+        ValueError: before any work, if the device does not exist, the run folder cannot be written, is in use or
+            holds a run, the run to resume had other options, its checkpoint is damaged or does not fit, or options
+            need a plant in simulation and there is an ``env``.
     """
 
     def __init__(
