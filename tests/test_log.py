@@ -13,7 +13,6 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.identification.resampling import hold_means, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, Log, checked, logged_signals, read_log
 from rt_torchrl.identification.simulated_log import policy_law, recorded
-from rt_torchrl.identification.units import converted
 from rt_torchrl.trajectories.rollout import Rollout
 
 pytest.importorskip("pandas"), pytest.importorskip("pint")

@@ -8,43 +8,17 @@ from pathlib import Path
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from small_runs import SMALL, small_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rt_torchrl import PlantContractError
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.long_term_memory import LongTermMemoryConfig
-from rt_torchrl.twinning.referees import RefereeConfig
-
-SMALL = TwinningConfig(
-    realisations=2,
-    virtual_episodes=2,
-    exploration=ExplorationConfig(episodes=2),
-    learner=LearnerConfig(
-        critic_iterations=3,
-        actor_iterations=3,
-        batch_size=8,
-        critic_hidden=(8,),
-        memory=LongTermMemoryConfig(capacity=500),
-    ),
-    # No patience, so that swaps and clones happen within the few episodes of a test.
-    referee=RefereeConfig(patience=0, clone_patience=0, stall=10.0),
-)
-
-
-def small_run(folder, episodes=3, **options):
-    config = RunConfig(
-        episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options
-    )
-    return Run(config, LinearQuadratic(horizon=2.0))
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):
@@ -254,7 +228,7 @@ def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
     small_run(tmp_path, episodes=1).train()
     wider = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, critic_hidden=(9,)))
-    with pytest.raises(ValueError, match="weights do not fit"):
+    with pytest.raises(ValueError, match=r"critic_hidden is \[9\] here and was \[8\] in the run"):
         Run(RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
 
 

@@ -55,6 +55,9 @@ class RealEpisodes(UnseenEpisodes):
     def fly(self, policy: nn.Module) -> Trajectory:
         return self._flown(policy, self._count)
 
+    def validation(self) -> None:
+        """None: a real episode may take hours."""
+
     def untrained_cost(self, policy: nn.Module) -> float:
         """J_a of one episode: that of a random policy is a matter of its order of size."""
         return self.judge(self._flown(policy, 1)).control_costs.mean().item()

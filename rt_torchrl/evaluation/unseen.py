@@ -16,6 +16,8 @@ from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identif
 
 UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
+VALIDATION_SEED = 2_000_000
+"""Seed of the episodes that a choice is made on whose result is reported on the unseen ones."""
 
 
 class UnseenEpisodes:
@@ -61,6 +63,17 @@ class UnseenEpisodes:
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
         """J_a of each episode."""
         return control_cost(self.plant, self.fly(policy))
+
+    def validation(self) -> "UnseenEpisodes | None":
+        """As many episodes of other draws, on the system as it is now; None where they cannot be had for nothing.
+
+        A policy that is chosen for its cost on some episodes costs less on them than it does on others.
+        """
+        device = self.initial_state.device
+        count = len(self.initial_state)
+        found = UnseenEpisodes(self.plant, count, compiled=self._compiled, device=device, seed=VALIDATION_SEED)
+        found.closure = self.closure
+        return found
 
     def untrained_cost(self, policy: nn.Module) -> float:
         """Mean J_a of one of many random initial policies."""

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import check_options
 
 Optimiser = Literal["adam", "lbfgs"]
@@ -122,6 +123,7 @@ class _Seen:
     def __call__(self) -> Tensor:
         if self.count == self._iterations:
             raise _Finished
+        safe_point()
         with torch.enable_grad():
             self._module.zero_grad(set_to_none=True)
             cost = self._cost()

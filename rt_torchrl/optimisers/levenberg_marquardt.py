@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
 
 
@@ -64,6 +65,7 @@ class LevenbergMarquardt:
         current = equations()
         start, gradient, count = current.cost.item(), current.gradient.norm().item(), 0
         while count < iterations and not current.cost < stop_below * start:
+            safe_point()
             if self._arrived(current):
                 break
             count += 1

@@ -1,6 +1,5 @@
 """A run folder read back: the plant, the trained policies and the closure, without training anything."""
 
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ from torch import nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import class_of, config_of, read_settings, require_config
+from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
+from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
 
 
@@ -83,7 +83,7 @@ def _rebuilt(
             f"{config_class.__qualname__} has no method plant() that makes the plant from its options; write one, or "
             "give load_run the plant."
         )
-    options = {key: value for key, value in settings.items() if key not in ("plant", "recipe")}
+    options = {key: value for key, value in settings.items() if key not in BESIDE}
     try:
         config = config_of(config_class, options)
         plant = config.plant() if plant is None else plant
@@ -121,7 +121,4 @@ def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:
             f"the run in {folder} has no weights.pt: it is not finished. Go on with it by --resume; Ctrl-C ends it "
             "and leaves the weights of the episodes done."
         )
-    try:
-        return torch.load(file, weights_only=True, map_location="cpu")
-    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
+    return load_tensors(file)

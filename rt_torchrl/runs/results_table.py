@@ -23,16 +23,20 @@ def results_table(metrics: dict[str, Any]) -> str:
     for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):
         rows.append((f"J_a {role.replace('_', '-')}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
     for name, before, after, ratio in rows:
-        means = f"{unseen[before]['mean']:>12.5g}{unseen[after]['mean']:>12.5g}"
-        lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{ratio:>10.3g}")
+        means = f"{_number(unseen[before]['mean'], '.5g'):>12}{_number(unseen[after]['mean'], '.5g'):>12}"
+        lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{_number(ratio, '.3g'):>10}")
     if "J_a_untrained" in unseen:
-        shares = ", ".join(f"{role.replace('_', '-')} {found[f'J_a_over_untrained_{role}']:.3g}" for role in ROLES)
-        lines.append(f"  over a random start's mean J_a of {unseen['J_a_untrained']['mean']:.4g}: {shares}")
+        shares = ", ".join(_share(role, found[f"J_a_over_untrained_{role}"]) for role in ROLES)
+        mean = _number(unseen["J_a_untrained"]["mean"], ".4g")
+        lines.append(f"  over a random start's mean J_a of {mean}: {shares}")
     if "reference" in found:
-        best, share = found["reference"]["J_a"], found["reference"]["better_over_reference"]
-        lines.append(f"  exact gradients on the true plant: J_a {best:.5g}; the better policy is at {share:.3f} of it")
+        best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
+        best, share = _number(best, ".5g"), _number(share, ".3f")
+        lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
     for name, baseline in unseen["baselines"].items():
-        lines.append(f"  {f'J_a {name}':<22}{'':>12}{baseline['J_a']['mean']:>12.5g}   {_interval(baseline['J_a'])}")
+        lines.append(
+            f"  {f'J_a {name}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
+        )
     lines += merit_lines(unseen)
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += closure_lines(found["closure"])
@@ -40,8 +44,18 @@ def results_table(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _number(value: float | None, digits: str) -> str:
+    """A number; a dash for one that is not finite, which JSON has no number for."""
+    return "-" if value is None else format(value, digits)
+
+
+def _share(role: str, value: float | None) -> str:
+    return f"{role.replace('_', '-')} {_number(value, '.3g')}"
+
+
 def _interval(found: dict[str, Any]) -> str:
-    return "[{:.4g}, {:.4g}]".format(*found["confidence_interval"])
+    low, high = (_number(end, ".4g") for end in found["confidence_interval"])
+    return f"[{low}, {high}]"
 
 
 def merit_lines(unseen: dict[str, Any]) -> list[str]:
@@ -63,18 +77,20 @@ def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
     lines = []
     for name in next(iter(columns.values())):
         values = [merit[name] for merit in columns.values()]
-        shown = (f"{v['mean']:.4g}" + (f" ({v['median']:.4g})" if "median" in v else "") for v in values)
+        shown = (
+            _number(v["mean"], ".4g") + (f" ({_number(v['median'], '.4g')})" if "median" in v else "") for v in values
+        )
         lines.append(f"    {name:<26}" + "".join(f"{text:>20}" for text in shown))
     return lines
 
 
 def closure_lines(closure: dict[str, Any]) -> list[str]:
     """Weights found, beside the true ones where the real plant has some of the same names."""
-    if not closure["found"] or not all(isinstance(value, float) for value in closure["found"].values()):
+    if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
         return []
     true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
     lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'true':>12}" if true else "")]
     for name, value in closure["found"].items():
-        known = "" if not true else f"{true[name]:>12.5g}" if name in true else f"{'-':>12}"
-        lines.append(f"  {name:<22}{closure['start'][name]:>12.5g}{value:>12.5g}{known}")
+        weights = [closure["start"][name], value, *([true.get(name)] if true else [])]
+        lines.append(f"  {name:<22}" + "".join(f"{_number(weight, '.5g'):>12}" for weight in weights))
     return lines

@@ -2,9 +2,7 @@
 
 import copy
 import functools
-import json
-import logging
-import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import Any
 
 import torch
 from matplotlib.figure import Figure
-from tqdm import tqdm
+from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
 from rt_torchrl.contract.check import check_plant
@@ -20,17 +18,22 @@ from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.real_episodes import Baseline, RealController, RealEpisodes
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, exact_optimum, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, results
+from rt_torchrl.runs.atomic_file import finite, write_json
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Dashboard
-from rt_torchrl.runs.results_table import progress, results_table
+from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
+from rt_torchrl.runs.progress import Progress
+from rt_torchrl.runs.results_table import results_table
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.runs.run_folder import RunFolder
+from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -43,6 +46,8 @@ PlantFigures = Callable[[Snapshot], dict[str, Figure]]
 
 class Run:
     """One training with everything around it.
+
+    It holds its folder from its construction to the end of :meth:`train`: no other training may write there.
 
     Args:
         config: see :class:`RunConfig`.
@@ -59,8 +64,9 @@ class Run:
     Raises:
         PlantContractError: before any work, if a plant breaks its contract; what takes seconds to find, ``check_plant``
             finds.
-        ValueError: before any work, if the device does not exist, the run folder cannot be written or is taken, the
-            checkpoint to resume from does not fit, or options need a plant in simulation and there is an ``env``.
+        ValueError: before any work, if the device does not exist, the run folder cannot be written, is in use or
+            holds a run, the run to resume had other options, its checkpoint is damaged or does not fit, or options
+            need a plant in simulation and there is an ``env``.
     """
 
     def __init__(
@@ -84,62 +90,103 @@ class Run:
             check_plant(physics, steps=CHECKED_STEPS, traced=False)
         if config.threads:
             torch.set_num_threads(config.threads)
-        logging.getLogger("torchrl").setLevel(logging.WARNING)
-        self.folder = require_folder(config, plant.name)
+        quieten_libraries()
+        self._held = RunFolder(config, plant.name)
+        self.folder = self._held.path
+        try:
+            system = simulated(plant, config, device=device, compiled=compiled) if env is None else env
+            self._make_algorithm(plant, system, believed or plant, device=device, compiled=compiled)
+            self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
+            self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
+            self.episodes: list[dict[str, Any]] = []
+            if self._held.resumes():
+                self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
+        except BaseException:
+            self._held.release()
+            raise
+
+    def _make_algorithm(
+        self, plant: Plant, env: EnvBase, physics: Plant, *, device: torch.device, compiled: bool
+    ) -> None:
+        config = self.config
         generator = torch.Generator(device=device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, plant)
         policies = {role: policy.to(device) for role, policy in config.make_policies(plant, generator).items()}
         closure = config.make_closure(plant, generator).to(device)
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
         self.algorithm = ReinforcementTwinning(
-            simulated(plant, config, device=device, compiled=compiled) if env is None else env,
-            DigitalTwin(believed or plant, closure, engine=config.engine, compiled=compiled),
+            env,
+            DigitalTwin(physics, closure, engine=config.engine, compiled=compiled),
             **policies,
-            config=self.config.twinning,
+            config=config.twinning,
             generator=generator,
         )
-        self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
-        self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
-        self.episodes: list[dict[str, Any]] = []
-        if config.resume:
-            self.episodes = checkpoint.load(self.folder / "checkpoint.pt", self.algorithm)
 
     def train(self) -> dict[str, Any]:
-        """Train, evaluate and write the results; Ctrl-C ends the training after the episodes done so far.
+        """Train, evaluate and write the results.
+
+        Ctrl-C ends the training after the iteration under way, and goes on with the episodes done so far. A second
+        one, or one after the training, leaves at once; the run can then be resumed.
 
         Returns:
             The content of ``metrics.json``.
+
+        Raises:
+            KeyboardInterrupt: if it was left at once.
+            ValueError: if another training has taken the folder since an earlier one of this object.
         """
-        settings = settings_of(self.asked, self.algorithm.twin.plant.name)
-        (self.folder / "config.json").write_text(json.dumps(settings, indent=2, default=str) + "\n")
+        self._held.hold()
+        try:
+            return self._train()
+        except KeyboardInterrupt:
+            print(f"left at once: {len(self.episodes)} episodes done are in {self.folder}, which --resume goes on with")
+            raise
+        finally:
+            self._held.release()
+
+    def _train(self) -> dict[str, Any]:
+        self._held.begin(self.config)
         dashboard = Dashboard(self.folder)
-        gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)
-        dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
-        with tqdm(total=self.config.episodes, initial=len(self.episodes), unit="episode", dynamic_ncols=True) as bar:
-            try:
-                while len(self.episodes) < self.config.episodes:
-                    self._episode(dashboard)
-                    bar.set_postfix_str(progress(self.episodes[-1]))
-                    bar.update()
-            except KeyboardInterrupt:
-                bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to leave at once)")
-        if not self.episodes:
-            raise SystemExit("interrupted before the first episode was done; nothing to report.")
-        self._drop_half_an_episode()
-        self._follow_wear()
-        flights = {role: self.unseen.fly(self.algorithm.policies[role]) for role in results.ROLES}
-        judged = results.judge(self.unseen, flights, self.baselines)
-        metrics = self._results(gap, flights, judged)
-        if self.config.figures:
-            self._draw(dashboard, judged)
+        with Progress(self.config.episodes, len(self.episodes)) as bar:
+            bar.doing("checking the gradient")
+            gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)
+            dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
+            self._all_episodes(dashboard, bar)
+            if not self.episodes:
+                raise SystemExit("interrupted before the first episode was done; nothing to report.")
+            self._drop_half_an_episode()
+            bar.doing("judging on unseen episodes")
+            self._follow_wear()
+            flights = {role: self.unseen.fly(self.algorithm.policies[role]) for role in results.ROLES}
+            judged = results.judge(self.unseen, flights, self.baselines)
+            metrics = self._results(gap, flights, judged)
+            if self.config.figures:
+                bar.doing("drawing the figures")
+                self._draw(dashboard, judged)
         dashboard.close()
         print(results_table(metrics))
         print(f"results in {self.folder}; look at them with: tensorboard --logdir {self.folder}")
         return metrics
 
-    def _episode(self, dashboard: Dashboard) -> None:
+    def _all_episodes(self, dashboard: Dashboard, bar: Progress) -> None:
+        """Those that are left, or as many of them as are done when Ctrl-C is pressed."""
+        with Interruption() as interruption:
+            try:
+                while len(self.episodes) < self.config.episodes:
+                    safe_point()
+                    self._episode(dashboard, bar)
+                    bar.episode(self.episodes[-1])
+            except BaseException as error:
+                if interruption.at_once:
+                    # Torch and TorchRL may have made another error of it.
+                    raise KeyboardInterrupt from error
+                if not isinstance(error, KeyboardInterrupt):
+                    raise
+                bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to leave at once)")
+
+    def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         live = self.algorithm.referee.live
-        record = results.episode_record(self.algorithm.episode(), episode=len(self.episodes), live=live)
+        record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes), live=live)
         record["closure"] = named_weights(self.algorithm.twin.closure)
         every = self.config.unseen_every
         if every and (len(self.episodes) + 1) % every == 0:
@@ -147,10 +194,11 @@ class Run:
             acting = self.algorithm.policies[self.algorithm.referee.live]
             record["J_a_unseen"] = self.unseen.control_costs(acting).mean().item()
         self.episodes.append(record)
-        checkpoint.save(self.folder / "checkpoint.pt", self.algorithm, self.episodes)
+        checkpoint.save(self._held.checkpoint, self.algorithm, self.episodes)
         dashboard.episode(record)
         every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
+            safe_point()
             dashboard.figures(self._figures(self._snapshot()), len(self.episodes) - 1)
 
     def _follow_wear(self) -> None:
@@ -161,7 +209,7 @@ class Run:
     def _drop_half_an_episode(self) -> None:
         """After an interrupt, go back to the end of the last whole episode."""
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
-            self.episodes = checkpoint.load(self.folder / "checkpoint.pt", self.algorithm)
+            self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
 
     def _results(self, gap: float, flights: dict[Role, Trajectory], judged: dict[str, Judged]) -> dict[str, Any]:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
@@ -172,10 +220,12 @@ class Run:
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *initial, *found)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
-        metrics = {"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary}
-        (self.folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}
-        torch.save(weights | {"closure": self.algorithm.twin.closure.state_dict()}, self.folder / "weights.pt")
+        # Not the metrics of an earlier end beside these weights: they are what says that the run is finished.
+        (self.folder / "metrics.json").unlink(missing_ok=True)
+        save_tensors(self.folder / "weights.pt", weights | {"closure": self.algorithm.twin.closure.state_dict()})
+        write_json(self.folder / "metrics.json", metrics)
         return metrics
 
     def _snapshot(self) -> Snapshot:
@@ -199,16 +249,10 @@ def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     """Run a recipe's main on its command line; what the user can mend is told in one line, without a traceback."""
     try:
         main(from_command_line(config_class))
-    except ValueError as error:
+    except (ValueError, OSError, DivergenceError) as error:
         raise SystemExit(f"error: {error}") from error
-
-
-def can_compile(device: torch.device) -> bool:
-    """Whether this machine has what torch.compile needs; if not, says on the terminal what is missing."""
-    missing = missing_for_compilation() if device.type == "cpu" else None
-    if missing:
-        print(f"This machine lacks {missing}: running without torch.compile, several times slower.")
-    return missing is None
+    except KeyboardInterrupt:
+        sys.exit(130)  # as shells report Ctrl-C
 
 
 def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:
@@ -244,42 +288,3 @@ def require_simulation(
             f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "
             "and the real system's is not known; leave them out, or give the RealSystem its closure."
         )
-
-
-def require_device(name: str) -> torch.device:
-    """The device of that name.
-
-    Raises:
-        ValueError: if there is no such device on this machine.
-    """
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device={name!r} cannot be used on this machine ({error}); use cpu.") from error
-    return device
-
-
-def require_folder(config: RunConfig, plant: str) -> Path:
-    """The run folder, created and proved writable.
-
-    Raises:
-        ValueError: if it cannot be written, or holds another run and neither resume nor overwrite is asked for.
-    """
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    folder = config.log_dir or Path("runs") / plant / f"{stamp}-seed-{config.seed}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".writable-{os.getpid()}"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(f"log_dir={folder} cannot be written ({error}); choose another with --log-dir.") from error
-    if (folder / "config.json").exists() and not (config.resume or config.overwrite):
-        raise ValueError(
-            f"log_dir={folder} holds a run already; choose another folder, or --resume it, or --overwrite it."
-        )
-    if config.overwrite:
-        for old in (*folder.glob("events.out.tfevents.*"), folder / "checkpoint.pt"):
-            old.unlink(missing_ok=True)
-    return folder

@@ -17,6 +17,10 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import PREFIX, attribute, module_of
 
 FILE = "config.json"
+RAN = "ran"
+"""Key of what ran, an entry for every start of the run."""
+BESIDE = ("plant", "recipe", RAN)
+"""Keys beside the options."""
 GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
 
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 
@@ -82,5 +83,6 @@ class LivePolicy(nn.Module):
 
     @torch.no_grad()
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        safe_point()
         command = self.policy(observation)
         return (command + self.draw_noise(command.shape)).clamp(self.low, self.high)

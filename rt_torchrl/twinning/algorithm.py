@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_map_only
 from torchrl.envs import EnvBase
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.refusal import note_refusal
@@ -98,6 +99,7 @@ class ReinforcementTwinning:
         steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
+            safe_point()
             tell(step.__name__)
             start = time.perf_counter()
             merged(report, self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())

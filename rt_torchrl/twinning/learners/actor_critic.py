@@ -13,6 +13,7 @@ from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
 from torchrl.objectives import LossModule
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
@@ -150,6 +151,7 @@ class ActorCritic(ABC):
 
     def critic_step(self) -> tuple[Tensor, Tensor, Tensor]:
         """One iteration of the critics; loss and mean |δ| for the rewards as they are, and the gradient's norm."""
+        safe_point()
         scale = self.config.reward_scale
         batch = self.memory.sample(self.batch_size)
         loss, td_error = self.critic_loss(batch)
@@ -162,6 +164,7 @@ class ActorCritic(ABC):
 
     def actor_step(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """One iteration of the policy; the mean value for the rewards as they are, and the gradient's norm."""
+        safe_point()
         loss = self.actor_loss(batch)
         self.actor_optimiser.zero_grad(set_to_none=True)
         loss.backward()

@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
@@ -103,6 +104,7 @@ class ShortHorizon:
         inputs = exogenous[:, : count * n].unflatten(1, (count, n))
         rows, norms = torch.arange(batch, device=exogenous.device), []
         for shift in range(count):
+            safe_point()
             phase = (rows + shift) % count
             start = plant.dt * n * phase.double()
             norms.append(self._window(flown.states[rows, phase * n], inputs[rows, phase], start))

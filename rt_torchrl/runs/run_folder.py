@@ -1,0 +1,131 @@
+"""The folder of one run: whose it is, who writes in it, and what of an earlier run is in it."""
+
+import os
+import time
+from pathlib import Path
+
+import filelock
+
+from rt_torchrl.runs import run_settings
+from rt_torchrl.runs.atomic_file import remove_partials
+from rt_torchrl.runs.run_config import RunConfig
+
+RESULTS = ("metrics.json", "weights.pt")
+WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
+LEFT = ("events.out.tfevents.*", "figures/*.png", "figures/animation.gif", *WRITTEN)
+"""What a run leaves, in the order in which it is removed: ``config.json`` last, because it says what the rest is of."""
+
+
+class RunFolder:
+    """A folder in which no other training writes as long as this object holds it.
+
+    The operating system lets go of it when the process ends, however that happens.
+
+    Args:
+        config: options of the run.
+        plant: name of its plant.
+
+    Raises:
+        ValueError: if the folder cannot be written, is in use, holds another run and neither ``resume`` nor
+            ``overwrite`` is asked for, or holds none that could be resumed with these options.
+    """
+
+    def __init__(self, config: RunConfig, plant: str):
+        if config.resume and config.overwrite:
+            raise ValueError(
+                "resume and overwrite exclude each other: one goes on with the run in log_dir, the other removes it."
+            )
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        self.path = config.log_dir or Path("runs") / plant / f"{stamp}-seed-{config.seed}"
+        self._config, self._plant = config, plant
+        self._require_writable()
+        # Not of a thread: a run may be made in one and trained in another.
+        self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
+        self.hold()
+        try:
+            self._require_own()
+        except BaseException:
+            self.release()
+            raise
+
+    def _require_writable(self) -> None:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            probe = self.path / f".writable-{os.getpid()}"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise ValueError(
+                f"log_dir={self.path} cannot be written ({error}); choose another with --log-dir."
+            ) from error
+
+    def hold(self) -> None:
+        """Keep other trainings out, from now on.
+
+        Raises:
+            ValueError: if one is in it.
+        """
+        if self._lock.is_locked:
+            return
+        try:
+            self._lock.acquire(timeout=0)
+        except filelock.Timeout as error:
+            raise ValueError(
+                f"log_dir={self.path} is in use by another training; wait for its end, or choose another folder."
+            ) from error
+        except OSError as error:
+            raise ValueError(f"log_dir={self.path} cannot be locked ({error}); choose another folder.") from error
+        remove_partials(self.path)
+
+    def release(self) -> None:
+        """Let others in."""
+        self._lock.release(force=True)
+
+    def _require_own(self) -> None:
+        config, path = self._config, self.path
+        if config.resume:
+            self._require_resumable()
+        elif not config.overwrite and any((path / name).exists() for name in WRITTEN):
+            raise ValueError(
+                f"log_dir={path} holds a run already; choose another folder, or --resume it, or --overwrite it."
+            )
+
+    def _require_resumable(self) -> None:
+        if not (self.path / run_settings.FILE).is_file():
+            raise ValueError(
+                f"log_dir={self.path} holds no run to resume: it has no {run_settings.FILE}. Start without --resume."
+            )
+        run_settings.require_same(self.path, self._config)
+        if not self.checkpoint.is_file() and any((self.path / name).exists() for name in RESULTS):
+            raise ValueError(
+                f"log_dir={self.path} holds a finished run without its {self.checkpoint.name}: there is nothing to go "
+                "on with. To train anew in this folder, use --overwrite."
+            )
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the checkpoint is, or will be."""
+        return self.path / "checkpoint.pt"
+
+    def resumes(self) -> bool:
+        """Whether there is a checkpoint to go on from; a run that has none yet is resumed from its beginning."""
+        if self._config.resume and not self.checkpoint.is_file():
+            print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
+        return self._config.resume and self.checkpoint.is_file()
+
+    def begin(self, effective: RunConfig) -> None:
+        """Remove what is to be overwritten, then say in ``config.json`` whose folder this is.
+
+        In this order, so that at no moment results of one run are beside the options of another.
+
+        Args:
+            effective: the options as carried out.
+
+        Raises:
+            OSError: if the folder cannot be written.
+        """
+        if self._config.overwrite:
+            for pattern in LEFT:
+                for old in self.path.glob(pattern):
+                    old.unlink(missing_ok=True)
+        run_settings.write_settings(self.path, self._config, effective, self._plant)

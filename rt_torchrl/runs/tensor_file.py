@@ -1,0 +1,90 @@
+"""Tensors in plain containers, in a file that runs no code and whose damage is noticed."""
+
+import io
+import pickle
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rt_torchrl.runs.atomic_file import write_atomically
+
+
+def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write tensors, numbers and strings in dicts, lists and tuples, as ``torch.load`` reads them too.
+
+    Raises:
+        ValueError: if there is anything else in them; it names the place.
+        OSError: see :func:`write_atomically`.
+    """
+    buffer = io.BytesIO()
+    torch.save(plain(content), buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_tensors(path: Path) -> dict[str, Any]:
+    """What :func:`save_tensors` wrote, on the CPU.
+
+    Every part of the file is compared with its checksum (CRC-32) first.
+
+    Raises:
+        ValueError: if the file is damaged, or holds anything else than tensors in plain containers, which is then not
+            built.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            torn = archive.testzip()
+    # What zipfile raises depends on the byte that is wrong; nothing but reading is in the block.
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError, zlib.error) as error:
+        raise ValueError(f"{path} is damaged, or no file of a run: {error}") from error
+    if torn is not None:
+        raise ValueError(f"{path} is damaged: part {torn!r} does not have the checksum that it was written with.")
+    try:
+        content = torch.load(path, weights_only=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        raise ValueError(
+            f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
+            f"in plain containers. {first_line(error)}"
+        ) from error
+    except (RuntimeError, EOFError, KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
+    return content
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, without the advice that torch adds to it."""
+    return f"({(str(error).splitlines() or [type(error).__name__])[0]})"
+
+
+def plain(value: Any, place: str = "") -> Any:
+    """The same in the containers and numbers of Python alone.
+
+    Raises:
+        ValueError: if a value is no tensor, number or string; it names the place.
+    """
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    if isinstance(value, torch.Tensor):
+        return value.detach().as_subclass(torch.Tensor)
+    if isinstance(value, np.generic | float | int | str):
+        return plain(value.item() if isinstance(value, np.generic) else _base(value), place)
+    if isinstance(value, Mapping):
+        return {key: plain(entry, f"{place}[{key!r}]") for key, entry in value.items()}
+    if type(value) in (list, tuple, torch.Size):
+        entries = [plain(entry, f"{place}[{k}]") for k, entry in enumerate(value)]
+        return entries if isinstance(value, list) else tuple(entries)
+    raise ValueError(
+        f"{place or 'content'} of what is to be saved is a {type(value).__name__}; a state_dict may hold tensors, "
+        "numbers and strings, in dicts, lists and tuples."
+    )
+
+
+def _base(value: float | str) -> float | str:
+    """A number or string of a derived class as one of Python's own."""
+    return next(kind(value) for kind in (float, int, str) if isinstance(value, kind))

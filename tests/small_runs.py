@@ -1,0 +1,33 @@
+"""Whole runs on the oracle plant that take seconds."""
+
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.long_term_memory import LongTermMemoryConfig
+from rt_torchrl.twinning.referees import RefereeConfig
+
+SMALL = TwinningConfig(
+    realisations=2,
+    virtual_episodes=2,
+    exploration=ExplorationConfig(episodes=2),
+    learner=LearnerConfig(
+        critic_iterations=3,
+        actor_iterations=3,
+        batch_size=8,
+        critic_hidden=(8,),
+        memory=LongTermMemoryConfig(capacity=500),
+    ),
+    # No patience, so that swaps and clones happen within the few episodes of a test.
+    referee=RefereeConfig(patience=0, clone_patience=0, stall=10.0),
+)
+
+
+def small_run(folder, episodes=3, **options):
+    config = RunConfig(
+        episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options
+    )
+    return Run(config, LinearQuadratic(horizon=2.0))
