@@ -16,6 +16,7 @@ from rt_torchrl.envs.pendulum.models import UniformRod
 from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.trajectory import Record, Rollout, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
@@ -151,6 +152,36 @@ def test_engines_agree_without_inputs():
         found = torch.autograd.grad(control_cost(plant, flown, nothing).mean(), weights)
         gradients.append(torch.cat([part.flatten() for part in found]))
     torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)  # rounding
+
+
+COMPILED = """
+import sys, torch
+sys.path.insert(0, "tests")
+from test_pendulum import Pendulum, Rollout, control_cost, seeded
+
+plant = Pendulum(horizon=0.25)
+# A window of a short horizon has a start for each realisation; lengths and numbers of realisations both change.
+for n, batch, start in ((5, 1, 0.0), (4, 3, 0.0), (3, 5, torch.arange(5.0).double())):
+    gradients = []
+    for compiled in (False, True):
+        rollout = Rollout(plant, plant.closure, plant.make_policy(seeded()), compiled=compiled)
+        state, nothing = plant.draw_initial_state(batch, seeded()), torch.zeros(batch, n, 0).double()
+        cost = control_cost(plant, rollout(state, nothing, start=start), nothing).mean()
+        found = torch.autograd.grad(cost, list(rollout.interval.policy.parameters()))
+        gradients.append(torch.cat([part.flatten() for part in found]))
+    # The same sums in another order.
+    assert (gradients[0] - gradients[1]).norm() < 1e-11 * gradients[0].norm(), (n, batch)
+print("compared")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
+def test_compiled_gradients_of_several_shapes_are_the_eager_ones():
+    """In a process of its own, because annotations that are checked at run time cannot be compiled."""
+    root = Path(__file__).parent.parent
+    done = subprocess.run([sys.executable, "-c", COMPILED], cwd=root, capture_output=True, text=True)
+    assert done.stdout.strip() == "compared", done.stderr[-3000:]
 
 
 def test_the_recipe_trains_on_gymnasium(tmp_path):
