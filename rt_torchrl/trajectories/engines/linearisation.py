@@ -6,12 +6,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from rt_torchrl.trajectories.engines.compilation import marked_dynamic, plain
+from rt_torchrl.trajectories.engines.compilation import plain
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
 PIECE = 2048
-"""Intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one number; with
-pieces of this there is one for all trajectories that are not shorter."""
+"""Intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one number;
+with pieces of this there is one for all trajectories that are not shorter."""
 
 
 def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:

@@ -26,12 +26,15 @@ from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearis
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class ParallelAdjoint:
+class Parallel:
     """See the module.
 
     Args:
         compiled: compile the two recurrences, the Jacobians and the final product.
     """
+
+    own_scheme = True
+    start_per_realisation = True
 
     def __init__(self, *, compiled: bool):
         self.march = compiled_if(compiled, march_by_scan, march)
