@@ -169,7 +169,7 @@ def test_correlation_of_residuals():
     values = noise_of(5000, 0, smooth=True)
     segments = [line_segment(np.zeros(5000))]
     # Means of neighbours share one of two numbers: 1/2, with a scatter of 1/√5000.
-    assert lag_one(segments, [torch.as_tensor(values).reshape(-1, 1)]).item() == pytest.approx(0.5, abs=0.05)
+    assert lag_one(Line(), segments, [torch.as_tensor(values).reshape(-1, 1)]).item() == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_twin_that_diverges_at_the_start_is_told():

@@ -81,6 +81,10 @@ def test_what_cannot_be_identified_is_refused(log, tmp_path, options, message):
 
 def test_what_cannot_be_recorded_is_refused(tmp_path):
     record = recipe("record_log")
-    for options, message in (({"plant": "windmill"}, "windmill"), ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5")):
+    for options, message in (
+        ({"plant": "windmill"}, "windmill"),
+        ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5"),
+        ({"plant": "wind_turbine", "states": ("rotor_speed", "foo")}, r"'wind_turbine' logs no foo; choose of"),
+    ):
         with pytest.raises(ValueError, match=message):
             record.Config(log=tmp_path / "log.csv", **options)

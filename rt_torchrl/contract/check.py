@@ -8,6 +8,7 @@ from rt_torchrl.contract.costs import costs
 from rt_torchrl.contract.draws import draws, modules
 from rt_torchrl.contract.gradients import gradients
 from rt_torchrl.contract.methods import methods
+from rt_torchrl.contract.periods import periods
 from rt_torchrl.contract.signals import signals
 from rt_torchrl.contract.stability import stability
 from rt_torchrl.contract.tracing import forward_mode, tracing
@@ -28,9 +29,9 @@ def check_plant(plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int =
 
     Looked at, on states that ``episodes`` short flights under random commands visit: signals and their ranges; shapes,
     precision and finiteness of every method under any leading dimensions; purity; draws and their generator; closures
-    and policy; that the step applies what the actuators say; costs; gradients against finite differences; forward mode
-    and one graph, as the engines and the compiler need them; and the stability of the Runge-Kutta step. A check whose
-    ground another one took away is left out.
+    and policy; that the step applies what the actuators say; costs; that a turn of a periodic state changes nothing;
+    gradients against finite differences; forward mode and one graph, as the engines and the compiler need them; and
+    the stability of the Runge-Kutta step. A check whose ground another one took away is left out.
 
     Args:
         plant: at the time step that it will be trained with.
@@ -65,7 +66,7 @@ def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, traced: bool
         calls = Calls.in_flight(plant, episodes, steps, seed)
     except FloatingPointError as error:
         return [f"step: {error}"]
-    checks = [methods, costs, stability, gradients, forward_mode, *([tracing] if traced else [])]
+    checks = [methods, costs, periods, stability, gradients, forward_mode, *([tracing] if traced else [])]
     return [text for check in checks for text in attempt(check, calls)]
 
 
