@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from rt_torchrl import Engine, Rollout, control_cost, main_of, shipped_plants
+from rt_torchrl.trajectories.rollout import refusal
 
 REFERENCE: Engine = "odeint_adjoint"
 
@@ -23,7 +24,7 @@ class Config:
         realisations: trajectories N_z.
         steps: control intervals; 0 takes the plant's whole episode.
         repeats: gradients of each engine, in turn.
-        engines: the engines; the ratio is to the last one.
+        engines: the engines; one that cannot roll the plant out is left out, and the ratio is to the last of the rest.
         compiled: compile each engine.
         eager: engines that are left uncompiled all the same, such as odeint_adjoint as torchdiffeq has it.
         threads: number of CPU threads; 0 leaves torch's default.
@@ -55,7 +56,7 @@ def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
     initial_state = plant.draw_initial_state(config.realisations, generator)
     exogenous = plant.draw_exogenous(config.realisations, generator)[:, : config.steps or plant.n_steps]
     rollout = Rollout(plant, closure, policy, engine=engine, compiled=config.compiled and engine not in config.eager)
-    weights = [*closure.parameters(), *policy.parameters()]
+    weights = [w for w in (*closure.parameters(), *policy.parameters()) if w.requires_grad]
 
     def compute() -> torch.Tensor:
         cost = control_cost(plant, rollout(initial_state, exogenous)).mean()
@@ -64,10 +65,28 @@ def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
     return compute
 
 
+def sorted_out(config: Config) -> tuple[list[Engine], dict[Engine, str]]:
+    """The engines that can roll the plant out, and why the others cannot.
+
+    Raises:
+        ValueError: if none can.
+    """
+    plant = shipped_plants()[config.plant]()
+    reasons = {engine: refusal(engine, plant) for engine in config.engines}
+    left_out = {engine: reason for engine, reason in reasons.items() if reason}
+    able = [engine for engine in reasons if engine not in left_out]
+    if not able:
+        raise ValueError(f"engines={config.engines}: none of them can be timed. {' '.join(left_out.values())}")
+    return able, left_out
+
+
 def main(config: Config) -> None:
     if config.threads:
         torch.set_num_threads(config.threads)
-    functions = {engine: gradient(config, engine) for engine in config.engines}
+    able, left_out = sorted_out(config)
+    for reason in left_out.values():
+        print(f"left out: {reason}")
+    functions = {engine: gradient(config, engine) for engine in able}
     found = {engine: compute() for engine, compute in functions.items()}  # compiles
     seconds: dict[str, list[float]] = {engine: [] for engine in functions}
     for _ in range(config.repeats):
@@ -75,13 +94,13 @@ def main(config: Config) -> None:
             start = time.perf_counter()
             compute()
             seconds[engine].append(time.perf_counter() - start)
-    last = config.engines[-1]
+    last = able[-1]
     medians = {engine: statistics.median(values) for engine, values in seconds.items()}
     gaps = {engine: ((g - found[last]).norm() / found[last].norm()).item() for engine, g in found.items()}
     for engine, median in medians.items():
         print(f"{engine:<15} {median:10.3f} s   {medians[last] / median:8.1f} times faster   gap {gaps[engine]:.1e}")
     if config.output:
-        result = {"seconds": seconds, "medians": medians, "gaps": gaps}
+        result = {"seconds": seconds, "medians": medians, "gaps": gaps, "left_out": left_out}
         config.output.write_text(json.dumps(result, indent=2) + "\n")
 
 

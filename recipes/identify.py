@@ -108,7 +108,7 @@ def main(config: Config) -> None:
     training, held_out = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
-    steps = sum(len(segment.record.actions) for segment in parts.segments)
+    steps = sum(len(segment.actions) for segment in parts.segments)
     wanted = steps >= 500 if config.compiled is None else config.compiled
     measured = measured_states(plant, log)
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
@@ -154,13 +154,13 @@ def metrics_of(plant: Plant, measured: list[int], found: Identified, parts: Resa
         name: {key: value if math.isfinite(value) else None for key, value in entry.items()}
         for name, entry in found.weights.items()
     }
-    described = parts._asdict() | {"segments": [(s.start, len(s.record.actions)) for s in parts.segments]}
+    described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
     return summary | {"log": described}
 
 
 def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
     """What became of the log, for the terminal."""
-    steps = [len(segment.record.actions) for segment in parts.segments]
+    steps = [len(segment.actions) for segment in parts.segments]
     lines = [
         f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%}), resampled to {sum(steps)} intervals of "
         f"{plant.dt:g} s in {len(steps)} segments"

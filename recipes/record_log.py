@@ -35,7 +35,8 @@ class Config:
         states: names of the states that are logged; by default all.
         seed: of the episode and of a policy's first weights.
         horizon: length of the episode [s]; by default the plant's.
-        jitter: greatest difference of a control interval from dt, as a share of dt.
+        jitter: greatest difference of a control interval from dt, as a share of dt; by default 0.4, or 0 for a plant
+            with a scheme of its own.
         noise: standard deviation of the sensors of the states, as a share of what they read.
         gap: share of the log that is missing from its middle on.
     """
@@ -48,7 +49,7 @@ class Config:
     states: tuple[str, ...] = ()
     seed: int = 0
     horizon: float | None = None
-    jitter: float = 0.4
+    jitter: float | None = None
     noise: float = 0.005
     gap: float = 0.02
 
@@ -64,12 +65,18 @@ class Config:
             raise ValueError(f"law='classical': of {self.plant!r} no classical controller is known; use policy.")
         if not 0.0 <= self.gap < 0.5:
             raise ValueError(f"gap={self.gap} must lie in [0, 0.5), a share of the log.")
+        known = [state.name for state in logged_states(make_plant(self))]
+        unknown = [name for name in self.states if name not in known]
+        if unknown:
+            raise ValueError(f"states={self.states}: {self.plant!r} logs no {', '.join(unknown)}; choose of {known}.")
 
 
 def main(config: Config) -> None:
     plant, generator = make_plant(config), torch.Generator().manual_seed(config.seed)
     law = law_of(config, plant, generator)
-    log = with_gap(recorded(plant, law, generator, jitter=config.jitter, noise=config.noise), config.gap)
+    default = 0.0 if plant.own_scheme else 0.4
+    jitter = default if config.jitter is None else config.jitter
+    log = with_gap(recorded(plant, law, generator, jitter=jitter, noise=config.noise), config.gap)
     log = log.without([s.name for s in logged_states(plant) if config.states and s.name not in config.states])
     log.write(config.log)
     print(f"{len(log.times)} rows of plant {plant.name!r} in {config.log}: {', '.join(log.columns)}")

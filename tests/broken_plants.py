@@ -1,5 +1,7 @@
 """Plants that break the contract, each in one way, and what the check is to say of it."""
 
+import dataclasses
+
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
@@ -226,6 +228,16 @@ class Late(LinearQuadratic):
         return 2.0 * cost if t.max() > 100.0 else cost
 
 
+class Unwrapped(LinearQuadratic):
+    """Its position is the angle of a motor, which its cost takes for a length."""
+
+    states = (dataclasses.replace(LinearQuadratic.states[0], low=-9.0, high=9.0, periodic=True), SPEED)
+
+
+class PeriodicForce(LinearQuadratic):
+    actions = (dataclasses.replace(LinearQuadratic.actions[0], periodic=True),)
+
+
 TRACED = {Branching: "vector_field: is not one graph: .*if \\(state", Late: "running_cost: is not one graph: "}
 """Found by tracing alone."""
 BROKEN = {
@@ -253,6 +265,8 @@ BROKEN = {
     Profit: r"running_cost: is -0.\d+ at state .*expected no negative cost",
     Biased: "discrepancy: is 0.01 between a state and itself",
     OtherAction: r"step: its applied action is not what actuate\(state, command\) gives",
+    Unwrapped: "discrepancy: its cost changes by up to .* when state 'position' turns by its period 18 m; use its",
+    PeriodicForce: "actions: 'force' is periodic; only a state can be: take its cosine and sine instead",
     Halving: "actuate: an applied action that is commanded again from the same state becomes another",
     DetachedState: "observe: autograd finds no dependence on state 'position'",
     DetachedWeights: "vector_field: autograd finds no dependence on closure weight 'matrix'",

@@ -30,6 +30,21 @@ def test_every_engine_is_timed_and_compared(tmp_path):
     assert found["gaps"]["parallel"] == pytest.approx(found["gaps"]["autograd"], rel=1e-6)
 
 
+def test_an_engine_that_cannot_is_left_out_and_the_others_are_timed(tmp_path, capsys):
+    """The pendulum steps by a scheme of its own, which the continuous adjoint does not know."""
+    recipe, output = runpy.run_path(str(RECIPE)), tmp_path / "result.json"
+    small = {"plant": "pendulum", "realisations": 2, "steps": 5, "repeats": 1, "compiled": False, "output": output}
+    recipe["main"](recipe["Config"](**small))
+    shown, found = capsys.readouterr().out, json.loads(output.read_text())
+    assert "left out: engine='odeint_adjoint' integrates the vector field, but plant 'pendulum'" in shown
+    assert list(found["medians"]) == ["parallel"] and list(found["left_out"]) == ["odeint_adjoint"]
+    recipe["main"](recipe["Config"](**small, engines=("odeint_adjoint", "parallel", "autograd")))
+    # Two exact gradients: rounding.
+    assert json.loads(output.read_text())["gaps"]["parallel"] < 1e-11
+    with pytest.raises(ValueError, match="none of them can be timed.*scheme of its own; use parallel or autograd"):
+        recipe["main"](recipe["Config"](**small, engines=("odeint_adjoint",)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
 def test_engines_agree_over_a_whole_episode(tmp_path, plant):

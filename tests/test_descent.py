@@ -141,6 +141,59 @@ def test_state_round_trip_continues_identically():
     assert torch.equal(first.at, second.at)
 
 
+class Cliff(Bowl):
+    """The bowl, which diverges where the second weight is below −1: in one of three ways."""
+
+    def __init__(self, point, kind):
+        super().__init__(point)
+        self.kind = kind
+
+    def __call__(self):
+        cost = super().__call__()
+        if self.point.at[1].item() >= -1.0:
+            return cost
+        if self.kind == "raises":
+            raise FloatingPointError("diverged")
+        # √0 has an infinite slope where the cost itself is finite.
+        return cost * math.nan if self.kind == "nan" else cost + 0.0 * (self.point.at - self.point.at).sum().sqrt()
+
+
+@pytest.mark.parametrize("kind", ["raises", "nan", "infinite gradient"])
+@pytest.mark.parametrize("optimiser, rate", [("adam", 0.4), ("adam", 3.0), ("lbfgs", 1.0), ("lbfgs", 100.0)])
+def test_a_step_that_diverges_is_shortened(optimiser, rate, kind):
+    """The minimum lies beyond the cliff: steps lead over it again and again, and the descent comes up to its edge."""
+    point = Point()
+    cost = Cliff(point, kind)
+    found = Descent(point, DescentConfig(optimiser=optimiser, rate=rate)).run(cost, 40)
+    assert 1 <= found.iterations == cost.with_gradient <= 40
+    over = [at[1].item() < -1.0 for _, at in cost.seen]
+    assert any(over) and not all(over)
+    # Of the weights after the last step only the cost is asked for, which may be finite where its gradient is not.
+    last = range(cost.with_gradient, len(over) if kind == "infinite gradient" else 0)
+    sound = [pair for k, pair in enumerate(cost.seen) if k in last or not over[k]]
+    best, where = min(sound, key=lambda pair: pair[0])
+    assert found.best == best and torch.equal(point.at.detach(), where)
+    # At the edge ½·4·1² = 2 is left of 9.75; half a step from the edge may be left beside it.
+    assert found.start == pytest.approx(9.75) and found.best < 6.0
+
+
+@pytest.mark.parametrize("kind", ["raises", "nan", "infinite gradient"])
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_a_cost_that_diverges_at_the_start_raises(optimiser, kind):
+    point = Point((0.0, -1.5, 0.0))
+    with pytest.raises(FloatingPointError, match="diverged" if kind == "raises" else "cost=.* is not finite"):
+        Descent(point, DescentConfig(optimiser=optimiser)).run(Cliff(point, kind), 5)
+
+
+def test_halving_a_step_of_adam_by_hand():
+    """Adam's first step has the length of its rate: 0 → −3 is over the cliff at −1, −1.5 still, −0.75 is not."""
+    point = Point()
+    cost = Cliff(point, "raises")
+    Descent(point, DescentConfig(rate=3.0)).run(cost, 4)
+    # ε = 1e-8 of Adam beside relative gradients of 0.1 and more.
+    assert [at[1].item() for _, at in cost.seen[:4]] == pytest.approx([0.0, -3.0, -1.5, -0.75], rel=1e-6)
+
+
 @pytest.mark.parametrize(
     "change", [{"optimiser": "sgd"}, {"rate": 0.0}, {"gradient_limit": math.nan}, {"second_moment": 1.0}]
 )

@@ -36,7 +36,7 @@ def test_samples_have_the_mean_and_covariance_of_the_model():
     found = process(autoregressive(400, 0.8))
     count = 20_000
     small = found.sample(count, seeded(1))[..., 0] - found.mean[:, 0]
-    model = found.covariance[:, 0]
+    model = found.covariance[:, 0, 0]
     # Five standard errors: of a mean √(C_0/N), of a covariance at most √(2/N) C_0.
     assert small.mean(0).abs().max() < 5 * (model[0] / count).sqrt()
     for lag in (0, 1, 3, 10, 50, 99, 150, 399):
@@ -51,14 +51,14 @@ def test_covariance_is_that_of_the_residual():
     lags = torch.arange(6, dtype=torch.float64)
     # The block means that the large scale follows hold 3ish/48 of the variance; estimating adds 2 % (14 400 samples
     # with a correlation time of 3): 10 % of the variance.
-    torch.testing.assert_close(found.covariance[:6, 0], 4.0 * 0.5**lags, rtol=0, atol=0.4)
+    torch.testing.assert_close(found.covariance[:6, 0, 0], 4.0 * 0.5**lags, rtol=0, atol=0.4)
 
 
 @pytest.mark.parametrize("n", [8, 9, 100, 1201])
 def test_spectrum_of_the_embedding_is_not_negative(n):
     """The embedding is a covariance: its eigenvalues, the FFT of the circulant, are not negative but for rounding."""
     found = process(autoregressive(n, 0.9, seed=n))
-    C = found.covariance[:, 0].numpy()
+    C = found.covariance[:, 0, 0].numpy()
     circulant = np.concatenate([C, [0.0], C[:0:-1]])
     assert len(circulant) == 2 * n
     eigenvalues = np.fft.fft(circulant)
@@ -77,9 +77,9 @@ def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
     assert np.sqrt(np.mean(error**2)) < 0.1
     # White noise remains. Blocks of four hold a quarter of its variance, which bounds what the regression can take;
     # the variance itself is known to √(2/1200) = 4 %, two of them.
-    assert 0.75 - 0.08 < found.covariance[0, 0].item() / 0.04 < 1.08
+    assert 0.75 - 0.08 < found.covariance[0, 0, 0].item() / 0.04 < 1.08
     # What is taken turns up, with its sign turned, at the neighbours: at most that quarter.
-    assert found.covariance[1:4, 0].abs().max() < (0.25 + 0.08) * 0.04
+    assert found.covariance[1:4, 0, 0].abs().max() < (0.25 + 0.08) * 0.04
 
 
 def test_constant_input_stays_constant():
@@ -95,12 +95,48 @@ def test_samples_are_held_within_the_physical_range():
     assert drawn[..., 1].min() < -2.0 and drawn[..., 1].max() > 2.0
 
 
-def test_components_are_independent_and_samples_differ():
+def bivariate(n, rho, lag, correlation, seed=0):
+    """Two processes of covariance ρ^|h|, the second ``lag`` samples behind a process that correlates with the first."""
+    first, other = autoregressive(n + lag, rho, seed), autoregressive(n + lag, rho, seed + 1)
+    second = correlation * first + math.sqrt(1.0 - correlation**2) * other
+    return np.stack([first[lag:], 3.0 * second[:n]], -1)
+
+
+LAGS = (-8, -4, -1, 0, 1, 4, 8)
+
+
+def cross_covariance(found, h):
+    """Of the first component, h samples later, and the second."""
+    return (found.covariance[abs(h)] if h >= 0 else found.covariance[abs(h)].T)[0, 1].item()
+
+
+@pytest.mark.parametrize("correlation", [0.8, -0.5, 0.0])
+@pytest.mark.parametrize("lag", [0, 4])
+def test_components_keep_their_correlation(correlation, lag):
+    """E ε_0(t + h) ε_1(t) of a known bivariate process; fast beside the knots."""
+    found = process(bivariate(14_400, 0.5, lag, correlation), FREE * 2)
+    size = found.covariance[0].diagonal().prod().sqrt().item()
+    for h in LAGS:
+        # What the block means take of the residual, and the estimation, as for one component above.
+        assert cross_covariance(found, h) / size == pytest.approx(correlation * 0.5 ** abs(h + lag), abs=0.1), h
+
+
+def test_samples_have_the_cross_covariances_of_the_model():
+    found, count = process(bivariate(200, 0.7, 4, 0.8), FREE * 2), 10_000
+    small = (found.sample(count, seeded(1)) - found.mean)[:, 100:120]
+    size = found.covariance[0].diagonal().prod().sqrt().item()
+    for h in LAGS:
+        estimate = (small[:, 8 + h, 0] * small[:, 8, 1]).mean().item()
+        # Five standard errors of a mean of products, at most √2 of the product of the deviations.
+        assert abs(estimate - cross_covariance(found, h)) < 5.0 * math.sqrt(2.0 / count) * size, h
+    assert cross_covariance(found, -4) > 0.4 * size > 10.0 * math.sqrt(2.0 / count) * size
+
+
+def test_two_equal_components_stay_equal_and_samples_differ():
     base = autoregressive(300, 0.3)
-    drawn = process(np.stack([base, base], -1), FREE * 2).sample(2000, seeded())
-    centred = drawn - drawn.mean(0)
-    correlation = (centred[:, 100, 0] * centred[:, 100, 1]).mean() / centred[:, 100].square().mean()
-    assert correlation.abs() < 5 / math.sqrt(2000)
+    drawn = process(np.stack([base, base], -1), FREE * 2).sample(3, seeded())
+    # The spectrum is singular: rounding is its root's, 1e-8 of the deviation.
+    torch.testing.assert_close(drawn[..., 0], drawn[..., 1], rtol=0, atol=1e-6)
     assert not torch.equal(drawn[0], drawn[1])
 
 
@@ -117,7 +153,7 @@ def test_a_record_of_14_400_points_needs_no_dense_matrix():
     drawn = found.sample(2, seeded())
     assert drawn.shape == (2, 14_400, 1) and drawn.isfinite().all()
     # Time averages of one path; correlation time of 19 steps: 760 independent values, 5 % of a variance, five of them.
-    assert (drawn - found.mean).var().item() == pytest.approx(found.covariance[0, 0].item(), rel=0.25)
+    assert (drawn - found.mean).var().item() == pytest.approx(found.covariance[0, 0, 0].item(), rel=0.25)
 
 
 @pytest.mark.parametrize(

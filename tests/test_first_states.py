@@ -26,7 +26,7 @@ def assimilation(plant, closure, **options):
 def lines():
     """Two noisy records of a line, each with its own start and wind."""
     times = 0.1 * np.arange(101)
-    return [line_segment(3.0 + (0.4 + 0.2 * z) * times + noise_of(101, k), wind=z).record for k, z in enumerate(WINDS)]
+    return [line_segment(3.0 + (0.4 + 0.2 * z) * times + noise_of(101, k), wind=z) for k, z in enumerate(WINDS)]
 
 
 def test_weights_are_those_of_a_regression_with_a_start_for_each_record():
@@ -50,7 +50,7 @@ def test_nothing_is_drawn_from_a_record_without_noise():
     plant = LinearQuadratic()
     (segment,) = flown(plant, torch.Generator().manual_seed(0), (50,))
     closure = plant.make_closure(torch.Generator().manual_seed(1))
-    found = assimilation(plant, closure).update([segment.record], [], 1, torch.Generator())
+    found = assimilation(plant, closure).update([segment], [], 1, torch.Generator())
     assert found.best < 1e-20 * found.start
     # The loop ends at steps of 1e-9, or where little is left to gain.
     torch.testing.assert_close(closure.matrix, torch.tensor(plant.true_closure).double(), rtol=0, atol=1e-7)

@@ -15,6 +15,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP, mlp
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.engines import linearisation
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
@@ -187,6 +188,28 @@ def test_continuous_adjoint_of_a_linear_system_is_exact_but_for_the_weights():
     exact, reference = case.gradients("parallel"), case.gradients("odeint_adjoint")
     for name in ("initial_state", "exogenous", "command"):
         assert relative_gap(reference[name], exact[name]) < 1e-13, name  # rounding
+
+
+@pytest.mark.parametrize("driver", ["perceptron", "commands"])
+def test_products_are_made_in_pieces(driver, monkeypatch):
+    """A tape of at most 50 intervals at a time, of 160 in all; the gradients are those of one piece, and exact."""
+    case, seen = Case(PLANTS["linear_quadratic"](), "perceptron", driver, 4), []
+    whole = case.gradients("parallel")
+    monkeypatch.setattr(linearisation, "PIECE", 50)
+    step = case.plant.step
+
+    def counted(t, state, *rest):
+        seen.append(state.shape[:-1].numel() if torch.is_grad_enabled() else 0)
+        return step(t, state, *rest)
+
+    monkeypatch.setattr(case.plant, "step", counted)
+    cut = case.gradients("parallel")
+    assert max(seen) == 40 and seen.count(40) >= 4
+    monkeypatch.undo()
+    for name, gradient in case.gradients("autograd").items():
+        assert torch.equal(cut[name], whole[name]) or relative_gap(cut[name], whole[name]) < 1e-13, name  # rounding
+        # The same derivatives summed in another order, as above.
+        assert relative_gap(cut[name], gradient) < 1e-10, name
 
 
 COMPARISON = """

@@ -63,7 +63,7 @@ def test_a_segment_is_replayed_on_the_plants_clock():
             InitialStates([segment], (), torch.ones(4).double()),
         )
         (replayed,) = misfit.replays()
-        errors.append((replayed.states - second.record.states).abs().max().item())
+        errors.append((replayed.states - second.states).abs().max().item())
     assert errors[0] < 1e-12 < 1e-4 < errors[1]
 
 
@@ -157,7 +157,7 @@ def test_actions_that_the_actuators_would_not_apply_are_told():
     plant = WindTurbine(horizon=20.0)
     (segment,) = flown(plant, torch.Generator().manual_seed(0), (40,))
     assert held_back(plant, [segment]) == {"generator_torque": 0.0, "blade_pitch": 0.0}
-    states, exogenous, actions = segment.record
+    states, actions, exogenous, _ = segment
     jump = actions.clone()
     jump[20:, 1] += 10.0
     # The states remember what was applied before: the pitch may move by 4 deg, and only at step 20 it moved by more;
@@ -170,7 +170,7 @@ def test_correlation_of_residuals():
     values = noise_of(5000, 0, smooth=True)
     segments = [line_segment(np.zeros(5000))]
     # Means of neighbours share one of two numbers: 1/2, with a scatter of 1/√5000.
-    assert lag_one(segments, [torch.as_tensor(values).reshape(-1, 1)]).item() == pytest.approx(0.5, abs=0.05)
+    assert lag_one(Line(), segments, [torch.as_tensor(values).reshape(-1, 1)]).item() == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_twin_that_diverges_at_the_start_is_told():

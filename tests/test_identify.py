@@ -127,7 +127,7 @@ def test_what_cannot_be_recorded_is_refused(tmp_path):
     for options, message in (
         ({"plant": "windmill"}, "windmill"),
         ({"plant": "wind_turbine", "gap": 0.5}, "gap=0.5"),
-        ({"plant": "wind_turbine", "states": ("foo",)}, r"states=\['foo'\].*choose of rotor_speed"),
+        ({"plant": "wind_turbine", "states": ("rotor_speed", "foo")}, r"states=\['foo'\].*choose of rotor_speed"),
         ({"plant": "wind_turbine", "law": "random"}, "law='random' does not exist; choose classical or policy"),
     ):
         with pytest.raises(ValueError, match=message):

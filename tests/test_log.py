@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ import torch
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.identification import resampling
 from rt_torchrl.identification.resampling import hold_means, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, Log, checked, logged_signals, read_log
 from rt_torchrl.identification.simulated_log import policy_law, recorded
@@ -257,6 +260,55 @@ def test_the_turbine_completes_its_filters():
 def test_remembered_actions_have_no_column_of_their_own():
     names = [signal.name for signal in logged_signals(WindTurbine(horizon=10.0))]
     assert names.count("generator_torque") == names.count("blade_pitch") == 1
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_a_periodic_state_is_interpolated_across_its_seam(counted):
+    """A rod that turns steadily, by 0.3 rad between rows, of a sensor that wraps or counts the turns."""
+    plant, times = Pendulum(), jittered(120, dt=0.05)
+    turned = 3.0 + 6.0 * times
+    angle = turned if counted else np.arctan2(np.sin(turned), np.cos(turned))
+    columns = {"angle": angle, "angular_speed": np.full(120, 6.0), "torque": np.zeros(120)}
+    log = checked(Log(times=times, columns=columns), plant)
+    (segment,) = resample(log, plant).segments
+    found = segment.states[:, 0].numpy()
+    expected = 3.0 + 6.0 * 0.05 * np.arange(len(found))
+    # Linear in time: rounding of angles up to 40.
+    assert np.abs(np.arctan2(np.sin(found - expected), np.cos(found - expected))).max() < 1e-12
+    assert (np.abs(found) <= math.pi).all() and segment.exogenous.shape == (len(found) - 1, 0)
+
+
+def test_what_the_recorder_writes_of_a_plant_with_its_own_scheme():
+    """The plant's own steps, without inputs; its noisy angles are read again, and in range."""
+    plant = Pendulum()
+    policy = plant.make_policy(torch.Generator().manual_seed(0))
+    log = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(0))
+    start = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure, policy)(start, torch.zeros(1, plant.n_steps, 0).double())
+    # The same steps, of an angle that was wrapped once more: rounding over 200 steps.
+    for k, state in enumerate(plant.states):
+        np.testing.assert_allclose(log.columns[state.name], flown.states[0, :, k].numpy(), rtol=0, atol=1e-9)
+    noisy = recorded(plant, policy_law(plant, policy), torch.Generator().manual_seed(0), noise=0.05)
+    assert np.abs(noisy.columns["angle"]).max() <= math.pi and checked(noisy, plant) is noisy
+    with pytest.raises(ValueError, match="jitter=0.4: plant 'pendulum' steps by a scheme of its own.*jitter=0"):
+        recorded(plant, policy_law(plant, policy), torch.Generator(), jitter=0.4)
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e9])
+def test_a_time_in_another_unit_is_refused_before_memory_is_taken(unit, monkeypatch):
+    """Milliseconds and nanoseconds taken for seconds; of the latter the grid alone would have 10¹² points."""
+    monkeypatch.setattr(resampling, "_segment", lambda *_: pytest.fail("memory is taken"))
+    step = f"{0.1 * unit:g}"
+    message = rf"'time' of the log has a median step of {re.escape(step)} s.*236 rows would become \d+ .*dt=0.1 s"
+    with pytest.raises(ValueError, match=message):
+        resample(signals(0.1 * unit * np.arange(236)), PLANT)
+
+
+def test_a_slow_log_is_still_taken():
+    """Twenty control intervals between rows are what a slow sensor gives."""
+    (segment,) = resample(signals(2.0 * np.arange(20)), PLANT).segments
+    assert len(segment.actions) == 380
 
 
 def test_a_recorder_without_jitter_writes_the_plants_own_trajectory():

@@ -1,6 +1,7 @@
 """Rollouts and costs against the matrix exponential and closed forms; what is refused."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 from torch import nn
 
+from rt_torchrl.trajectories import rollout as trajectory
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -182,6 +184,12 @@ def test_single_precision_states_are_refused():
     plant = LinearQuadratic()
     with pytest.raises(ValueError, match=r"initial_state has shape \(1, 2\) and dtype torch\.float32.*torch\.float64"):
         Rollout(plant, plant.closure)(torch.zeros(1, 2), *(torch.zeros(1, 5, 1).double() for _ in "zc"))
+
+
+@pytest.mark.parametrize("name, engine", trajectory.ENGINES.items())
+def test_an_engine_is_named_as_its_class_and_says_what_it_takes(name, engine):
+    assert re.sub("(?<!^)(?=[A-Z])", "_", engine.__name__).lower() == name
+    assert engine.own_scheme == engine.start_per_realisation == (name != "odeint_adjoint")
 
 
 @pytest.mark.parametrize("engine", ENGINES)

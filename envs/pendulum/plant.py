@@ -52,7 +52,7 @@ class Pendulum(Plant):
     hidden = (32, 32)
 
     states = (
-        Signal(symbol=r"\theta", name="angle", unit="rad", low=-math.pi, high=math.pi),
+        Signal(symbol=r"\theta", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
         Signal(symbol=r"\dot\theta", name="angular_speed", unit="rad/s", low=-8.0, high=8.0),
     )
     actions = (Signal(symbol="u", name="torque", unit="N m", low=-2.0, high=2.0),)

@@ -9,6 +9,7 @@ from rt_torchrl.contract.costs import costs
 from rt_torchrl.contract.draws import draws, modules
 from rt_torchrl.contract.gradients import gradients
 from rt_torchrl.contract.methods import methods
+from rt_torchrl.contract.periods import periods
 from rt_torchrl.contract.signals import signals
 from rt_torchrl.contract.stability import stability
 from rt_torchrl.contract.tracing import forward_mode, tracing
@@ -18,6 +19,7 @@ Check = Callable[[Calls], Iterable[str]]
 ON_FLIGHTS: dict[str, Check] = {
     "shapes and purity": methods,
     "costs": costs,
+    "periods": periods,
     "stability of the step": stability,
     "gradients": gradients,
     "forward mode": forward_mode,
@@ -65,9 +67,9 @@ def check_plant(
 
     Looked at, on states that ``episodes`` short flights under random commands visit: signals and their ranges; shapes,
     precision and finiteness of every method under any leading dimensions; purity; draws and their generator; closures
-    and policy; that the step applies what the actuators say; costs; gradients against finite differences; forward mode
-    and one graph, as the engines and the compiler need them; and the stability of the Runge-Kutta step. A check whose
-    ground another one took away is left out.
+    and policy; that the step applies what the actuators say; costs; that a turn of a periodic state changes nothing;
+    gradients against finite differences; forward mode and one graph, as the engines and the compiler need them; and
+    the stability of the Runge-Kutta step. A check whose ground another one took away is left out.
 
     Args:
         plant: at the time step that it will be trained with.

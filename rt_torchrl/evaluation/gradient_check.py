@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.trajectories.rollout import Engine, Rollout
+from rt_torchrl.trajectories.rollout import Engine, Rollout, refusal
 from rt_torchrl.trajectories.trajectory import control_cost
 
 STEPS = 40
@@ -14,9 +14,12 @@ def engine_gap(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes) ->
     """Relative gap ‖g_parallel − g_reference‖/‖g_reference‖ of dJ_a over closure and policy weights.
 
     The reference is ``odeint_adjoint``, or ``autograd`` for a plant with a scheme of its own. Over a short horizon and
-    two episodes, eager, so that it costs seconds and not minutes.
+    two episodes, eager, so that it costs seconds and not minutes. Weights that are not trained are left out.
+
+    Raises:
+        ValueError: if no weight of the closure or the policy is trained.
     """
-    slow: Engine = "autograd" if unseen.plant.own_scheme else "odeint_adjoint"
+    slow: Engine = "autograd" if refusal("odeint_adjoint", unseen.plant) else "odeint_adjoint"
     fast, reference = (_gradient(closure, policy, unseen, engine) for engine in ("parallel", slow))
     return ((fast - reference).norm() / reference.norm()).item()
 
@@ -24,6 +27,11 @@ def engine_gap(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes) ->
 def _gradient(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes, engine: Engine) -> Tensor:
     initial_state, exogenous = unseen.initial_state[:2], unseen.exogenous[:2, :STEPS]
     flown = Rollout(unseen.plant, closure, policy, engine=engine)(initial_state, exogenous)
-    weights = [*closure.parameters(), *policy.parameters()]
+    weights = [w for w in (*closure.parameters(), *policy.parameters()) if w.requires_grad]
+    if not weights:
+        raise ValueError(
+            f"closure {type(closure).__name__} and policy {type(policy).__name__} have no weight that is trained, so "
+            "there is no gradient to check; set requires_grad of at least one."
+        )
     gradient = torch.autograd.grad(control_cost(unseen.plant, flown).mean(), weights)
     return torch.cat([part.flatten() for part in gradient])

@@ -16,6 +16,7 @@ from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -112,7 +113,7 @@ class Identification:
             name: {"before": start[name], "after": value, "standard_error": errors[name]}
             for name, value in coefficients(closure).items()
         }
-        autocorrelation = lag_one(training, after[0].states)
+        autocorrelation = lag_one(self.twin.plant, training, after[0].states)
         return Identified(weights, *zip(before, after, strict=True), autocorrelation, done)
 
     def judge(self, segments: Sequence[Trajectory]) -> Judgement:
@@ -124,7 +125,7 @@ class Identification:
         states = [replayed.states for replayed in misfit.replays()]
         measured = [segment.states for segment in segments]
         J_p = sum(plant.dt * plant.discrepancy(s, m).sum().item() for s, m in zip(states, measured, strict=True))
-        error = torch.cat(states) - torch.cat(measured)
+        error = differences(plant.states, torch.cat(states), torch.cat(measured))
         seconds = plant.dt * sum(len(m) for m in measured)
         return Judgement(J_p, seconds, (error**2).mean(0).sqrt(), states)
 
@@ -170,9 +171,10 @@ def coefficients(closure: nn.Module) -> dict[str, float]:
     return {name: value.item() for name, value in named_values(closure).items()}
 
 
-def lag_one(segments: Sequence[Trajectory], states: Sequence[Tensor]) -> Float[Tensor, " n_s"]:
+def lag_one(plant: Plant, segments: Sequence[Trajectory], states: Sequence[Tensor]) -> Float[Tensor, " n_s"]:
     """Correlation of the residuals of neighbouring samples; nan for a state without residuals."""
-    residuals = [s - segment.states for s, segment in zip(states, segments, strict=True)]
+    pairs = zip(states, segments, strict=True)
+    residuals = [differences(plant.states, found, segment.states) for found, segment in pairs]
     products = sum((r[1:] * r[:-1]).sum(0) for r in residuals)
     return products / sum((r**2).sum(0) for r in residuals)
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -61,7 +62,8 @@ class InitialStates(nn.Module):
             return cls.as_measured(segments)
         fixed = Misfit(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
         measured = torch.cat([segment.states for segment in segments])
-        residual = (torch.cat([replayed.states for replayed in fixed.replays()]) - measured).square().mean(0).sqrt()
+        replayed = torch.cat([found.states for found in fixed.replays()])
+        residual = differences(twin.plant.states, replayed, measured).square().mean(0).sqrt()
         # A residual of zero would leave no unit to measure an offset in.
         return cls(segments, free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
 

@@ -2,7 +2,8 @@ r"""From a log at irregular instants to records at a plant's control intervals.
 
 A plant is sampled-data. Its states are instantaneous, so they are interpolated linearly at :math:`t_k`. Its actions and
 exogenous inputs are held over an interval, so the one of :math:`[t_k, t_{k+1}]` is the mean over that interval of what
-the log held, which keeps the impulse of a force and the energy of a load whatever the instants were.
+the log held, which keeps the impulse of a force and the energy of a load whatever the instants were. A periodic state
+is interpolated the short way round: between two rows it turns by less than half a turn.
 """
 
 from collections.abc import Sequence
@@ -14,10 +15,13 @@ from jaxtyping import Float
 
 from rt_torchrl.identification.sensor_log import Log, logged_states
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 GAP_INTERVALS = 3.0
 """Sampling intervals after which a pause counts as a gap, unless a limit is stated."""
+INTERVALS_PER_ROW = 50
+"""Control intervals for each row of a log beyond which its time has another unit, or nothing is known between rows."""
 ROUNDING = 1e-6
 """Share of an interval by which an instant may miss the grid."""
 
@@ -44,8 +48,8 @@ def resample(log: Log, plant: Plant, *, gap: float | None = None, shortest: int 
         shortest: control intervals below which a part is left out.
 
     Raises:
-        ValueError: if an argument is out of its range, no part is long enough, or states are missing that the plant
-            cannot complete.
+        ValueError: if an argument is out of its range, no part is long enough, the control intervals are far more than
+            the rows, or states are missing that the plant cannot complete.
     """
     intervals = np.diff(log.times)
     interval = float(np.median(intervals))
@@ -56,13 +60,11 @@ def resample(log: Log, plant: Plant, *, gap: float | None = None, shortest: int 
     limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
     cuts = np.flatnonzero(intervals > limit * (1.0 + ROUNDING))
     ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
-    segments, too_short = [], []
-    for first, last in ends:
-        steps = _steps(log.times[first], log.times[last], plant.dt)
-        if steps < shortest:
-            too_short.append((float(log.times[first]), float(log.times[last])))
-        else:
-            segments.append(_segment(log, slice(first, last + 1), steps, plant))
+    parts = [(first, last, _steps(log.times[first], log.times[last], plant.dt)) for first, last in ends]
+    too_short = [(float(log.times[first]), float(log.times[last])) for first, last, steps in parts if steps < shortest]
+    enough = [part for part in parts if part[2] >= shortest]
+    _require_rows(log, sum(steps for *_, steps in enough), interval, plant)
+    segments = [_segment(log, slice(first, last + 1), steps, plant) for first, last, steps in enough]
     if not segments:
         raise ValueError(
             f"log of {len(log.times)} rows has no part of {shortest} control intervals of {plant.dt:g} s without a gap "
@@ -115,6 +117,18 @@ def hold_means(
     return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
 
 
+def _require_rows(log: Log, steps: int, interval: float, plant: Plant) -> None:
+    """Refuse a log that would grow beyond all it knows, before memory is taken for it."""
+    rows = len(log.times)
+    if steps > INTERVALS_PER_ROW * rows:
+        raise ValueError(
+            f"column 'time' of the log has a median step of {interval:g} s, so that {rows} rows would become {steps} "
+            f"control intervals of plant {plant.name!r} (dt={plant.dt:g} s), more than {INTERVALS_PER_ROW} for each "
+            "row. Times are in seconds: say the unit of the column, such as --columns ms=time*1e-3; or give the twin a "
+            "longer dt."
+        )
+
+
 def _steps(first: float, last: float, dt: float) -> int:
     return int((last - first) / dt + ROUNDING)
 
@@ -123,14 +137,28 @@ def _segment(log: Log, rows: slice, steps: int, plant: Plant) -> Trajectory:
     times = log.times[rows]
     grid = times[0] + plant.dt * np.arange(steps + 1)
 
-    def held(signals) -> torch.Tensor:
-        return torch.from_numpy(np.stack([hold_means(times, log.columns[s.name][rows], grid) for s in signals], -1))
+    def held(signals: Sequence[Signal]) -> Float[torch.Tensor, "n n_held"]:
+        values = np.empty((steps, len(signals)))  # a plant may have no inputs
+        for k, signal in enumerate(signals):
+            values[:, k] = hold_means(times, log.columns[signal.name][rows], grid)
+        return torch.from_numpy(values)
 
     actions, exogenous = held(plant.actions), held(plant.inputs)
     measured = {
-        state.name: torch.from_numpy(np.interp(grid, times, log.columns[state.name][rows]))
+        state.name: torch.from_numpy(_interpolated(state, times, log.columns[state.name][rows], grid))
         for state in logged_states(plant)
         if state.name in log.columns
     }
     states = plant.complete_states(measured, exogenous, actions)
     return Trajectory(states, actions, exogenous, float(times[0]))
+
+
+def _interpolated(
+    state: Signal,
+    times: Float[np.ndarray, " rows"],
+    values: Float[np.ndarray, " rows"],
+    grid: Float[np.ndarray, " samples"],
+) -> Float[np.ndarray, " samples"]:
+    if state.periodic:
+        values = np.unwrap(values, period=state.period)
+    return state.wrapped(np.interp(grid, times, values))

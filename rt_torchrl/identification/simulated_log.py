@@ -43,6 +43,8 @@ def recorded(plant: Plant, law: Law, generator: torch.Generator, *, jitter: floa
     At t_j the loop observes and acts; action and exogenous input are held until t_{j+1}, over which the plant is
     integrated by one step. The loop acts on the true state; what is logged has the sensors' noise.
 
+    A plant with a scheme of its own knows no interval but Δt, and is recorded without jitter.
+
     Args:
         plant: its own closure is the true one.
         law: see :data:`Law`.
@@ -51,12 +53,17 @@ def recorded(plant: Plant, law: Law, generator: torch.Generator, *, jitter: floa
         noise: standard deviation of the sensors of the states, as a share of what they read.
 
     Raises:
-        ValueError: if an argument is out of its range.
+        ValueError: if an argument is out of its range, or there is jitter and the plant has a scheme of its own.
     """
     if not 0.0 <= jitter < 1.0:
         raise ValueError(f"jitter={jitter} must lie in [0, 1), a share of the control interval.")
     if not 0.0 <= noise < 1.0:
         raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
+    if jitter and plant.own_scheme:
+        raise ValueError(
+            f"jitter={jitter}: plant {plant.name!r} steps by a scheme of its own, which knows no interval but dt="
+            f"{plant.dt:g} s; record it with jitter=0."
+        )
     n = plant.n_steps
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64) - 0.5)
@@ -65,9 +72,12 @@ def recorded(plant: Plant, law: Law, generator: torch.Generator, *, jitter: floa
     rows = []
     for k in range(n + 1):
         z = exogenous[:, min(k, n - 1)]
-        applied = plant.actuate(state, law(times[k], state, z))
+        command = law(times[k], state, z)
+        applied = plant.actuate(state, command)
         rows.append(torch.cat([state, applied, z], -1))
-        if k < n:
+        if k < n and plant.own_scheme:
+            state = plant.step(times[k], state, command, z, plant.closure).state
+        elif k < n:
             state = _held(plant, times[k], state, applied, z, (times[k + 1] - times[k]).item())
     return _log(plant, times, torch.cat(rows), generator, noise)
 
@@ -85,4 +95,5 @@ def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, 
     own = {signal.name for signal in logged_states(plant)}
     signals = (*plant.states, *plant.actions, *plant.inputs)
     chosen = {s.name: k for k, s in enumerate(signals) if k >= n_s or s.name in own}
-    return Log(times=times.numpy(), columns={name: np.ascontiguousarray(values[:, k]) for name, k in chosen.items()})
+    columns = {name: np.ascontiguousarray(signals[k].wrapped(values[:, k])) for name, k in chosen.items()}
+    return Log(times=times.numpy(), columns=columns)

@@ -1,6 +1,7 @@
 """Gradient descent as steps 4 and 5 share it: a few steps a time, the best weights kept."""
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -58,6 +59,9 @@ class Descended(NamedTuple):
 class Descent:
     """Updates the weights of a module in place and leaves the best ones seen in it.
 
+    A step to weights where the cost diverges (it raises ``FloatingPointError``, or cost or gradient is not finite) is
+    halved until it does not; every such trial counts as an iteration.
+
     Args:
         module: holds the weights.
         config: see :class:`DescentConfig`.
@@ -82,6 +86,9 @@ class Descent:
             cost: scalar cost at the module's present weights; the same function throughout.
             iterations: number of gradients; 0 does nothing.
             stop_below: stop early once the cost is below this share of its start; 0 never does.
+
+        Raises:
+            FloatingPointError: if the cost diverges at the weights that the descent starts from.
         """
         seen = _Seen(self.module, cost, self.config, iterations, stop_below)
         try:
@@ -89,15 +96,21 @@ class Descent:
                 # Another episode has another cost: curvature of the last one would mislead the line search.
                 self.restart()
                 self._optimiser.param_groups[0].update(max_iter=iterations, max_eval=iterations)
-                self._optimiser.step(seen)
+                self._optimiser.step(seen.or_infinite)
             else:
                 for _ in range(iterations):
-                    self._optimiser.step(seen)
+                    self._adam_step(seen)
             seen.note_last()
         except _Finished:
             pass
         self.module.load_state_dict(seen.best_weights)
         return Descended(seen.start, seen.best, seen.gradient, seen.count)
+
+    def _adam_step(self, seen: "_Seen") -> None:
+        try:
+            self._optimiser.step(seen)
+        except _Diverged:
+            seen.halve_step()
 
     def state_dict(self) -> dict[str, Any]:
         return self._optimiser.state_dict()
@@ -110,6 +123,10 @@ class _Finished(Exception):
     """Leaves an optimiser that would go on."""
 
 
+class _Diverged(Exception):
+    """There is no finite cost and gradient at the present weights, which are not the first."""
+
+
 class _Seen:
     """The closure an optimiser calls: cost and gradient at the present weights, with a memory of the best."""
 
@@ -119,36 +136,81 @@ class _Seen:
         self.start = self.best = float("nan")
         self.gradient, self.count = float("nan"), 0
         self.best_weights = copy.deepcopy(module.state_dict())
+        self._weights = [w for w in module.parameters() if w.requires_grad]
+        self._sound: list[Tensor] = []  # weights of the last cost that was finite
 
     def __call__(self) -> Tensor:
         if self.count == self._iterations:
             raise _Finished
         safe_point()
+        try:
+            relative, cost, norm = self._differentiated()
+        except FloatingPointError as error:
+            if self.count == 0:
+                raise
+            self.count += 1
+            raise _Diverged from error
+        if self.count == 0:
+            self.gradient = norm * (abs(self.start) or 1.0)
+        self._sound = [w.detach().clone() for w in self._weights]
+        self._note(cost)
+        self.count += 1
+        return relative
+
+    def or_infinite(self) -> Tensor:
+        """The same for a line search, whose trials may diverge."""
+        try:
+            return self()
+        except _Diverged:
+            # Where a slope is NaN, torch's line search halves its bracket instead of interpolating.
+            for weight in self._weights:
+                weight.grad = torch.full_like(weight, float("nan"))
+            return torch.tensor(float("inf"), dtype=torch.float64)
+
+    @torch.no_grad()
+    def halve_step(self) -> None:
+        """Go half the way back to the last weights with a finite cost."""
+        for weight, sound in zip(self._weights, self._sound, strict=True):
+            weight.lerp_(sound, 0.5)
+
+    def _differentiated(self) -> tuple[Tensor, float, float]:
+        """Relative cost, cost and norm of the gradient, which is left in the weights.
+
+        Raises:
+            FloatingPointError: if one of them is not finite.
+        """
         with torch.enable_grad():
             self._module.zero_grad(set_to_none=True)
             cost = self._cost()
+            value = cost.item()
             if self.count == 0:
-                self.start = cost.item()
+                self.start = value
             # A cost that starts at zero is at its minimum; its gradient is zero too.
             relative = cost / (abs(self.start) or 1.0)
             relative.backward()
         weights = [w for w in self._module.parameters() if w.grad is not None]
         limit = self._config.gradient_limit if self._config.optimiser == "adam" else float("inf")
         norm = nn.utils.clip_grad_norm_(weights, limit).item()
-        if self.count == 0:
-            self.gradient = norm * (abs(self.start) or 1.0)
-        self._note(cost.item())
-        self.count += 1
-        return relative
+        if not (math.isfinite(value) and math.isfinite(norm)):
+            raise FloatingPointError(
+                f"cost={value:g} of {type(self._module).__name__} with a relative gradient of norm {norm:g} is not "
+                "finite; start the descent from weights whose cost and gradient are."
+            )
+        return relative, value, norm
 
     def note_last(self) -> None:
         """Consider the weights of the last step too; the optimiser has not evaluated them."""
-        if self.count:
+        if not self.count:
+            return
+        try:
             with torch.no_grad():
-                self._note(self._cost().item())
+                cost = self._cost().item()
+        except FloatingPointError:
+            return  # the best weights are others then
+        self._note(cost)
 
     def _note(self, cost: float) -> None:
-        if not cost >= self.best:
+        if cost < self.best or math.isnan(self.best):
             self.best, self.best_weights = cost, copy.deepcopy(self._module.state_dict())
         if cost < self._stop_below * self.start:
             raise _Finished

@@ -3,10 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+Values = TypeVar("Values", Tensor, np.ndarray)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +23,11 @@ class Signal:
         unit: SI unit, or the unit a correlation is defined in (``"rad/s"``, ``"deg"``, ``"-"``).
         low: least admissible value in ``unit``.
         high: greatest admissible value in ``unit``.
+        periodic: of a state that turns, such as an angle: whether its range is one turn, so that ``low`` and ``high``
+            are the same place.
+
+    Raises:
+        ValueError: if the name is no identifier, the range is empty, or a periodic signal has no finite range.
     """
 
     symbol: str
@@ -26,6 +35,7 @@ class Signal:
     unit: str
     low: float = -math.inf
     high: float = math.inf
+    periodic: bool = False
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -34,11 +44,37 @@ class Signal:
             raise ValueError(
                 f"Signal {self.name!r} has low={self.low}, high={self.high} [{self.unit}]; low must be below high."
             )
+        if self.periodic and not math.isfinite(self.period):
+            raise ValueError(
+                f"Signal {self.name!r} is periodic with low={self.low}, high={self.high} [{self.unit}]; both must be "
+                "finite, one turn apart."
+            )
+
+    @property
+    def period(self) -> float:
+        """One turn of a periodic signal, in ``unit``."""
+        return self.high - self.low
+
+    def wrapped(self, values: Values) -> Values:
+        """The same places within the range, where the signal is periodic; otherwise the values themselves."""
+        return self.low + (values - self.low) % self.period if self.periodic else values
+
+    def short_way(self, change: Values) -> Values:
+        """A change of the signal, by at most half a turn where it is periodic; otherwise the change itself."""
+        return (change + 0.5 * self.period) % self.period - 0.5 * self.period if self.periodic else change
 
     @property
     def label(self) -> str:
         r"""Axis label, such as ``rotor speed $\omega_r$ [rad/s]``."""
         return f"{self.name.replace('_', ' ')} ${self.symbol}$ [{self.unit}]"
+
+
+def differences(
+    signals: Sequence[Signal], first: Float[Tensor, "*batch n"], second: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch n"]:
+    """``first`` − ``second``, the short way round where a signal is periodic."""
+    changes = (first - second).unbind(-1)
+    return torch.stack([signal.short_way(change) for signal, change in zip(signals, changes, strict=True)], -1)
 
 
 def bounds(

@@ -17,13 +17,17 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.engines import Backpropagation, ContinuousAdjoint, ParallelAdjoint
+from rt_torchrl.trajectories.engines import Autograd, GradientEngine, OdeintAdjoint, Parallel
 from rt_torchrl.trajectories.engines.compilation import marked_dynamic, plain
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 Engine = Literal["parallel", "odeint_adjoint", "autograd"]
-ENGINES = {"parallel": ParallelAdjoint, "odeint_adjoint": ContinuousAdjoint, "autograd": Backpropagation}
+ENGINES: dict[Engine, type[GradientEngine]] = {
+    "parallel": Parallel,
+    "odeint_adjoint": OdeintAdjoint,
+    "autograd": Autograd,
+}
 
 
 class DivergenceError(FloatingPointError):
@@ -54,17 +58,14 @@ class Rollout:
         engine: Engine = "parallel",
         compiled: bool = False,
     ):
-        if engine not in ENGINES:
-            raise ValueError(f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}.")
-        if engine == "odeint_adjoint" and plant.own_scheme:
-            raise ValueError(
-                f"engine='odeint_adjoint' integrates the vector field, but plant {plant.name!r} steps by a scheme of "
-                "its own; use parallel or autograd."
-            )
+        refused = refusal(engine, plant)
+        if refused:
+            raise ValueError(refused)
         for role, module in (("closure", closure), ("policy", policy)):
             require_double(role, module)
         self.plant = plant
         self.interval = Interval(plant, closure, policy)
+        self.engine = engine
         self._engine = ENGINES[engine](compiled=compiled)
 
     def __call__(
@@ -81,7 +82,7 @@ class Rollout:
             initial_state: s_0 of each realisation.
             exogenous: z, held over each interval.
             command: actions from a record; None with a policy.
-            start: time of s_0 [s], one for all realisations or one for each; ``odeint_adjoint`` takes only the former.
+            start: time of s_0 [s], one for all realisations or one for each, of an engine that takes the latter.
 
         Raises:
             ValueError: if shapes do not fit the plant and each other, commands are given beside a policy, or the engine
@@ -89,10 +90,11 @@ class Rollout:
             DivergenceError: if a state is not finite; says which plant, realisation, time and state.
         """
         self._validate(initial_state, exogenous, command)
-        if isinstance(start, Tensor) and isinstance(self._engine, ContinuousAdjoint):
+        if isinstance(start, Tensor) and not self._engine.start_per_realisation:
+            others = " or ".join(name for name, kind in ENGINES.items() if kind.start_per_realisation)
             raise ValueError(
-                "engine='odeint_adjoint' integrates all realisations over the same span and takes no start for each; "
-                "use parallel or autograd, or whole records (segment=0)."
+                f"engine={self.engine!r} integrates all realisations over the same span and takes no start for each; "
+                f"use {others}, or whole records (segment=0)."
             )
         drive = drive_of(self.plant, exogenous, command, start=start)
         ends = self._engine.end_states(self.interval, marked_dynamic(plain(initial_state), 0), drive)
@@ -123,6 +125,19 @@ class Rollout:
                 )
             if not value.isfinite().all():
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
+
+
+def refusal(engine: Engine, plant: Plant) -> str | None:
+    """Why an engine cannot roll a plant out, for a message; None if it can."""
+    if engine not in ENGINES:
+        return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
+    if plant.own_scheme and not ENGINES[engine].own_scheme:
+        others = " or ".join(name for name, kind in ENGINES.items() if kind.own_scheme)
+        return (
+            f"engine={engine!r} integrates the vector field, but plant {plant.name!r} steps by a scheme of its own; "
+            f"use {others}."
+        )
+    return None
 
 
 def require_finite(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from rt_torchrl.options import check_options
@@ -38,11 +38,16 @@ class ExogenousConfig:
 
 
 class ExogenousProcess:
-    r"""Gaussian process of one recorded episode, :math:`\mathcal N_z(\tilde d(t), \Sigma_\varepsilon)` per component.
+    r"""Gaussian process of one recorded episode, :math:`\mathcal N_z(\tilde d(t), \Sigma_\varepsilon)`.
 
-    The large scale d̃ is a support vector regression with a Gaussian kernel (paper, eq. svr), fitted to block means of
-    the record. The residual z − d̃ is taken as stationary; its covariance is the sample autocovariance under a Parzen
-    window, which keeps it positive semi-definite, and is sampled exactly by circulant embedding.
+    The large scale d̃ of each component is a support vector regression with a Gaussian kernel (paper, eq. svr), fitted
+    to block means of the record. The residuals z − d̃ are taken as jointly stationary: components that moved together in
+    the record, at once or one after the other, do so in every realisation. Their covariances
+
+    .. math:: \Gamma_{kl}(h) = \mathrm E\,\varepsilon_k(t + h)\,\varepsilon_l(t)
+
+    are the sample covariances under a Parzen window, which keeps them positive semi-definite, and are sampled exactly
+    by circulant embedding. The large scales themselves do not vary between realisations.
 
     Args:
         record: z at every control interval.
@@ -74,12 +79,14 @@ class ExogenousProcess:
         self._low, self._high = bounds(signals, **like)
         # Columns are written in place: a plant without inputs has none to stack.
         values = record.cpu().numpy()
-        large, covariance = np.empty_like(values), np.empty_like(values)
+        large = np.empty_like(values)
         for k, column in enumerate(values.T):
             large[:, k] = _large_scale(column, config)
-            covariance[:, k] = _windowed_autocovariance(column - large[:, k])
         self.mean: Float[Tensor, "n n_z"] = torch.as_tensor(large, **like)
-        self.covariance: Float[Tensor, "n n_z"] = torch.as_tensor(covariance, **like)
+        covariance = torch.as_tensor(_windowed_covariance(values - large), **like)
+        self.covariance: Float[Tensor, "n n_z n_z"] = covariance
+        """Γ at lags 0 to n − 1; at negative ones it is its transpose."""
+        self._root = _spectral_root(covariance)
 
     def state_dict(self) -> dict[str, Tensor]:
         """What :meth:`from_state` rebuilds it from."""
@@ -90,20 +97,19 @@ class ExogenousProcess:
         """A process from its :meth:`state_dict` and the inputs that it was fitted to."""
         process = cls.__new__(cls)
         process.mean, process.covariance = state["mean"], state["covariance"]
+        process._root = _spectral_root(process.covariance)
         process._low, process._high = bounds(signals, dtype=process.mean.dtype, device=process.mean.device)
         return process
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
         """Realisations of the input, within the physical ranges of the signals."""
         n, n_z = self.mean.shape
-        # A covariance of finite support embeds exactly in a circulant twice as long, whose eigenvalues are its FFT.
-        circulant = torch.cat([self.covariance, torch.zeros_like(self.covariance[:1]), self.covariance[1:].flip(0)])
-        spectrum = torch.fft.fft(circulant, dim=0).real.clamp_min(0.0)  # rounding only: see the Parzen window
         shape = (count, 2 * n, n_z)
         noise = torch.complex(
             *(torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device) for _ in range(2))
         )
-        small = torch.fft.fft((spectrum / (2 * n)).sqrt() * noise, dim=1).real[:, :n]
+        coloured = (self._root * noise.unsqueeze(-2)).sum(-1)
+        small = torch.fft.fft(coloured, dim=1).real[:, :n]
         return (self.mean + small).clamp(self._low, self._high)
 
 
@@ -136,11 +142,27 @@ def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Fl
     return centre + spread * regression.predict(np.arange(len(values))[:, None] / block)
 
 
-def _windowed_autocovariance(residual: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Biased sample autocovariance times Parzen's window over a quarter of the record."""
-    n = len(residual)
-    spectrum = np.fft.rfft(residual - residual.mean(), 2 * n)
-    covariance = np.fft.irfft(np.abs(spectrum) ** 2, 2 * n)[:n] / n
+def _windowed_covariance(residuals: Float[np.ndarray, "n n_z"]) -> Float[np.ndarray, "n n_z n_z"]:
+    """Biased sample covariances Γ times Parzen's window over a quarter of the record."""
+    n = len(residuals)
+    spectra = [np.fft.rfft(residual - residual.mean(), 2 * n) for residual in residuals.T]
     u = np.arange(n) / max(1, n // 4)
     window = np.where(u <= 0.5, 1.0 - 6.0 * u**2 * (1.0 - u), 2.0 * np.clip(1.0 - u, 0.0, None) ** 3)
-    return covariance * window
+    found = np.empty((n, len(spectra), len(spectra)))
+    for k, first in enumerate(spectra):
+        for j, second in enumerate(spectra):
+            power = np.abs(first) ** 2 if k == j else first * second.conj()
+            found[:, k, j] = np.fft.irfft(power, 2 * n)[:n] / n * window
+    return found
+
+
+def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "samples n_z n_z"]:
+    """Hermitian roots of the spectrum of the circulant that holds the covariances, each over the number of lags.
+
+    A covariance of finite support embeds exactly in a circulant twice as long, whose eigenvalues are its FFT.
+    """
+    circulant = torch.cat([covariance, torch.zeros_like(covariance[:1]), covariance[1:].flip(0).mT])
+    # The FFT that makes samples of it runs backwards in time: conjugate, or a component that follows would lead.
+    values, vectors = torch.linalg.eigh(torch.fft.fft(circulant, dim=0).conj())
+    scale = (values.clamp_min(0.0) / len(circulant)).sqrt()  # rounding only: see the Parzen window
+    return (vectors * scale.unsqueeze(-2)) @ vectors.mH

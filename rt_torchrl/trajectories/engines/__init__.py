@@ -1,7 +1,8 @@
 """Three gradient engines for one trajectory: see :mod:`rt_torchrl.trajectories.rollout`."""
 
-from rt_torchrl.trajectories.engines.backpropagation import Backpropagation
-from rt_torchrl.trajectories.engines.continuous_adjoint import ContinuousAdjoint
-from rt_torchrl.trajectories.engines.parallel_adjoint import ParallelAdjoint
+from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
+from rt_torchrl.trajectories.engines.odeint_adjoint import OdeintAdjoint
+from rt_torchrl.trajectories.engines.parallel import Parallel
 
-__all__ = ["Backpropagation", "ContinuousAdjoint", "ParallelAdjoint"]
+__all__ = ["Autograd", "GradientEngine", "OdeintAdjoint", "Parallel"]

@@ -1,16 +1,17 @@
 """The Jacobians of all intervals of all trajectories as one batched call."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from rt_torchrl.trajectories.engines.compilation import marked_dynamic
+from rt_torchrl.trajectories.engines.compilation import plain
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
 PIECE = 2048
-"""Intervals that are linearised at once. Forward mode ties a compiled graph to one number; with pieces of this there is
-one for all trajectories that are not shorter."""
+"""Intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one number;
+with pieces of this there is one for all trajectories that are not shorter."""
 
 
 def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
@@ -21,8 +22,26 @@ def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
     has only the former, take the compiler of a drone's step a minute.
     """
     t = drive.t.expand(starts.shape[:2]).flatten()
-    rows = Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
-    return marked_dynamic(starts.flatten(0, 1), 0), Drive(*(marked_dynamic(x, 0) for x in rows))
+    return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
+
+
+def piece(rows: Tensor, drive: Drive, first: int, last: int) -> tuple[Tensor, Drive]:
+    """Rows ``first`` to ``last`` in memory of their own.
+
+    The compiler traces a view together with the tensor that it looks at. Rows that look at ``n batch ...`` have two
+    sizes that it does not know, of which it finds only the product; it then gives up.
+    """
+    return plain(rows[first:last]), Drive(*(plain(x[first:last]) for x in drive))
+
+
+def pieces(count: int) -> list[slice]:
+    """Cut ``count`` rows into as few pieces as :data:`PIECE` allows, of lengths that differ by one at most.
+
+    No piece is left with a single row, for which the compiler would trace again.
+    """
+    number = -(-count // PIECE)
+    ends = [count * k // number for k in range(number + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
 
 
 def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
@@ -30,7 +49,7 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
     rows, driven = as_one_batch(starts, drive)
     length = min(PIECE, len(rows))
     firsts = [*range(0, len(rows) - length, length), len(rows) - length]
-    found = [function(rows[k : k + length], Drive(*(x[k : k + length] for x in driven))) for k in firsts]
+    found = [function(*piece(rows, driven, first, first + length)) for first in firsts]
     found[-1] = found[-1][len(found) * length - len(rows) :]
     return torch.cat(found).unflatten(0, starts.shape[:2])
 

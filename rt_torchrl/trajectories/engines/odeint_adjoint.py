@@ -8,7 +8,7 @@ from rt_torchrl.trajectories.engines.compilation import compiled_if
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
 
-class ContinuousAdjoint:
+class OdeintAdjoint:
     r"""Chains :func:`torchdiffeq.odeint_adjoint` over the control intervals.
 
     The applied action and the exogenous input are constant components of the integrated state, so that the co-state of
@@ -19,6 +19,9 @@ class ContinuousAdjoint:
     Args:
         compiled: compile the vector field; the solver's loop stays in Python.
     """
+
+    own_scheme = False  # it integrates the vector field
+    start_per_realisation = False  # torchdiffeq integrates the whole batch over one span
 
     def __init__(self, *, compiled: bool):
         self._compiled = compiled

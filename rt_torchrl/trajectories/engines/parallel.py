@@ -9,10 +9,11 @@ With one interval as :math:`s_{k+1} = \Phi(s_k, x_k; w)`, the gradient of a cost
     \frac{dJ}{dw} = \sum_k \lambda_{k+1}^\top\frac{\partial\Phi}{\partial w}(s_k, x_k).
 
 Only the recurrence of the states and the (linear) one of λ are sequential. The Jacobians of all intervals and all
-trajectories are one batched call, and so is the sum over k.
+trajectories are one batched call, and so is the sum over k; both are cut into pieces where there are many.
 """
 
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 
 import torch
 from hoptorch.scan import scan
@@ -21,16 +22,19 @@ from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic, plain
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
-from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all
+from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all, piece, pieces
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class ParallelAdjoint:
+class Parallel:
     """See the module.
 
     Args:
         compiled: compile the two recurrences, the Jacobians and the final product.
     """
+
+    own_scheme = True
+    start_per_realisation = True
 
     def __init__(self, *, compiled: bool):
         self.march = compiled_if(compiled, march_by_scan, march)
@@ -64,13 +68,52 @@ class _DiscreteAdjoint(torch.autograd.Function):
         sources = marked_dynamic(plain(cost_gradient), 1)
         costates = ctx.engine.costates(marked_dynamic(jacobians[1:], 1), sources)  # λ_1 ... λ_n
         wanted = ctx.needs_input_grad[3:]  # t, exogenous, command and the weights
-        with torch.enable_grad():
-            inputs = [x.detach().requires_grad_(need) for x, need in zip(drive, wanted, strict=False)] + weights
-            out = ctx.engine.intervals(ctx.interval, *as_one_batch(starts, Drive(*inputs[:3])))
-        leaves = [x for x, need in zip(inputs, wanted, strict=True) if need]
-        found = iter(torch.autograd.grad(out, leaves, costates.flatten(0, 1), allow_unused=True) if leaves else ())
+        found = _products(ctx.engine.intervals, ctx.interval, starts, drive, weights, costates, wanted)
         first = torch.einsum("bji,bj->bi", jacobians[0], costates[0]) if ctx.needs_input_grad[2] else None
-        return None, None, first, *(next(found) if need else None for need in wanted)
+        return None, None, first, *found
+
+
+def _products(
+    function: Callable[[Interval, Tensor, Drive], Tensor],
+    interval: Interval,
+    starts: Tensor,
+    drive: Drive,
+    weights: Sequence[Tensor],
+    costates: Tensor,
+    wanted: Sequence[bool],
+) -> list[Tensor | None]:
+    """λᵀ∂Φ/∂x for t, z and a of every interval and, summed over the intervals, for every weight; None if not wanted.
+
+    In pieces, because the tape of an interval holds every unit of a perceptron.
+    """
+    if not any(wanted):
+        return [None] * len(wanted)
+    rows, driven = as_one_batch(starts, drive)
+    found = []
+    for at in pieces(len(rows)):
+        states, driving = piece(rows, driven, at.start, at.stop)
+        inputs = [*driving, *weights]
+        with torch.enable_grad():
+            for x, need in zip(driving, wanted, strict=False):
+                marked_dynamic(x, 0).requires_grad_(need)
+            out = function(interval, marked_dynamic(states, 0), driving)
+        leaves = [x for x, need in zip(inputs, wanted, strict=True) if need]
+        found.append(torch.autograd.grad(out, leaves, costates.flatten(0, 1)[at], allow_unused=True))
+    gathered = iter(zip(*found, strict=True))
+    shape = starts.shape[:2]
+    of_drive = [_of_rows(next(gathered), shape, x) if need else None for x, need in zip(drive, wanted, strict=False)]
+    return of_drive + [_summed(next(gathered)) if need else None for need in wanted[len(drive) :]]
+
+
+def _of_rows(parts: Sequence[Tensor | None], shape: torch.Size, drive: Tensor) -> Tensor | None:
+    """Gradients of all rows in the shape of the drive, of which t may be one for all realisations."""
+    if parts[0] is None:
+        return None
+    return torch.cat(parts).unflatten(0, shape).sum_to_size(drive.shape)
+
+
+def _summed(parts: Sequence[Tensor | None]) -> Tensor | None:
+    return None if parts[0] is None else reduce(torch.add, parts)
 
 
 def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:

@@ -7,12 +7,15 @@ from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class Backpropagation:
+class Autograd:
     """Tapes every operation of every step; memory and time grow with the number of steps.
 
     Args:
         compiled: run the recurrence and its reverse as one compiled scan.
     """
+
+    own_scheme = True
+    start_per_realisation = True
 
     def __init__(self, *, compiled: bool):
         self._march = compiled_if(compiled, march_by_scan, march)
