@@ -11,7 +11,7 @@ from rt_torchrl import ClassicalController, Plant, check_options, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.identification.sensor_log import SensorLog, logged_states
 from rt_torchrl.identification.simulated_log import ClassicalLaw, Law, policy_law, recorded
 from rt_torchrl.runs.shipped_plants import plant_class
 
@@ -98,7 +98,7 @@ def law_of(config: Config, plant: Plant, generator: torch.Generator) -> Law:
     return policy_law(plant, policy)
 
 
-def with_gap(log: Log, share: float) -> Log:
+def with_gap(log: SensorLog, share: float) -> SensorLog:
     """Without a share of its rows, from the middle on."""
     middle, end = 0.5 * log.times[-1], (0.5 + share) * log.times[-1]
     return log.chosen((log.times <= middle) | (log.times > end))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from tensordict import TensorDict
-from test_model_free import optimal_gain
+from test_ddpg import optimal_gain
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from test_model_free import optimal_gain
+from test_ddpg import optimal_gain
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune

@@ -12,7 +12,7 @@ from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.identification.covariance import covariance, named_values, newey_west, standard_errors
 from rt_torchrl.identification.identification import Identification, IdentificationConfig
-from rt_torchrl.identification.output_error import InitialStates, Misfit
+from rt_torchrl.identification.output_error import InitialStates, OutputError
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -26,10 +26,10 @@ def regression_error(n, dt, *, smooth):
     return math.sqrt((inverse @ X.T @ omega @ X @ inverse)[1, 1])
 
 
-def slope_misfit(segments, free=(0,)):
+def slope_output_error(segments, free=(0,)):
     plant = Line()
     initial = InitialStates(segments, free, torch.ones(1).double())
-    return Misfit(DigitalTwin(plant, Slope()), segments, initial)
+    return OutputError(DigitalTwin(plant, Slope()), segments, initial)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
@@ -38,12 +38,12 @@ def test_standard_errors_are_those_of_regression(smooth):
     n, found = 300, []
     for seed in range(10):
         segment = line_segment(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=smooth))
-        misfit = slope_misfit([segment])
+        output_error = slope_output_error([segment])
         slope, first = np.polyfit(0.1 * np.arange(n), segment.states[:, 0].numpy(), 1)
         with torch.no_grad():
-            misfit.twin.closure.w[0] = slope
-            misfit.initial.offsets[:] = first - segment.states[0]
-        found.append(covariance(misfit)[0, 0].item())
+            output_error.twin.closure.w[0] = slope
+            output_error.initial.offsets[:] = first - segment.states[0]
+        found.append(covariance(output_error)[0, 0].item())
     expected = regression_error(n, 0.1, smooth=smooth)
     # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
     # that in the error; the window takes another few per cent of the correlation and of the trend.
@@ -61,9 +61,9 @@ def test_scatter_over_logs_is_the_standard_error():
         segment = clean._replace(states=clean.states + noise, start=0.0)
         closure = LinearClosure(plant.true_closure)
         task = Identification(plant, closure, free=(0, 1), config=config)
-        task._descend(misfit := task._misfit([segment], (0, 1)))
+        task._descend(output_error := task._output_error([segment], (0, 1)))
         estimates.append(closure.matrix.detach().flatten().clone())
-        errors.append(torch.tensor(list(standard_errors(misfit).values())))
+        errors.append(torch.tensor(list(standard_errors(output_error).values())))
     z = (torch.stack(estimates) - torch.tensor(plant.true_closure).double().flatten()) / torch.stack(errors)
     # 48 standard normal numbers, four at a time correlated: their mean square is 1 within 0.4 or so. With 41 samples
     # of two states and 4 lags the errors themselves are low by some 10 %.
@@ -84,9 +84,9 @@ def test_named_errors_follow_from_those_of_the_logarithms():
     closure = QuasiSteadyPolar.true().requires_grad_(True)
     noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     noisy = [segments[0]._replace(states=segments[0].states + noise, start=0.0)]
-    misfit = Misfit(DigitalTwin(plant, closure), noisy, InitialStates(noisy, (), torch.ones(4).double()))
-    expected = closure.coefficients.detach() * covariance(misfit).diagonal().sqrt()
-    found = standard_errors(misfit)
+    output_error = OutputError(DigitalTwin(plant, closure), noisy, InitialStates(noisy, (), torch.ones(4).double()))
+    expected = closure.coefficients.detach() * covariance(output_error).diagonal().sqrt()
+    found = standard_errors(output_error)
     assert list(found) == ["a", "b", "c"]
     assert list(found.values()) == pytest.approx(expected.tolist(), rel=1e-9)
     assert list(named_values(LinearClosure(torch.zeros(2, 2)))) == [f"matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]

@@ -2,7 +2,7 @@
 
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
-from test_model_free import optimal_gain
+from test_ddpg import optimal_gain
 
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
 

@@ -43,7 +43,7 @@ def test_every_figure_is_drawn_within_its_canvas(snapshot):
         assert clipped_texts(figure) == [] and not collisions(figure), name
 
 
-def test_flight_path_is_the_record(snapshot):
+def test_collectors_path_is_the_record(snapshot):
     figure = figures.flight_path(snapshot)
     plant, real = snapshot.plant, snapshot.record.states
     path, wind, distance = (panel(figure, name) for name in ("vertical plane", *_side_labels(plant)))
@@ -64,7 +64,7 @@ def _side_labels(plant):
     return plant.inputs[0].label, "distance to the target [m]"
 
 
-def test_flight_path_marks_seconds_and_leaves_out_what_there_is_not(snapshot):
+def test_collectors_path_marks_seconds_and_leaves_out_what_there_is_not(snapshot):
     # The same record read at a longer interval lasts two seconds; the last mark is its end.
     slow = FlappingWing(horizon=0.2)
     slow.dt = 5e-3
@@ -77,7 +77,7 @@ def test_flight_path_marks_seconds_and_leaves_out_what_there_is_not(snapshot):
     assert [entry.get_label() for entry in wind.lines if entry.get_label()[0] != "_"] == ["recorded"]
 
 
-def test_flight_is_the_record_and_its_means_over_the_beats(snapshot):
+def test_collectors_is_the_record_and_its_means_over_the_beats(snapshot):
     figure, plant = figures.flight(snapshot), snapshot.plant
     for k in (0, 1):
         ax = panel(figure, plant.states[k].label)

@@ -22,7 +22,7 @@ from rt_torchrl.identification.identification import (
     lag_one,
     measured_states,
 )
-from rt_torchrl.identification.output_error import InitialStates, Misfit
+from rt_torchrl.identification.output_error import InitialStates, OutputError
 from rt_torchrl.identification.resampling import hold_out, resample
 from rt_torchrl.identification.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -39,11 +39,11 @@ def test_derivatives_are_those_of_backpropagation(kind):
     segments = flown(plant, generator, (12, 7, 20))
     scale = torch.linspace(0.5, 2.0, len(plant.states)).double()
     initial = InitialStates(segments, range(1, len(plant.states)), scale)
-    misfit = Misfit(DigitalTwin(plant, plant.make_closure(generator), engine="autograd"), segments, initial)
+    output_error = OutputError(DigitalTwin(plant, plant.make_closure(generator), engine="autograd"), segments, initial)
     with torch.no_grad():
         initial.offsets.normal_(0.0, 0.1, generator=generator)
-    found, cost = misfit.normal_equations(), misfit.cost()
-    weights = list(misfit.unknowns.parameters())
+    found, cost = output_error.normal_equations(), output_error.cost()
+    weights = list(output_error.unknowns.parameters())
     gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, weights)])
     # The same derivatives, forward instead of backward: rounding over 39 steps.
     assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
@@ -57,12 +57,12 @@ def test_a_segment_is_replayed_on_the_plants_clock():
     errors = []
     for start in (second.start, 0.0):
         segment = second._replace(start=start)
-        misfit = Misfit(
+        output_error = OutputError(
             DigitalTwin(plant, QuasiSteadyPolar.true().requires_grad_(True)),
             [segment],
             InitialStates([segment], (), torch.ones(4).double()),
         )
-        (replayed,) = misfit.replays()
+        (replayed,) = output_error.replays()
         errors.append((replayed.states - second.states).abs().max().item())
     assert errors[0] < 1e-12 < 1e-4 < errors[1]
 
@@ -196,7 +196,7 @@ segments = flown(plant, torch.Generator().manual_seed(0), (30, 20))
 twin = DigitalTwin(plant, plant.make_closure(torch.Generator().manual_seed(1)))
 initial = InitialStates(segments, (0, 1), torch.ones(2).double())
 by_step = Sensitivities(plant, twin.closure, compiled_step=True)
-eager, compiled = (Misfit(twin, segments, initial, sensitivities=s).normal_equations() for s in (None, by_step))
+eager, compiled = (OutputError(twin, segments, initial, sensitivities=s).normal_equations() for s in (None, by_step))
 # The same sums in another order.
 for first, second in zip(eager, compiled, strict=True):
     torch.testing.assert_close(first, second, rtol=1e-11, atol=1e-13)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
-from test_model_free import GAMMA, GAMMA_IN_TORCHRL, discounted_cost, explored, filled, optimal_gain, seeded
+from test_ddpg import GAMMA, GAMMA_IN_TORCHRL, discounted_cost, explored, filled, optimal_gain, seeded
 
 from rt_torchrl.twinning.learners import TD3, LearnerConfig
 from rt_torchrl.twinning.learners.learner import TD3Config

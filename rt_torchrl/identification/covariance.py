@@ -22,20 +22,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.identification.output_error import Misfit
+from rt_torchrl.identification.output_error import OutputError
 
 LEAST_EIGENVALUE = 1e-12
 """Of H with unit diagonal, below which a direction of the weights is not shown by the record."""
 
 
 @torch.no_grad()
-def covariance(misfit: Misfit) -> Float[Tensor, "n_w n_w"]:
+def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
     """Of the closure's weights at a minimum of J_p; inf on the diagonal for a weight that the segments do not show."""
-    replays = misfit.replays()
-    H = misfit.normal_equations(replays).matrix
+    replays = output_error.replays()
+    H = output_error.normal_equations(replays).matrix
     M, samples = torch.zeros_like(H), 0
     for replayed in replays:
-        scores = misfit.plant.dt * torch.einsum("ki,kiw->kw", replayed.gradient, replayed.sensitivity)
+        scores = output_error.plant.dt * torch.einsum("ki,kiw->kw", replayed.gradient, replayed.sensitivity)
         index = replayed.index
         M[index[:, None], index] += newey_west(scores)
         samples += len(scores)
@@ -48,7 +48,7 @@ def covariance(misfit: Misfit) -> Float[Tensor, "n_w n_w"]:
     found = freedom * inverse @ M @ inverse
     hidden = (vectors[:, ~shown] ** 2).sum(-1) > 1e-6
     found.diagonal()[hidden] = math.inf
-    n = misfit.weight_count
+    n = output_error.weight_count
     return found[:n, :n]
 
 
@@ -62,11 +62,11 @@ def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
     return found
 
 
-def standard_errors(misfit: Misfit) -> dict[str, float]:
+def standard_errors(output_error: OutputError) -> dict[str, float]:
     """Of every named value of the closure, to first order; inf where the segments do not show it."""
-    closure = misfit.twin.closure
+    closure = output_error.twin.closure
     weights = [w for w in closure.parameters() if w.requires_grad]
-    found = covariance(misfit)
+    found = covariance(output_error)
     unknown = found.diagonal().isinf()
     found = torch.where(unknown | unknown[:, None], 0.0, found)
     errors = {}

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.identification.covariance import named_values, standard_errors
-from rt_torchrl.identification.output_error import NOISE_TOLERANCE, InitialStates, Misfit
-from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.identification.output_error import NOISE_TOLERANCE, InitialStates, OutputError
+from rt_torchrl.identification.sensor_log import SensorLog, logged_states
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import check_options
@@ -106,8 +106,8 @@ class Identification:
         closure, both = self.twin.closure, (training, held_out)
         before = [self.judge(segments) for segments in both]
         start = coefficients(closure)
-        misfit, done = self._train(training)
-        errors = standard_errors(misfit)
+        output_error, done = self._train(training)
+        errors = standard_errors(output_error)
         after = [self.judge(segments) for segments in both]
         weights = {
             name: {"before": start[name], "after": value, "standard_error": errors[name]}
@@ -119,48 +119,50 @@ class Identification:
     def judge(self, segments: Sequence[Trajectory]) -> Judgement:
         """The twin with its present weights, from the initial states that suit it best, or from the measured ones."""
         plant = self.twin.plant
-        misfit = self._misfit(segments, self.free, weights=False)
+        output_error = self._output_error(segments, self.free, weights=False)
         if self.free:
-            misfit.fit_initial_states()
-        states = [replayed.states for replayed in misfit.replays()]
+            output_error.fit_initial_states()
+        states = [replayed.states for replayed in output_error.replays()]
         measured = [segment.states for segment in segments]
         J_p = sum(plant.dt * plant.discrepancy(s, m).sum().item() for s, m in zip(states, measured, strict=True))
         error = differences(plant.states, torch.cat(states), torch.cat(measured))
         seconds = plant.dt * sum(len(m) for m in measured)
         return Judgement(J_p, seconds, (error**2).mean(0).sqrt(), states)
 
-    def _misfit(self, segments: Sequence[Trajectory], free: Sequence[int], *, weights: bool = True) -> Misfit:
+    def _output_error(
+        self, segments: Sequence[Trajectory], free: Sequence[int], *, weights: bool = True
+    ) -> OutputError:
         initial = InitialStates.estimated(self.twin, segments, free, self._sensitivities)
-        return Misfit(self.twin, segments, initial, weights=weights, sensitivities=self._sensitivities)
+        return OutputError(self.twin, segments, initial, weights=weights, sensitivities=self._sensitivities)
 
-    def _train(self, segments: Sequence[Trajectory]) -> tuple[Misfit, int]:
-        """The misfit at its minimum, and the trial steps taken; both ways where initial states are unknown."""
+    def _train(self, segments: Sequence[Trajectory]) -> tuple[OutputError, int]:
+        """The output error at its minimum, and the trial steps taken; both ways where initial states are unknown."""
         closure = self.twin.closure
         start = copy.deepcopy(closure.state_dict())
-        together = self._misfit(segments, self.free)
+        together = self._output_error(segments, self.free)
         done = self._descend(together)
         if not self.free:
             return together, done
         found, J_p = copy.deepcopy(closure.state_dict()), together.normal_equations().cost
         closure.load_state_dict(start)
-        done += self._descend(self._misfit(segments, ()))
-        staged = self._misfit(segments, self.free)
+        done += self._descend(self._output_error(segments, ()))
+        staged = self._output_error(segments, self.free)
         done += self._descend(staged)
         if staged.normal_equations().cost < J_p:
             return staged, done
         closure.load_state_dict(found)
         return together, done
 
-    def _descend(self, misfit: Misfit) -> int:
+    def _descend(self, output_error: OutputError) -> int:
         iterations = self.config.iterations
         if self.config.optimiser == "levenberg_marquardt":
-            optimiser = LevenbergMarquardt(misfit.unknowns, tolerance=NOISE_TOLERANCE)
-            return optimiser.run(misfit.normal_equations, iterations).iterations
-        descent = Descent(misfit.unknowns, DescentConfig(optimiser=self.config.optimiser, rate=self.config.rate))
-        return descent.run(misfit.cost, iterations).iterations
+            optimiser = LevenbergMarquardt(output_error.unknowns, tolerance=NOISE_TOLERANCE)
+            return optimiser.run(output_error.normal_equations, iterations).iterations
+        descent = Descent(output_error.unknowns, DescentConfig(optimiser=self.config.optimiser, rate=self.config.rate))
+        return descent.run(output_error.cost, iterations).iterations
 
 
-def measured_states(plant: Plant, log: Log) -> list[int]:
+def measured_states(plant: Plant, log: SensorLog) -> list[int]:
     """Indices of the states that a log holds."""
     names = [state.name for state in logged_states(plant) if state.name in log.columns]
     return [k for k, state in enumerate(plant.states) if state.name in names]

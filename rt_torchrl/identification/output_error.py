@@ -60,7 +60,7 @@ class InitialStates(nn.Module):
         """Offsets in units of the twin's present residual, so that no step leaves what the sensors allow by much."""
         if not free:
             return cls.as_measured(segments)
-        fixed = Misfit(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
+        fixed = OutputError(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
         measured = torch.cat([segment.states for segment in segments])
         replayed = torch.cat([found.states for found in fixed.replays()])
         residual = differences(twin.plant.states, replayed, measured).square().mean(0).sqrt()
@@ -82,7 +82,7 @@ class Replayed(NamedTuple):
     index: Int[Tensor, " n_local"]
 
 
-class Misfit:
+class OutputError:
     """J_p of a twin on segments of a log.
 
     Args:
@@ -154,7 +154,7 @@ class Misfit:
         return NormalEquations(cost, gradient, matrix)
 
     def fit_initial_states(self) -> None:
-        """Estimate the initial states under the present weights, of a misfit whose only unknowns they are."""
+        """Estimate the initial states under the present weights, of an output error whose only unknowns they are."""
         LevenbergMarquardt(self.initial, tolerance=NOISE_TOLERANCE).run(self.normal_equations, INITIAL_ITERATIONS)
 
     def _index(self, number: int) -> Int[Tensor, " n_local"]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.identification.sensor_log import SensorLog, logged_states
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -37,7 +37,7 @@ class Resampled(NamedTuple):
     too_short: list[tuple[float, float]]  # first and last time of the parts that were left out
 
 
-def resample(log: Log, plant: Plant, *, gap: float | None = None, shortest: int = 10) -> Resampled:
+def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest: int = 10) -> Resampled:
     """Cut a log at its gaps and bring each part to the plant's control intervals.
 
     Args:
@@ -117,7 +117,7 @@ def hold_means(
     return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
 
 
-def _require_rows(log: Log, steps: int, interval: float, plant: Plant) -> None:
+def _require_rows(log: SensorLog, steps: int, interval: float, plant: Plant) -> None:
     """Refuse a log that would grow beyond all it knows, before memory is taken for it."""
     rows = len(log.times)
     if steps > INTERVALS_PER_ROW * rows:
@@ -133,7 +133,7 @@ def _steps(first: float, last: float, dt: float) -> int:
     return int((last - first) / dt + ROUNDING)
 
 
-def _segment(log: Log, rows: slice, steps: int, plant: Plant) -> Trajectory:
+def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajectory:
     times = log.times[rows]
     grid = times[0] + plant.dt * np.arange(steps + 1)
 

@@ -75,7 +75,7 @@ class Column:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Log:
+class SensorLog:
     """Signals of a real system, sampled together at instants that need not be regular.
 
     A row is what a controller knows and does at one instant: states are instantaneous, actions and exogenous inputs are
@@ -111,13 +111,13 @@ class Log:
             if values.shape != t.shape:
                 raise ValueError(f"column {name!r} has shape {values.shape}; the log has {len(t)} rows.")
 
-    def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "Log":
+    def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":
         """Of some rows only; what is left out becomes a gap."""
-        return Log(times=self.times[rows], columns={name: values[rows] for name, values in self.columns.items()})
+        return SensorLog(times=self.times[rows], columns={name: values[rows] for name, values in self.columns.items()})
 
-    def without(self, names: Sequence[str]) -> "Log":
+    def without(self, names: Sequence[str]) -> "SensorLog":
         """Without some columns."""
-        return Log(times=self.times, columns={k: v for k, v in self.columns.items() if k not in names})
+        return SensorLog(times=self.times, columns={k: v for k, v in self.columns.items() if k not in names})
 
     def write(self, path: Path) -> None:
         """As CSV, or Parquet if the name ends so; read again by :func:`read_log` without a mapping."""
@@ -139,7 +139,7 @@ def logged_signals(plant: Plant) -> tuple[Signal, ...]:
     return (*logged_states(plant), *plant.actions, *plant.inputs)
 
 
-def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Log:
+def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
     """The columns of a file that are signals of a plant; others are left alone.
 
     Args:
@@ -169,10 +169,10 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Log:
         raise ValueError(f"{path} has no column 'time'; say which it is, such as --columns t=time.")
     units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
     values = {name: _values(frame[column.header], column, units[name], path) for name, column in chosen.items()}
-    return Log(times=values.pop(TIME), columns=values)
+    return SensorLog(times=values.pop(TIME), columns=values)
 
 
-def checked(log: Log, plant: Plant, *, drop: bool = False) -> Log:
+def checked(log: SensorLog, plant: Plant, *, drop: bool = False) -> SensorLog:
     """A log that a twin of this plant can be driven by.
 
     Args:

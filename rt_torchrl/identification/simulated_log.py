@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.identification.sensor_log import Log, logged_states
+from rt_torchrl.identification.sensor_log import SensorLog, logged_states
 from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.plants.plant import Plant
 
@@ -35,7 +35,9 @@ class ClassicalLaw:
 
 
 @torch.no_grad()
-def recorded(plant: Plant, law: Law, generator: torch.Generator, *, jitter: float = 0.0, noise: float = 0.0) -> Log:
+def recorded(
+    plant: Plant, law: Law, generator: torch.Generator, *, jitter: float = 0.0, noise: float = 0.0
+) -> SensorLog:
     r"""One episode of the real system under a control loop whose intervals are not quite dt.
 
     .. math:: t_j = (j + \eta_j)\,\Delta t, \qquad \eta_j \sim U(-\tfrac12, \tfrac12)\cdot\mathrm{jitter}
@@ -88,7 +90,7 @@ def _held(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, le
     return plant.latch(end, applied)
 
 
-def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, noise: float) -> Log:
+def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, noise: float) -> SensorLog:
     n_s = len(plant.states)
     errors = torch.randn(len(rows), n_s, generator=generator, dtype=torch.float64)
     values = torch.cat([rows[:, :n_s] * (1.0 + noise * errors), rows[:, n_s:]], -1).numpy()
@@ -96,4 +98,4 @@ def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, 
     signals = (*plant.states, *plant.actions, *plant.inputs)
     chosen = {s.name: k for k, s in enumerate(signals) if k >= n_s or s.name in own}
     columns = {name: np.ascontiguousarray(signals[k].wrapped(values[:, k])) for name, k in chosen.items()}
-    return Log(times=times.numpy(), columns=columns)
+    return SensorLog(times=times.numpy(), columns=columns)

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from rt_torchrl.identification.output_error import (
     NOISE_TOLERANCE,
     InitialStates,
-    Misfit,
+    OutputError,
     compared,
     discrepancy_derivatives,
 )
@@ -139,9 +139,9 @@ class Assimilation:
         before = self._prior_cost().item()
         method, function = self.descent, cost
         if self.config.initial == "estimated":
-            misfit = self._misfit(replayed)
-            method = LevenbergMarquardt(misfit.unknowns, tolerance=NOISE_TOLERANCE)
-            function = partial(self._mean_equations, misfit)
+            output_error = self._output_error(replayed)
+            method = LevenbergMarquardt(output_error.unknowns, tolerance=NOISE_TOLERANCE)
+            function = partial(self._mean_equations, output_error)
         elif self.config.method == "levenberg_marquardt":
             method, function = self.second_order, equations
         found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
@@ -158,22 +158,22 @@ class Assimilation:
         try:
             if self.config.initial == "measured":
                 return self._identification_cost(whole).item()
-            misfit = self._misfit(whole, weights=False)
-            misfit.fit_initial_states()
-            return misfit.normal_equations().cost.item() / len(whole.states)
+            output_error = self._output_error(whole, weights=False)
+            output_error.fit_initial_states()
+            return output_error.normal_equations().cost.item() / len(whole.states)
         except FloatingPointError:
             return float("inf")
 
-    def _misfit(self, replayed: Trajectory, *, weights: bool = True) -> Misfit:
+    def _output_error(self, replayed: Trajectory, *, weights: bool = True) -> OutputError:
         """J_p with unknown first states."""
         segments, measured, twin = replayed.each(), replayed.states, self.twin
         free = compared(discrepancy_derivatives(twin.plant, measured, measured)[1]).nonzero().flatten().tolist()
         initial = InitialStates.estimated(twin, segments, free, twin.sensitivities)
-        return Misfit(twin, segments, initial, weights=weights)
+        return OutputError(twin, segments, initial, weights=weights)
 
-    def _mean_equations(self, misfit: Misfit) -> NormalEquations:
-        found = misfit.normal_equations()
-        return self._with_prior(NormalEquations(*(part / len(misfit.segments) for part in found)))
+    def _mean_equations(self, output_error: OutputError) -> NormalEquations:
+        found = output_error.normal_equations()
+        return self._with_prior(NormalEquations(*(part / len(output_error.segments) for part in found)))
 
     def _weights(self) -> Tensor:
         trained = [w.flatten() for w in self.twin.closure.parameters() if w.requires_grad]

@@ -14,7 +14,7 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.identification import resampling
 from rt_torchrl.identification.resampling import hold_means, hold_out, resample
-from rt_torchrl.identification.sensor_log import Column, Log, checked, logged_signals, read_log
+from rt_torchrl.identification.sensor_log import Column, SensorLog, checked, logged_signals, read_log
 from rt_torchrl.identification.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -28,7 +28,7 @@ def signals(times, **columns):
     """A log of the oracle plant; columns that are not given are zero."""
     times = np.asarray(times, dtype=float)
     zero = dict.fromkeys(("position", "velocity", "force", "disturbance"), np.zeros_like(times))
-    return Log(times=times, columns=zero | columns)
+    return SensorLog(times=times, columns=zero | columns)
 
 
 def jittered(n, dt=0.1, seed=0):
@@ -269,7 +269,7 @@ def test_a_periodic_state_is_interpolated_across_its_seam(counted):
     turned = 3.0 + 6.0 * times
     angle = turned if counted else np.arctan2(np.sin(turned), np.cos(turned))
     columns = {"angle": angle, "angular_speed": np.full(120, 6.0), "torque": np.zeros(120)}
-    log = checked(Log(times=times, columns=columns), plant)
+    log = checked(SensorLog(times=times, columns=columns), plant)
     (segment,) = resample(log, plant).segments
     found = segment.states[:, 0].numpy()
     expected = 3.0 + 6.0 * 0.05 * np.arange(len(found))
