@@ -5,8 +5,6 @@ import signal
 import threading
 from types import FrameType
 
-from typing_extensions import Self
-
 NOTICE = b"\ninterrupted: the training stops after the iteration under way (Ctrl-C again to leave at once)\n"
 
 
@@ -24,7 +22,7 @@ class Interruption:
 
     _asked = False
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Interruption":
         Interruption._asked = self.at_once = False
         main = threading.current_thread() is threading.main_thread()
         self._installed = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler

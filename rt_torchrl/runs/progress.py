@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 from tqdm import tqdm
-from typing_extensions import Self
 
 from rt_torchrl.runs.results_table import progress
 from rt_torchrl.trajectories.engines.compilation import watched_compilation
@@ -42,7 +41,7 @@ class Progress:
         self._compiling, self._ended = False, threading.Event()
         self._thread = threading.Thread(target=self._keep_moving, daemon=True)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Progress":
         self._watch = watched_compilation(self._compilation)
         self._watch.__enter__()
         self._thread.start()
