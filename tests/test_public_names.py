@@ -21,9 +21,10 @@ HOMES = {
 }
 """The module that each public name comes from."""
 ROOMS_OF = {
+    "benchmark.py": {"trajectories"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
-    "record_log.py": {"identification"},
+    "record_log.py": {"identification", "runs"},
     "study.py": {"study", "runs"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""
