@@ -217,6 +217,24 @@ def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch
     assert report["plan_accepted"] == 0.0 or idle == "model_free"
 
 
+def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monkeypatch):
+    """The weights that flew are sound; those that step 2 made of them diverge, cost infinitely much and lose."""
+    found = twinning(referee=RefereeConfig(patience=0))
+    update = found.learner.update
+
+    def ruined():
+        report = update()
+        with torch.no_grad():
+            found.policies["model_free"].gain.fill_(1e9)
+        return report
+
+    monkeypatch.setattr(found.learner, "update", ruined)
+    report = found.episode()
+    assert report["closure_refused"] == 0.0 and report["J_a_model_free"].isinf()
+    assert report["event"] == "swap" and found.referee.live == "model_based"
+    assert "model_free diverges on the twin" in report["reason"]
+
+
 def test_a_plan_that_diverges_is_refused_and_the_policy_before_stays(monkeypatch):
     found, before = twinning(), {}
     plan = found.planner.plan

@@ -8,6 +8,7 @@ import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
@@ -85,7 +86,7 @@ def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
     config = json.loads((tmp_path / "config.json").read_text())
 
     class Observant(LinearQuadratic):
-        observations = (*LinearQuadratic.observations, LinearQuadratic.observations[0])
+        observations = (*LinearQuadratic.observations, Signal("e", "again", "m"))
 
         def observe(self, t, state, exogenous):
             return torch.cat([state, state[..., :1]], -1)

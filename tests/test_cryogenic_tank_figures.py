@@ -78,9 +78,9 @@ def test_long_records_are_thinned_to_mean_and_range(snapshot):
     repeated = [torch.cat([values[:720]] * 2 + [values[:1]]) for values in record[:3]]
     states = torch.cat([repeated[0], repeated[0][-1:]])
     record = Trajectory(states, *repeated[1:])
-    long = replace(snapshot, record=record, replay=states, large_scale=repeated[1], realisations=None)
+    long = replace(snapshot, record=record, replay=states, large_scale=repeated[2], realisations=None)
     figure = figures.tank(long)
-    load, values = panel(figure, "heat load"), repeated[1][:, 0].numpy()
+    load, values = panel(figure, "heat load"), repeated[2][:, 0].numpy()
     drawn = line(load, "real").get_ydata()
     assert n % 3 == 1 and len(drawn) == (n + 2) // 3 <= figures.POINTS
     assert drawn[5] == pytest.approx(values[15:18].mean(), rel=1e-12)

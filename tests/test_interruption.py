@@ -11,7 +11,7 @@ import pytest
 from small_runs import small_run
 
 from rt_torchrl.interruption import Interruption, safe_point
-from rt_torchrl.twinning.model_free import ModelFree
+from rt_torchrl.twinning.learners import DDPG
 
 EPISODES = 4
 QUICK = {"figures": False, "untrained": 0}
@@ -124,17 +124,17 @@ def test_an_interrupt_at_any_moment_loses_nothing_but_the_episode_under_way(tmp_
 def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
     """Of step 2 with iterations without end: TorchRL has swapped weights in most of its time."""
     small = small_run(tmp_path, episodes=2, **QUICK)
-    run_one, update = small.algorithm.episode, ModelFree.update
+    run_one, update = small.algorithm.episode, DDPG.update
 
-    def endless(self, memory, episode_length):
+    def endless(self):
         object.__setattr__(self.config, "critic_iterations", 10**9)
-        return update(self, memory, episode_length)
+        return update(self)
 
-    def second():
+    def second(tell):
         if small.episodes:
-            monkeypatch.setattr(ModelFree, "update", endless)
+            monkeypatch.setattr(DDPG, "update", endless)
             threading.Timer(0.5, press).start()
-        return run_one()
+        return run_one(tell)
 
     monkeypatch.setattr(small.algorithm, "episode", second)
     begin = time.perf_counter()
@@ -155,7 +155,7 @@ def test_a_second_interrupt_leaves_at_once_whatever_became_of_it(tmp_path, monke
                 time.sleep(1)
             except KeyboardInterrupt:
                 raise RuntimeError("Converting a tensordict to boolean value is not permitted") from None
-        return run_one()
+        return run_one(tell)
 
     monkeypatch.setattr(run.algorithm, "episode", interrupted)
     with pytest.raises(KeyboardInterrupt):

@@ -131,9 +131,9 @@ def test_referees_ask_one_question(name):
 
 def test_a_learner_of_another_policy_is_refused():
     other = PLANT.make_policy(seeded(5))
-    with pytest.raises(ValueError, match="learner trains another policy than model_free"):
+    with pytest.raises(ValueError, match="DDPG trains another policy than model_free"):
         algorithm(learner=lambda policy: LEARNERS["ddpg"](other))
-    with pytest.raises(ValueError, match="planner trains another policy than model_based"):
+    with pytest.raises(ValueError, match="WholeEpisodes trains another policy than model_based"):
         algorithm(planner=lambda twin, policy: PLANNERS["whole episodes"](twin, other))
 
 

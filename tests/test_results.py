@@ -24,9 +24,7 @@ def refused(name):
 
 
 def test_metrics_are_json_where_nothing_was_iterated(tmp_path, capsys):
-    nothing = {
-        part: dataclasses.replace(getattr(SMALL, part), iterations=0) for part in ("assimilation", "model_based")
-    }
+    nothing = {part: dataclasses.replace(getattr(SMALL, part), iterations=0) for part in ("assimilation", "planner")}
     twinning = dataclasses.replace(SMALL, **nothing)
     options = {"compiled": False, "unseen": 3, "figures": False, "untrained": 0, "episodes": 1}
     metrics = Run(RunConfig(log_dir=tmp_path, twinning=twinning, **options), LinearQuadratic(horizon=2.0)).train()
@@ -85,6 +83,6 @@ def test_validation_follows_the_wear_of_the_system():
 
 def test_on_a_real_system_the_better_policy_is_the_live_one():
     system = Mock(spec=RealSystem, plant=LinearQuadratic(horizon=2.0))
-    algorithm = Mock(spec=ReinforcementTwinning, switch=Mock(live="model_free"))
+    algorithm = Mock(spec=ReinforcementTwinning, referee=Mock(live="model_free"))
     assert results.better_of(algorithm, RealEpisodes(system, 2)) == ("model_free", "twin")
     system.rollout.assert_not_called()

@@ -72,8 +72,8 @@ def test_resume_and_overwrite_exclude_each_other(tmp_path):
 
 def changed_twinning():
     default = RunConfig().twinning
-    rates = dataclasses.replace(default.model_free, critic_rate=2e-3, discount=0.5)
-    return dataclasses.replace(default, model_free=rates)
+    rates = dataclasses.replace(default.learner, critic_rate=2e-3, discount=0.5)
+    return dataclasses.replace(default, learner=rates)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def changed_twinning():
         ({"engine": "autograd"}, "engine is autograd here and was parallel in the run"),
         ({"quick": True}, "quick is True here and was False in the run"),
         ({"hidden": (4,)}, r"hidden is \[4\] here and was \[32, 32\] in the run"),
-        ({"twinning": changed_twinning()}, "critic_rate is 0.002 here and was 0.001.*model_free.discount is 0.5"),
+        ({"twinning": changed_twinning()}, "critic_rate is 0.002 here and was 0.001.*learner.discount is 0.5"),
     ],
 )
 def test_a_run_is_not_resumed_with_other_options(tmp_path, options, named):

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map_only
 from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
@@ -23,12 +22,13 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
+from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.distillation import Distillation, same_architecture
 from rt_torchrl.twinning.findings import findings, merged, weight_vector
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
+from rt_torchrl.twinning.saved_state import load_parts, on_device
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -72,13 +72,15 @@ class ReinforcementTwinning:
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, first)
-        require_own_policies(self)
+        for part, role in ((self.learner, "model_free"), (self.planner, "model_based")):
+            if part.policy is not self.policies[role]:
+                raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
         self.assimilation = Assimilation(twin, config.assimilation)
-        self.distillation = Distillation(twin, config.distillation)
         self.short_term = ShortTermMemory(config.records)
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.cloning = Cloning(self.virtual, config.distillation, config.virtual_episodes)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = collector_of(env, self.actor, twin.plant)
         self.episodes_done = 0
@@ -152,15 +154,15 @@ class ReinforcementTwinning:
         return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
 
     def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Step 5 or 6; if the live policy diverges in it, the closure of the episode before takes the place of w_p*.
+        """Step 5 or 6; if the twin diverges under what has just flown, the closure of the episode before takes over.
 
-        The live policy has just flown on the real system, so the closure must be wrong; any other policy may diverge on
-        a sound twin, and loses. Note: the paper keeps every closure. One that replays the records best may still be one
-        that no other flight can be made with, where noise of the sensors is large beside what the closure does; the
-        real system cannot wait.
+        The weights that have just flown on the real system did not diverge there, so the closure must be wrong. Any
+        other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure. One that replays the
+        records best may still be one that no other flight can be made with, where noise of the sensors is large beside
+        what the closure does; the real system cannot wait.
 
         Raises:
-            DivergenceError: if the live policy diverges with the earlier closure too.
+            DivergenceError: if the twin diverges under these weights with the earlier closure too.
         """
         state, policy = self.generator.get_state(), copy.deepcopy(self.policies["model_based"].state_dict())
         try:
@@ -186,12 +188,11 @@ class ReinforcementTwinning:
         planned_on, judged_on = map(self.virtual.draw, (count, self.config.virtual_episodes))
         policy = self.policies["model_based"]
         before = copy.deepcopy(policy.state_dict())
-        incumbent = self.virtual_costs(judged_on, {self.referee.live, "model_based"})["model_based"]
+        incumbent = self.virtual_costs(judged_on, ("model_based",))["model_based"]
         try:
             found = self.planner.plan(planned_on)
         except DivergenceError as error:
-            if self.referee.live == "model_based":
-                raise
+            self.require_sound_twin(planned_on)
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
@@ -228,37 +229,45 @@ class ReinforcementTwinning:
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
     def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
-        """Mean J_a of policies over virtual episodes; infinite for an idle policy under which the twin diverges.
+        """Mean J_a of policies over virtual episodes; infinite for one under which a sound twin diverges.
 
         Raises:
-            DivergenceError: if the twin diverges under the live policy.
+            DivergenceError: if the twin diverges under the weights that have just flown, too.
         """
-        flies = {role: role == self.referee.live for role in roles}
-        return {role: self.virtual.cost(self.policies[role], episodes, flies=flies[role]) for role in roles}
+        costs = {role: self.virtual.cost(self.policies[role], episodes) for role in roles}
+        if not all(cost.isfinite() for cost in costs.values()):
+            self.require_sound_twin(episodes)
+        return costs
+
+    def require_sound_twin(self, episodes: Scenario) -> None:
+        """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.
+
+        Raises:
+            DivergenceError: if it does.
+        """
+        if not self.virtual.cost(self.track_record.policy_flown(), episodes).isfinite():
+            raise DivergenceError(
+                f"the twin of plant {self.twin.plant.name!r} diverged under the weights that have just flown on the "
+                f"real system; the closure is {type(self.twin.closure).__name__}."
+            )
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """The live policy into the idle one: a copy of its weights, or a distillation into another architecture.
+        """The live policy into the idle one, unless the referee finds the clone worse than the policy it replaces.
 
         Args:
-            costs: mean J_a of both policies over ``judged_on``, where the referee may find a distilled clone worse than
-                the policy it replaces.
-            judged_on: virtual episodes.
+            costs: mean J_a of both policies over the virtual episodes ``judged_on``.
         """
-        live, idle = (self.policies[role] for role in (self.referee.live, self.referee.idle))
-        report = findings()
-        if same_architecture(live, idle):
-            idle.load_state_dict(live.state_dict())
-        else:
-            before, replaced = copy.deepcopy(idle.state_dict()), costs[self.referee.idle]
-            seen, count = self.learner.observations(), self.config.virtual_episodes
-            error = self.distillation.imitate(live, idle, seen=seen, draw=lambda: self.virtual.draw(count))
-            cost = self.virtual.cost(idle, judged_on)
-            report = findings(distillation_error=error, distillation_cost_ratio=cost / costs[self.referee.live])
-            if self.referee.worse(cost.item(), than=replaced.item()):
-                idle.load_state_dict(before)
-                reason = f"clone refused: J_a {cost:.4g} of it, {replaced:.4g} of what it replaces"
-                return merged(report, findings(reason)).set_non_tensor("event", "keep")
-        (self.learner if self.referee.idle == "model_free" else self.planner).restart()
+        live, idle = self.referee.live, self.referee.idle
+        report = self.cloning.clone(
+            self.policies[live],
+            self.policies[idle],
+            seen=self.learner.observations,
+            costs=(costs[live].item(), costs[idle].item()),
+            judged_on=judged_on,
+            worse=self.referee.worse,
+        )
+        if "reason" not in report:
+            (self.learner if idle == "model_free" else self.planner).restart()
         return report
 
     def state_dict(self) -> dict[str, Any]:
@@ -275,19 +284,13 @@ class ReinforcementTwinning:
         """Go on from :meth:`state_dict` of an algorithm that was built with the same arguments.
 
         Raises:
-            ValueError: if the weights do not fit; names the component.
+            ValueError: if the state of a component does not fit; names it.
         """
-        kept = {name: state[name] for name in KEPT}
-        state = state | tree_map_only(Tensor, lambda tensor: tensor.to(self.generator.device), kept)
+        state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
         parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
         parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
-        for name, (part, saved) in parts.items():
-            try:
-                part.load_state_dict(saved)
-            # Torch, tensordict and environments each have errors of their own for what does not fit.
-            except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-                raise ValueError(f"the saved state of {name} does not fit: {error}") from error
+        load_parts(parts)
         self.generator.set_state(state["generator"].cpu())
         self.episodes_done = state["episodes_done"]
 
@@ -295,14 +298,3 @@ class ReinforcementTwinning:
 KEPT = ("virtual", "short_term", "track_record")
 """Components that take the tensors of their state as they are, wherever these lie."""
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
-
-
-def require_own_policies(algorithm: ReinforcementTwinning) -> None:
-    """Refuse a learner or planner that would train a policy which nobody flies.
-
-    Raises:
-        ValueError: naming it.
-    """
-    for part, role in (("learner", "model_free"), ("planner", "model_based")):
-        if getattr(algorithm, part).policy is not algorithm.policies[role]:
-            raise ValueError(f"{part} trains another policy than {role}; build it with the module given as {role}.")

@@ -9,7 +9,6 @@ and the twin have shown:
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -142,23 +141,3 @@ class ShareOfRange(nn.Module):
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
         action = self.policy(observation)
         return (action - self.low.to(action)) / self.range.to(action)
-
-
-def same_architecture(first: nn.Module, second: nn.Module) -> bool:
-    """Whether a copy of its weights makes one module the other: same modules, same settings, same shapes of weights.
-
-    Shapes alone do not tell: two perceptrons of other activations have the same.
-    """
-    return _structure(first) == _structure(second)
-
-
-def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
-    """Class and settings of every submodule, and the shapes of what its state dict holds."""
-    parts = [(name, type(part), part.extra_repr(), _settings(part)) for name, part in module.named_modules()]
-    return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
-
-
-def _settings(module: nn.Module) -> dict[str, Any]:
-    """Attributes that are neither weights nor submodules, such as an activation or a depth."""
-    values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
-    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}

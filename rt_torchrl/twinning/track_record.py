@@ -54,13 +54,20 @@ class TrackRecord:
         """
         return tuple(self._predicted(twin, flown) for flown in self._flown)
 
-    @torch.no_grad()
-    def _predicted(self, twin: DigitalTwin, flown: Flown) -> float:
+    def policy_flown(self) -> nn.Module:
+        """The policy that has flown the latest episode, with the weights that it had in it."""
+        return self._policy(self._flown[-1])
+
+    def _policy(self, flown: Flown) -> nn.Module:
         policy = copy.deepcopy(self._policies[flown.role])
         policy.load_state_dict(flown.weights)
+        return policy
+
+    @torch.no_grad()
+    def _predicted(self, twin: DigitalTwin, flown: Flown) -> float:
         trajectory = flown.trajectory
         try:
-            return twin.cost(policy, trajectory.states[:1], trajectory.exogenous[None]).item()
+            return twin.cost(self._policy(flown), trajectory.states[:1], trajectory.exogenous[None]).item()
         except DivergenceError:
             return float("inf")
 

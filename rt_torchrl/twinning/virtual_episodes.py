@@ -42,25 +42,12 @@ class VirtualEpisodes:
         return Scenario(initial_state, sample_experience(self.processes, count, self.generator))
 
     @torch.no_grad()
-    def cost(self, policy: nn.Module, episodes: Scenario, *, flies: bool = False) -> Tensor:
-        """Mean J_a of a policy; infinite if the twin diverges under it.
-
-        Args:
-            policy: acts in the episodes.
-            episodes: drawn by :meth:`draw`.
-            flies: whether the policy flies on the real system, so that the twin must not diverge under it.
-
-        Raises:
-            DivergenceError: if it does.
-        """
+    def cost(self, policy: nn.Module, episodes: Scenario) -> Tensor:
+        """Mean J_a of a policy; infinite if the twin diverges under it."""
         try:
             cost = self.twin.cost(policy, *episodes)
         except DivergenceError:
-            if flies:
-                raise
             return torch.full((), torch.inf, dtype=torch.float64, device=episodes.initial_state.device)
-        if flies and not cost.isfinite():
-            raise DivergenceError(f"J_a of the live policy on the twin of plant {self.twin.plant.name!r} is {cost}.")
         return cost.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def state_dict(self) -> dict[str, Any]:

@@ -174,12 +174,14 @@ class ActorCritic(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """See :meth:`Learner.state_dict`."""
-        return {name: getattr(self, name).state_dict() for name in COMPONENTS}
+        parts = {name: getattr(self, name).state_dict() for name in COMPONENTS}
+        return parts | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See :meth:`Learner.load_state_dict`."""
         for name in COMPONENTS:
             getattr(self, name).load_state_dict(state[name])
+        self.generator.set_state(state["generator"].cpu())
 
 
 CRITIC_FINDINGS, ACTOR_FINDINGS = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")

@@ -1,0 +1,85 @@
+"""The idle policy becomes a clone of the live one."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+from jaxtyping import Float
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
+from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+
+
+class Cloning:
+    """Copies weights between policies of the same architecture, and distils one into another architecture.
+
+    Args:
+        virtual: flies the policies.
+        config: of the distillation.
+        count: virtual episodes that a distillation draws at a time.
+    """
+
+    def __init__(self, virtual: VirtualEpisodes, config: DistillationConfig, count: int):
+        self.virtual, self.count = virtual, count
+        self.distillation = Distillation(virtual.twin, config)
+
+    def clone(
+        self,
+        live: nn.Module,
+        idle: nn.Module,
+        *,
+        seen: Callable[[], Float[Tensor, "n n_o"]],
+        costs: tuple[float, float],
+        judged_on: Scenario,
+        worse: Callable[[float, float], bool],
+    ) -> TensorDict:
+        """Make ``idle`` a clone of ``live``; it keeps its weights if a distilled clone is worse than it is.
+
+        Args:
+            live: the policy that is cloned; it is not changed.
+            idle: the policy that becomes the clone.
+            seen: gives the observations of the real system.
+            costs: mean J_a of ``live`` and of ``idle`` over ``judged_on``.
+            judged_on: virtual episodes on which the clone is judged.
+            worse: the referee's question.
+
+        Returns:
+            Nothing of a copy; ``distillation_error`` and ``distillation_cost_ratio`` of a distillation. A clone that is
+            refused is the event ``keep`` with its ``reason``.
+        """
+        if same_architecture(live, idle):
+            idle.load_state_dict(live.state_dict())
+            return findings()
+        before, (live_cost, replaced) = copy.deepcopy(idle.state_dict()), costs
+        error = self.distillation.imitate(live, idle, seen=seen(), draw=lambda: self.virtual.draw(self.count))
+        cost = self.virtual.cost(idle, judged_on).item()
+        found = {"distillation_error": error, "distillation_cost_ratio": cost / live_cost}
+        if not worse(cost, replaced):
+            return findings(**found)
+        idle.load_state_dict(before)
+        reason = f"clone refused: J_a {cost:.4g} of it, {replaced:.4g} of what it replaces"
+        return findings(reason, **found).set_non_tensor("event", "keep")
+
+
+def same_architecture(first: nn.Module, second: nn.Module) -> bool:
+    """Whether a copy of its weights makes one module the other: same modules, same settings, same shapes of weights.
+
+    Shapes alone do not tell: two perceptrons of other activations have the same.
+    """
+    return _structure(first) == _structure(second)
+
+
+def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
+    """Class and settings of every submodule, and the shapes of what its state dict holds."""
+    parts = [(name, type(part), part.extra_repr(), _settings(part)) for name, part in module.named_modules()]
+    return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
+
+
+def _settings(module: nn.Module) -> dict[str, Any]:
+    """Attributes that are neither weights nor submodules, such as an activation or a depth."""
+    values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
+    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}
