@@ -10,12 +10,12 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.distillation import (
     Distillation,
     DistillationConfig,
     ShareOfRange,
     match_actions,
-    same_architecture,
 )
 from rt_torchrl.twinning.referees import RefereeConfig
 

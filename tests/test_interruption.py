@@ -147,7 +147,7 @@ def test_a_second_interrupt_leaves_at_once_whatever_became_of_it(tmp_path, monke
     run = small_run(tmp_path, episodes=3, **QUICK)
     run_one = run.algorithm.episode
 
-    def interrupted():
+    def interrupted(tell):
         if run.episodes:
             press()
             try:
