@@ -1,6 +1,7 @@
 """Ctrl-C: at any moment of a training nothing is lost but the episode under way."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -127,7 +128,7 @@ def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
     run_one, update = small.algorithm.episode, DDPG.update
 
     def endless(self):
-        object.__setattr__(self.config, "critic_iterations", 10**9)
+        self.config = dataclasses.replace(self.config, critic_iterations=10**9)
         return update(self)
 
     def second(tell):
