@@ -34,7 +34,7 @@ from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
 from .twinning.learners import DDPG, TD3, ActorCritic, Learner, LearnerConfig, TD3Config
-from .twinning.long_term_memory import LongTermMemoryConfig
+from .twinning.learners.long_term_memory import LongTermMemoryConfig
 from .twinning.planners import Planner, PlannerConfig, ShortHorizon, ShortHorizonConfig, WholeEpisodes
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
 

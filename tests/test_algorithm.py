@@ -1,20 +1,17 @@
 """The six steps together, on the linear-quadratic plant, where the right closure and the right gain are known."""
 
-import dataclasses
 import functools
 
 import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from tensordict import TensorDict
 from test_ddpg import optimal_gain
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
@@ -146,118 +143,6 @@ def test_live_starts_model_free_and_explores_less_and_less():
     assert found.referee.live == "model_free" and found.actor.policy is found.policies["model_free"]
     strengths = [found.episode()["exploration"] for _ in range(6)]
     assert strengths == pytest.approx([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
-
-
-def unsound(found, monkeypatch, episodes):
-    """Let step 4 find, in these episodes, a closure under which no flight stays finite."""
-    update = found.assimilation.update
-
-    def updated(*arguments):
-        descended = update(*arguments)
-        if found.episodes_done in episodes:
-            for weight in found.twin.closure.parameters():
-                weight.data.fill_(1e300)
-        return descended
-
-    monkeypatch.setattr(found.assimilation, "update", updated)
-
-
-@pytest.mark.parametrize("step", ["plan", "switch_policies"])
-def test_a_closure_that_cannot_be_flown_with_is_taken_back(monkeypatch, step):
-    found, sound = twinning(), twinning()
-    for algorithm in (found, sound):
-        algorithm.episode()
-    earlier = weights(found.twin.closure)
-    unsound(found, monkeypatch, {1})
-    # Compared with an algorithm whose step 4 finds nothing new, and whose planning begins afresh.
-    sound.planner.restart()
-    sound.assimilation.config = dataclasses.replace(sound.assimilation.config, iterations=0)
-    if step == "switch_policies":
-        for algorithm in (found, sound):
-            monkeypatch.setattr(algorithm, "plan", functools.wraps(algorithm.plan)(lambda: TensorDict({})))
-    report, expected = found.episode(), sound.episode()
-    assert report["closure_refused"] == 1.0 and expected["closure_refused"] == 0.0
-    assert report["reason"].startswith("closure refused: plant") and "diverged" in report["reason"]
-    assert torch.equal(weights(found.twin.closure), earlier)
-    for role in found.policies:
-        assert torch.equal(weights(found.policies[role]), weights(sound.policies[role]))
-    assert report["J_a_model_based"] == expected["J_a_model_based"]
-
-
-def test_a_twin_that_diverges_with_the_earlier_closure_too_ends_the_training(monkeypatch):
-    found = twinning()
-    unsound(found, monkeypatch, {0})
-    monkeypatch.setattr(found.twin.closure, "load_state_dict", lambda state: None)
-    with pytest.raises(DivergenceError, match="diverged"):
-        found.episode()
-
-
-def flying(found, monkeypatch, diverging):
-    """Let the twin diverge under the policies of these modules, wherever virtual episodes are flown."""
-    cost = found.twin.cost
-
-    def checked(policy, *episodes):
-        if any(policy is module for module in diverging):
-            raise DivergenceError("plant 'linear_quadratic' diverged")
-        return cost(policy, *episodes)
-
-    monkeypatch.setattr(found.twin, "cost", checked)
-
-
-@pytest.mark.parametrize("live, idle", [("model_free", "model_based"), ("model_based", "model_free")])
-def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch, live, idle):
-    """The closure that was just found stays, the training goes on, and the live policy stays live."""
-    found = twinning(referee=RefereeConfig(patience=0))
-    found.referee.live = live
-    flying(found, monkeypatch, [found.policies[idle]])
-    report = found.episode()
-    assert report["closure_refused"] == 0.0 and found.referee.live == live
-    assert report[f"J_a_{idle}"].isinf() and report[f"J_a_{live}"].isfinite()
-    assert f"{idle} diverges on the twin" in report["reason"]
-    assert report["plan_accepted"] == 0.0 or idle == "model_free"
-
-
-def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monkeypatch):
-    """The weights that flew are sound; those that step 2 made of them diverge, cost infinitely much and lose."""
-    found = twinning(referee=RefereeConfig(patience=0))
-    update = found.learner.update
-
-    def ruined():
-        report = update()
-        with torch.no_grad():
-            found.policies["model_free"].gain.fill_(1e9)
-        return report
-
-    monkeypatch.setattr(found.learner, "update", ruined)
-    report = found.episode()
-    assert report["closure_refused"] == 0.0 and report["J_a_model_free"].isinf()
-    assert report["event"] == "swap" and found.referee.live == "model_based"
-    assert "model_free diverges on the twin" in report["reason"]
-
-
-def test_a_plan_that_diverges_is_refused_and_the_policy_before_stays(monkeypatch):
-    found, before = twinning(), {}
-    plan = found.planner.plan
-
-    def wild(episodes):
-        before["weights"] = weights(found.policies["model_based"])
-        descended = plan(episodes)
-        with torch.no_grad():
-            found.policies["model_based"].gain.fill_(1e9)  # finite weights under which the states overflow
-        return descended
-
-    monkeypatch.setattr(found.planner, "plan", wild)
-    report = found.episode()
-    assert report["plan_accepted"] == 0.0 and report["closure_refused"] == 0.0
-    assert torch.equal(weights(found.policies["model_based"]), before["weights"])
-    assert report["J_a_model_based"].isfinite()
-
-
-def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch):
-    found = twinning()
-    monkeypatch.setattr(found.referee, "worse", lambda cost, than: True)
-    report = found.episode()
-    assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
 
 
 def test_swap_changes_who_acts_and_copies_nothing():

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from rt_torchrl.options import check_options, require_widths
-from rt_torchrl.twinning.long_term_memory import LongTermMemoryConfig
+from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
 
 LearnerName = Literal["ddpg", "td3"]
 
