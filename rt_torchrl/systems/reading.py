@@ -65,7 +65,7 @@ class Reading:
         if tuple(found.shape) != (*reported.batch_size, len(signals)):
             raise ValueError(
                 f"{what}, read from {list(self.keys)}, has shape {tuple(found.shape)}; the plant needs "
-                f"{(*reported.batch_size, len(signals))} for {names}: give the reading a function `of` that makes it."
+                f"{(*reported.batch_size, len(signals))}, which is {names}: give the reading a function `of` them."
             )
         return in_units(found, self.scale, self.offset).reshape(1, len(signals))
 
