@@ -116,7 +116,7 @@ def test_dates_are_counted_from_the_first_row(tmp_path):
         (TABLE, ["when=time"], "column 'when' for 'time'"),
         (TABLE, ["t=clock"], "has the signals time, position"),
         (TABLE, ["t=time", "x_mm=position", "velocity=position"], "name a signal twice"),
-        (TABLE, ["t=time", "note=position"], "what is no number"),
+        (TABLE, ["t=time", "note=position"], "an entry that is not a number"),
         ("time,force\n0,1\n0.1,1\n", [], "no column disturbance"),
         (TABLE.replace("100,", "0,"), ["t=time"], "row 1 of the log .* the same time"),
         (TABLE.replace("250,", "50,"), ["t=time"], "row 2 of the log .* an earlier time"),

@@ -229,7 +229,7 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndar
         return np.empty(0)
     dates = column.signal == TIME and not pd.api.types.is_numeric_dtype(series)
     if dates and column.unit is not None:
-        raise ValueError(f"column {column.header!r} of {path} holds dates; leave out its unit {column.unit!r}.")
+        raise ValueError(f"column {column.header!r} of {path} holds dates; leave its unit {column.unit!r} away.")
     try:
         if dates:
             instants = pd.to_datetime(series, utc=True, format="ISO8601")

@@ -1,7 +1,7 @@
 r"""Reinforcement Twinning: the six steps of the paper's algorithm, one method each.
 
-Two policies of the same observation live side by side, π_mf (model-free) and π_mb (model-based). One is live: it acts
-on the real system. The other is idle, learns beside it and can take over.
+There are two policies of the same observation, π_mf (model-free) and π_mb (model-based). One is live: it acts on the
+real system. The other is idle: it learns at the same time and can take over.
 """
 
 import copy
@@ -40,17 +40,16 @@ class ReinforcementTwinning:
     Args:
         env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
-        model_free: π_mf, trained in place; starts live.
-        model_based: π_mb, trained in place.
-        config: see :class:`TwinningConfig`.
-        generator: source of everything random except what the real system draws itself.
-        learner: step 2, of the policy ``model_free``; that of ``config.learner`` by default.
-        planner: step 5, of the policy ``model_based``; that of ``config.planner`` by default.
-        referee: step 6; that of ``config.referee`` by default.
+        model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based``.
+        model_based: policy π_mb, trained in place.
+        config: hyper-parameters of the six steps.
+        generator: source of all random numbers that the real system does not draw itself.
+        learner: learner of step 2, which trains ``model_free``; by default ``config.learner`` makes it.
+        planner: planner of step 5, which trains ``model_based``; by default ``config.planner`` makes it.
+        referee: referee of step 6; by default ``config.referee`` makes it.
 
     Raises:
-        ValueError: if the real system is not one of batch size 1, or a learner or planner is given that trains another
-            policy.
+        ValueError: if the real system's batch size is not 1, or the learner or planner trains another policy.
     """
 
     def __init__(
@@ -85,13 +84,13 @@ class ReinforcementTwinning:
         self._earlier_closure: dict[str, Any] | None = None
 
     def episode(self, tell: Callable[[str], None] = lambda step: None) -> TensorDict:
-        """One real episode and all that is learned from it: the six steps of the paper, in order.
+        """Fly one real episode and learn from it: the six steps of the paper, in order.
 
         Args:
-            tell: is called with the name of every step as it begins.
+            tell: function that is called with the name of every step when the step begins.
 
         Returns:
-            ``real_cost``, the reports of the steps that were made, and ``seconds`` of each step.
+            ``real_cost``, the reports of the steps of this arm, and the ``seconds`` of each step.
         """
         arm, report, seconds = self.config.arm, findings(), {}
         steps = [self.interact]
@@ -110,10 +109,11 @@ class ReinforcementTwinning:
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
 
-        An episode with readings that cannot be learned from is flown again, and the report says how many were, and why.
+        An episode that cannot be learned from is flown again; the report gives the number of such episodes and the
+        reasons.
 
         Raises:
-            ValueError: if several episodes in a row cannot be learned from; nothing of them is in a memory.
+            ValueError: if several episodes in a row cannot be learned from; no memory holds anything of them.
         """
         live, strength, refused = self.referee.live, self.config.exploration.strength(self.episodes_done), []
         while True:
@@ -121,7 +121,7 @@ class ReinforcementTwinning:
             episode = self.collector.rollout()[0]
             if not note_refusal(refused, episode):
                 break
-        # What is learned from is the action that was applied.
+        # The learner learns from the action that was applied.
         episode["action"] = episode["next", "applied"]
         self.learner.store(episode)
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
@@ -140,24 +140,24 @@ class ReinforcementTwinning:
         return self.learner.update()
 
     def fit_exogenous(self) -> TensorDict:
-        """Step 3: a Gaussian process of the exogenous input of this episode."""
+        """Step 3: fit a Gaussian process to the exogenous input of this episode."""
         self.virtual.learn(self.short_term[-1])
         return findings()
 
     def assimilate(self) -> TensorDict:
-        """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
+        """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories with the stored actions."""
         processes = list(self.virtual.processes)[-len(self.short_term) :]
         self._earlier_closure = copy.deepcopy(self.twin.closure.state_dict())
         found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
         return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
 
     def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Step 5 or 6; if the live policy diverges in it, the closure of the episode before takes the place of w_p*.
+        """Take step 5 or 6; if the live policy diverges in it, repeat it with the closure of the last episode.
 
-        The live policy has just flown on the real system, so the closure must be wrong; any other policy may diverge on
-        a sound twin, and loses. Note: the paper keeps every closure. One that replays the records best may still be one
-        that no other flight can be made with, where noise of the sensors is large beside what the closure does; the
-        real system cannot wait.
+        The live policy has just flown on the real system, so the closure must be wrong. Any other policy may diverge on
+        a sound twin, and loses. Note: the paper keeps every closure. Where the sensors' noise is larger than the effect
+        of the closure, even the closure that replays the records best may diverge in other flights, and the real system
+        cannot wait.
 
         Raises:
             DivergenceError: if the live policy diverges with the earlier closure too.
@@ -177,10 +177,10 @@ class ReinforcementTwinning:
         return merged(step(), findings(refused, closure_refused=1.0))
 
     def plan(self) -> TensorDict:
-        """Step 5: π_mb is planned on the twin with w_p*; the referee keeps the plan only if it is no worse.
+        """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse.
 
-        Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the policy before on N others,
-        because the best policy for a few winds can lie just beyond a cliff of another one.
+        Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the previous policy on N other
+        winds, because the best policy for a few winds can lie just beyond a cliff of another wind.
         """
         count = self.config.planner.realisations or self.config.realisations
         planned_on, judged_on = map(self.virtual.draw, (count, self.config.virtual_episodes))
@@ -208,7 +208,7 @@ class ReinforcementTwinning:
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
-        """Step 6: mean J_a of both policies over the same N virtual episodes, then the referee's word."""
+        """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
         judged_on = self.virtual.draw(self.config.virtual_episodes)
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
@@ -228,21 +228,21 @@ class ReinforcementTwinning:
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
     def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
-        """Mean J_a of policies over virtual episodes; infinite for an idle policy under which the twin diverges.
+        """Mean J_a of policies over virtual episodes; infinite for an idle policy with which the twin diverges.
 
         Raises:
-            DivergenceError: if the twin diverges under the live policy.
+            DivergenceError: if the twin diverges with the live policy.
         """
         flies = {role: role == self.referee.live for role in roles}
         return {role: self.virtual.cost(self.policies[role], episodes, flies=flies[role]) for role in roles}
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """The live policy into the idle one: a copy of its weights, or a distillation into another architecture.
+        """Clone the live policy into the idle one, by a copy of its weights or, across architectures, by distillation.
 
         Args:
-            costs: mean J_a of both policies over ``judged_on``, where the referee may find a distilled clone worse than
-                the policy it replaces.
-            judged_on: virtual episodes.
+            costs: mean J_a of both policies over ``judged_on``.
+            judged_on: virtual episodes on which the referee may find a distilled clone worse than the policy that it
+                replaces; the clone is then refused.
         """
         live, idle = (self.policies[role] for role in (self.referee.live, self.referee.idle))
         report = findings()
@@ -256,13 +256,13 @@ class ReinforcementTwinning:
             report = findings(distillation_error=error, distillation_cost_ratio=cost / costs[self.referee.live])
             if self.referee.worse(cost.item(), than=replaced.item()):
                 idle.load_state_dict(before)
-                reason = f"clone refused: J_a {cost:.4g} of it, {replaced:.4g} of what it replaces"
+                reason = f"clone refused: its J_a is {cost:.4g}, that of the policy it replaces {replaced:.4g}"
                 return merged(report, findings(reason)).set_non_tensor("event", "keep")
         (self.learner if self.referee.idle == "model_free" else self.planner).restart()
         return report
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next episode depends on: the state of every component, in tensors and plain containers."""
+        """State of every component, which the next episode depends on, in tensors and plain containers."""
         return {
             "episodes_done": self.episodes_done,
             "generator": self.generator.get_state(),
@@ -272,10 +272,10 @@ class ReinforcementTwinning:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict` of an algorithm that was built with the same arguments.
+        """Go on from the :meth:`state_dict` of an algorithm that was built with the same arguments.
 
         Raises:
-            ValueError: if the weights do not fit; names the component.
+            ValueError: if the state of a component does not fit; it names the component.
         """
         kept = {name: state[name] for name in KEPT}
         state = state | tree_map_only(Tensor, lambda tensor: tensor.to(self.generator.device), kept)
@@ -285,7 +285,7 @@ class ReinforcementTwinning:
         for name, (part, saved) in parts.items():
             try:
                 part.load_state_dict(saved)
-            # Torch, tensordict and environments each have errors of their own for what does not fit.
+            # Torch, tensordict and environments each raise errors of their own if a state does not fit.
             except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
                 raise ValueError(f"the saved state of {name} does not fit: {error}") from error
         self.generator.set_state(state["generator"].cpu())
@@ -293,15 +293,15 @@ class ReinforcementTwinning:
 
 
 KEPT = ("virtual", "short_term", "track_record")
-"""Components that take the tensors of their state as they are, wherever these lie."""
+"""Components that take the tensors of their state without moving them to another device."""
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
 
 
 def require_own_policies(algorithm: ReinforcementTwinning) -> None:
-    """Refuse a learner or planner that would train a policy which nobody flies.
+    """Refuse a learner or planner that would train a policy which never flies.
 
     Raises:
-        ValueError: naming it.
+        ValueError: if there is one; it names the component.
     """
     for part, role in (("learner", "model_free"), ("planner", "model_based")):
         if getattr(algorithm, part).policy is not algorithm.policies[role]:
