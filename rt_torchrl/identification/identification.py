@@ -30,9 +30,11 @@ class IdentificationConfig:
 
     Args:
         iterations: trial steps of each descent, see :class:`Identification`.
-        optimiser: levenberg_marquardt, for closures of some ten weights; adam or lbfgs, for closures of more weights.
+        optimiser: method of the descent: levenberg_marquardt for closures of some ten weights, or adam or lbfgs for
+            closures of more weights.
         rate: learning rate of adam, or first step length of lbfgs.
-        initial: estimated makes the initial state of each segment an unknown; measured takes it from the first sample.
+        initial: initial state of each segment: estimated, as an unknown of which the first sample is a measurement, or
+            measured, as in the first sample.
     """
 
     iterations: int = 30

@@ -30,8 +30,8 @@ class RunConfig:
         policy: kind of both policies: plant for the plant's own policy, or mlp. A recipe may call its plant's own
             policy paper, and offer other policies.
         hidden: widths of the hidden layers of an mlp policy.
-        model_free_policy: kind of the model-free policy, one of the choices of policy; same for the kind of the
-            model-based policy with the same initial weights.
+        model_free_policy: kind of the model-free policy, one of the choices of policy; same for the kind and the
+            initial weights of the model-based policy.
         closure: law in the twin: plant for the plant's own law, or mlp for a law with a perceptron in it. A recipe may
             call its plant's own law paper, and may train an mlp with other defaults of twinning.records and
             twinning.assimilation, which it calls NEURAL.
@@ -47,8 +47,8 @@ class RunConfig:
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir.
         overwrite: whether to replace the files that an earlier run left in log_dir.
-        quick: whether to make a whole run that is small: at most 3 episodes, 200 critic and actor iterations, 5 unseen
-            episodes.
+        quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
+            unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end.
         untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
             compared with; 0 leaves this comparison out.

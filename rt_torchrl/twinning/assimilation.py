@@ -33,11 +33,11 @@ class AssimilationConfig:
         iterations: number n_G of gradients per episode.
         stop_ratio: share of the J_p at the start of the episode below which the descent ends; with 0 it never ends
             early.
-        inputs: ``realisations`` replays the record with N_z samples of the exogenous process, as in the paper;
-            ``record`` replays it with the measured exogenous input. With realisations a twin does not fit chance in the
-            input, but it also does not find weights that move the states less than that chance does.
-        method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
-            forward sensitivities, for closures of some ten weights, and does not use ``descent``.
+        inputs: exogenous input of the replay: ``realisations`` for N_z samples of the exogenous process, as in the
+            paper, or ``record`` for the measured input. With realisations a twin does not fit chance in the input, but
+            it also does not find weights that move the states less than that chance does.
+        method: method of the fit: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the
+            normal equations from forward sensitivities, for closures of some ten weights, and does not use ``descent``.
         prior: factor ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in the unit of J_p, on the weights w of the closure's
             perceptrons (:class:`BoundedPerceptron`); 0 leaves it out. Weights of which the records say nothing then
             keep their initial values, and so the law keeps its initial form where no record has been.
@@ -45,10 +45,10 @@ class AssimilationConfig:
             shooting); 0 replays whole records, as in the paper. Over short segments the states are nearly linear in the
             weights, so a closure with many weights fits the record in a few steps. The J_p that descends is then the
             mean over the segments.
-        initial: ``measured`` starts a replay from the first reading of the sensors, as in the paper. ``estimated``
-            makes those components of the first state that J_p compares unknowns beside the weights; without it, a plant
-            that forgets slowly carries the error of the first reading through the whole record, and the weights make up
-            for it. It needs ``levenberg_marquardt`` and the inputs of the ``record``.
+        initial: first state of a replay: ``measured`` for the first reading of the sensors, as in the paper, or
+            else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
+            that forgets slowly carries the error of the first reading through the whole record, and the weights would
+            make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
         descent: parameters of the closure's descent.
     """
 

@@ -79,11 +79,11 @@ class LearnerConfig:
     """Parameters of step 2.
 
     Args:
-        algorithm: ``ddpg``, as in the paper, or ``td3``, which has two critics, of which the lower value counts, a
-            delayed policy and smoothed targets.
+        algorithm: model-free method: ``ddpg``, as in the paper, or ``td3``, which takes the lower value of two critics,
+            delays the policy and smooths the targets.
         critic_iterations: number n_Q of critic iterations per episode.
-        actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one policy iteration for every
-            ``td3.delay`` critic iterations instead.
+        actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every ``td3.delay``
+            critic iterations instead.
         batch_size: number n_b of transitions in a batch; it is at most the number n_t of control intervals.
         discount: discount factor γ per control interval.
         return_steps: number of control intervals whose rewards a target sums before it bootstraps; 1 as in the paper.

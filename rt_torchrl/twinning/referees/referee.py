@@ -18,8 +18,8 @@ class RefereeConfig:
     """Parameters of step 6.
 
     Args:
-        rule: ``decision_tree``, as in the paper, or ``trust_ratio``, which believes the twin only while the real cost
-            follows the twin's predictions.
+        rule: rule of the referee: ``decision_tree``, as in the paper, or ``trust_ratio``, which believes the twin only
+            while the real cost follows the twin's predictions.
         patience: number P_π of episodes in a row that a reason to swap must outlast.
         clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
             a clone.
