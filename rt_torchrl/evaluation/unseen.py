@@ -65,7 +65,7 @@ class UnseenEpisodes:
         return control_cost(self.plant, self.fly(policy))
 
     def validation(self) -> "UnseenEpisodes | None":
-        """As many validation episodes, with other draws, on the system as it is now; None if they would cost flights.
+        """Validation episodes: as many, with other draws, on the system as it is now; None if they would cost flights.
 
         A policy that is chosen by its cost on some episodes costs less on these than on others.
         """

@@ -145,7 +145,7 @@ def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarra
 
 
 def _numbers(closure: dict[str, Any] | None) -> dict[str, float]:
-    """Those weights from :func:`named_weights` that are numbers with a name."""
+    """Weights from :func:`named_weights` that are numbers with a name."""
     return {name: value for name, value in (closure or {}).items() if isinstance(value, float)}
 
 

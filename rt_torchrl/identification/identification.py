@@ -51,7 +51,7 @@ class IdentificationConfig:
 
 
 class Judgement(NamedTuple):
-    """How good a twin is on segments: J_p summed over them, their total length [s], RMS errors and replayed states."""
+    """Result of a twin on segments: the sum of J_p, the total length [s], RMS errors, and the states as replayed."""
 
     J_p: float
     seconds: float

@@ -1,4 +1,4 @@
-"""Where an environment reports the vectors of a plant, and where it takes its action."""
+"""The places of a plant's vectors in an environment's report, and the place where it takes its action."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ def joined(*entries: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """Where an environment reports a vector of the plant, which is offset + scale·of(entries).
+    """The place of a plant's vector in an environment's report; the vector is offset + scale·of(entries).
 
     Args:
         keys: entries of the environment's TensorDict that are read.
@@ -83,7 +83,7 @@ class Reading:
 
 @dataclass(frozen=True, kw_only=True)
 class Actuation:
-    """Where an environment takes its action; the plant's command is offset + scale·action.
+    """The place where an environment takes its action; the plant's command is offset + scale·action.
 
     Args:
         key: entry of the environment's TensorDict that takes the action.

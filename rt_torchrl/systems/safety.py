@@ -246,7 +246,7 @@ class SafetyLayer(EnvBase):
         return applied, reasons | held
 
     def _faults(self, found: TensorDictBase, elapsed: float, when: str) -> dict[str, str]:
-        """What is wrong with an observation, by kind of fault.
+        """Faults of an observation by kind, each with a detail.
 
         Raises:
             ValueError: if an entry is missing that the system declares.

@@ -53,7 +53,7 @@ class Watchdog:
         self._since, self._until = math.inf, -math.inf
 
     def faults(self, entries: Mapping[str, Tensor], elapsed: float) -> dict[str, str]:
-        """What is wrong with an observation, by kind of fault.
+        """Faults of an observation by kind, each with a detail.
 
         Args:
             entries: entries of the observation.

@@ -215,7 +215,7 @@ class Assimilation:
         plant, target = self.twin.plant, measured[:, 1:]
         share = plant.dt / len(measured)
         g, H = discrepancy_derivatives(plant, states, target)
-        # For a closure of many weights the products below are most of the work, so they skip states without a part.
+        # For a closure of many weights the products below are most of the work; they skip states that L_p ignores.
         seen = compared(H)
         H, S_seen = H[..., seen, :][..., seen], S[:, :, seen]
         return NormalEquations(
