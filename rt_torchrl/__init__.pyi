@@ -1,6 +1,6 @@
-"""The public names of the library: ``__init__.py`` imports them from where this file says, each at its first use."""
+"""The public names of the library; ``__init__.py`` imports each at its first use, from the module named here."""
 
-# Plants and what may stand in them
+# Plants and their parts
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.disturbance import require_request
 from .plants.integrators import rk4_step
@@ -38,7 +38,7 @@ from .twinning.learners.long_term_memory import LongTermMemoryConfig
 from .twinning.planners import Planner, PlannerConfig, ShortHorizon, ShortHorizonConfig, WholeEpisodes
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
 
-# Trainings from the command line, and what they leave
+# Trainings from the command line, and their results
 from .options import check_options
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.run import Run, main_of, require_device

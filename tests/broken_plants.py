@@ -1,4 +1,4 @@
-"""Plants that break the contract, each in one way, and what the check is to say of it."""
+"""Plants that break the contract, each in one way, and the message that the check must give for each."""
 
 import dataclasses
 
@@ -229,7 +229,7 @@ class Late(LinearQuadratic):
 
 
 class Unwrapped(LinearQuadratic):
-    """Its position is the angle of a motor, which its cost takes for a length."""
+    """A plant whose position is the angle of a motor, which its cost takes for a length."""
 
     states = (dataclasses.replace(LinearQuadratic.states[0], low=-9.0, high=9.0, periodic=True), SPEED)
 

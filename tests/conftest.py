@@ -12,7 +12,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 @pytest.fixture
 def unchecked():
-    """Without the run-time checks of annotations, for values that these would refuse before the library does."""
+    """Switch the run-time checks of annotations off, for values that they would refuse before the library does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

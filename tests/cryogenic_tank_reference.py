@@ -72,7 +72,7 @@ def flown(plant, p, drop, load, n, closure=None):
 
 
 class Ledger:
-    """The plant with three more states, integrated by the same step: what the vent took, and the heat that came in.
+    """The plant with three more states, integrated by the same step: what has left by the vent, and the heat let in.
 
     So the integrals of the fluxes have the order of the states. The fluxes are read off the vent and the saturation
     table; the rates that they are compared with come from the derivatives of the balances.
@@ -95,7 +95,7 @@ class Ledger:
         return tank.rho_l * V_l + tank.rho_v * (V_T - V_l)
 
     def energy(self, state, heat_capacity=M_C):
-        """Of wall and mixture, H − pV."""
+        """Energy H − pV of wall and mixture."""
         tank, V_l, p = self.plant.saturation(state[..., 2]), state[..., 1], state[..., 2]
         enthalpy = tank.rho_l * tank.h_l * V_l + tank.rho_v * tank.h_v * (V_T - V_l)
         return heat_capacity * state[..., 0] + enthalpy - p * V_T

@@ -29,7 +29,7 @@ FACTORIES = {
 
 
 class RequireDevice(TorchFunctionMode):
-    """Collects where code of this library makes a tensor without saying on which device."""
+    """A mode that collects the places where code of this library makes a tensor without naming its device."""
 
     def __init__(self):
         super().__init__()

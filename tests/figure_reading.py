@@ -1,4 +1,4 @@
-"""What the tests of figures share: a snapshot without a training, and what is read off a drawn figure."""
+"""Common parts of the tests of figures: a snapshot without a training, and readings of a drawn figure."""
 
 from itertools import combinations
 
@@ -35,7 +35,7 @@ def snapshot_of(plant, twin, *, shift, realisations=True, episodes=()) -> Snapsh
 
 
 def draw(figure) -> set[str]:
-    """Draw it, which raises on broken mathtext; return every text."""
+    """Draw a figure, which raises on broken mathtext, and return every text in it."""
     FigureCanvasAgg(figure).draw()
     return {text.get_text() for text in figure.findobj(Text)}
 
@@ -66,5 +66,5 @@ def collisions(figure) -> list[tuple[str, str]]:
 
 
 def line(ax, label):
-    """The line of that label."""
+    """The line with this label."""
     return next(line for line in ax.lines if line.get_label() == label)

@@ -1,6 +1,6 @@
 """Oracle for the forces of the flapping wing: the paper's formulas read literally, in numpy.
 
-Literally but for the misprints that the plant names: the sign of R_2(α), and ż in the place of ẏ.
+The misprints that the plant names are corrected: the sign of R_2(α), and ż in the place of ẏ.
 """
 
 import numpy as np

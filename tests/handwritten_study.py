@@ -37,7 +37,7 @@ WRITE_RESULTS = (
 
 
 def written(path, main):
-    """A recipe of the options every recipe has, with this as its main."""
+    """A recipe with the options that every recipe has, and with this code as its main."""
     path.write_text(
         "import json, os\n"
         "from dataclasses import dataclass\n"
@@ -69,12 +69,12 @@ def summary(costs, live="model_based"):
 
 
 def finished(tmp_path, seed, shift, **options):
-    """A training whose results are there: costs about 1 + shift."""
+    """A finished training, whose costs are about 1 + shift."""
     return finish(training(tmp_path, seed, **options), shift)
 
 
 def finish(found, shift=0.0):
-    """Leave the results of a training: costs about 1 + shift in each of its episodes, at most three."""
+    """Write the results of a training, with costs of about 1 + shift in each of its episodes, at most three."""
     costs = (1.0 + shift + 0.1 * np.random.default_rng(7).standard_normal(EPISODES)).tolist()
     found.folder.mkdir(parents=True)
     episodes = [

@@ -1,4 +1,4 @@
-r"""A linear-quadratic control problem under partial observation, whose answer needs no training.
+r"""A linear-quadratic control problem under partial observation, whose optimum is known without a training.
 
 The oscillator of :mod:`linear_quadratic`, with two things that its policy does not see: the force follows the command
 with a lag, :math:`\dot f = (a - f)/\tau`, and the disturbance is coloured, :math:`d_{k+1} = \rho d_k + w_k`. The policy
@@ -30,7 +30,7 @@ class HiddenForce(LinearQuadratic):
         dt: control interval [s], a fifth of the lag and a sixtieth of the oscillator's period.
         horizon: length of an episode [s], ten periods.
         deviation: standard deviation of the disturbance [m/s^2].
-        correlation_time: of the disturbance [s].
+        correlation_time: correlation time of the disturbance [s].
     """
 
     name = "hidden_force"
@@ -84,7 +84,7 @@ class Answer:
         self.W[3, 3], self.Q[:3, :3], self.n = plant.noise**2 * (1.0 - plant.memory**2), Q, plant.n_steps
 
     def closed(self, gain):
-        """The gain of ξ, from one of (x, v) or of ξ, and F_K."""
+        """The gain on ξ and F_K, for a gain on (x, v) or on ξ."""
         K = np.zeros((1, 4))
         K[0, : np.size(gain)] = np.ravel(gain)
         return K, self.F - self.G @ K
@@ -113,7 +113,7 @@ class Answer:
     def policy_gradient(self, gain, discount):
         r"""Half the mean of :math:`(dq/da)(da/dK)` over settled episodes, with the true q of discounted costs.
 
-        Where it is zero, a learner stays that makes no error but for its discount.
+        A learner whose only error is its discount stays where this gradient is zero.
         """
         K, F = self.closed(gain)
         seen = solve_discrete_lyapunov(F, self.W)

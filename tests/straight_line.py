@@ -11,7 +11,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class Slope(nn.Module):
-    """ẋ = w_0, and what a second weight does that only the input shows."""
+    """ẋ = w_0 + w_1 z; the second weight shows only where there is an input."""
 
     def __init__(self):
         super().__init__()
@@ -50,7 +50,7 @@ def line_segment(values, wind=0.0, start=0.0):
 
 
 def noise_of(n, seed, *, smooth=False):
-    """White noise of unit deviation, or the mean of neighbours of it."""
+    """White noise of unit deviation, or means of neighbouring samples of it."""
     values = np.random.default_rng(seed).normal(size=n + 1)
     return 0.5 * (values[1:] + values[:-1]) if smooth else values[1:]
 

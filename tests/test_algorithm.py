@@ -51,7 +51,7 @@ def weights(module):
 
 
 def scripted(found, live, idle):
-    """Let step 6 see these costs."""
+    """Make step 6 compare these costs."""
     costs = {found.referee.live: live, found.referee.idle: idle}
     found.virtual_costs = lambda *arguments: {role: torch.tensor(cost) for role, cost in costs.items()}
 
@@ -88,7 +88,7 @@ def test_arms_touch_their_own_half_alone():
 
 
 def test_what_is_stored_is_what_was_applied():
-    """On the turbine, whose rate limits change most commands of a policy with noise."""
+    """The turbine's rate limits change most commands of a policy with noise."""
     found = twinning(WindTurbine(horizon=30.0), exploration=ExplorationConfig(spread=1.0, episodes=5))
     flown = []
     fly = found.collector.rollout
@@ -218,7 +218,7 @@ def test_identification_finds_the_true_closure():
 
 
 def test_planning_finds_the_optimal_gain():
-    """On the true twin and over 10 s, ten time constants of the loop, the best constant gain is Riccati's."""
+    """The best constant gain on the true twin is Riccati's over 10 s, which are ten time constants of the loop."""
     plant = LinearQuadratic(horizon=10.0, noise=0.0)
     found = twinning(
         plant,

@@ -12,7 +12,7 @@ RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 
 
 def compared(tmp_path, *options):
-    """What the benchmark writes, run in a process of its own."""
+    """Output of the benchmark, which runs in a process of its own."""
     output = tmp_path / "result.json"
     command = [sys.executable, str(RECIPE), "--repeats", "1", "--output", str(output), *options]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -83,7 +83,7 @@ def test_what_fails_in_the_simulator_is_told_where_it_is_stepped():
 
 
 def within(seconds, call):
-    """What a call raises, from a thread that may hang."""
+    """The error that a call raises, made in a thread because the call may hang."""
     raised = []
 
     def run():
@@ -100,7 +100,7 @@ def within(seconds, call):
 
 
 def test_a_step_without_an_episode_is_refused():
-    """Before the first reset, after the end, and after a failure; a reset begins anew."""
+    """There is no episode before the first reset, after the end and after a failure; a reset begins a new one."""
 
     def breaks(seed, controller):
         controller({"place and rate": np.zeros(2)})

@@ -16,7 +16,7 @@ from rt_torchrl.contract.stability import amplification, stable_step
 
 
 def violations(plant, **options):
-    """What is found; the methods of a test's run are checked by jaxtyping, which cannot be traced."""
+    """Violations that the check finds; jaxtyping checks methods during a test, and cannot be traced."""
     with pytest.raises(PlantContractError) as raised:
         check_plant(plant, traced=False, **options)
     return raised.value.violations
@@ -55,7 +55,7 @@ def test_a_sound_plant_is_told_what_was_checked():
 
 
 def test_a_plant_without_chance_is_sound():
-    """The same start and no disturbance in every episode."""
+    """Every episode of this plant has the same start and no disturbance."""
 
     class Steady(LinearQuadratic):
         def draw_initial_state(self, batch, generator):
@@ -68,7 +68,7 @@ def test_a_plant_without_chance_is_sound():
 
 
 def test_the_check_leaves_no_trace():
-    """Neither in the plant's weights nor in torch's global random numbers."""
+    """The check changes neither the plant's weights nor torch's global random numbers."""
     plant = LinearQuadratic()
     before, numbers = plant.closure.matrix.clone(), torch.random.get_rng_state()
     check_plant(plant, traced=False)
@@ -116,7 +116,7 @@ for kind in TRACED:
 
 
 def test_what_is_not_one_graph_is_found():
-    """In a process of its own: the run-time checks of this one cannot be traced."""
+    """The check runs in a process of its own, because the run-time checks of this one cannot be traced."""
     root = Path(__file__).parent.parent
     done = subprocess.run([sys.executable, "-c", TRACE], cwd=root, capture_output=True, text=True)
     found = {name: violations for name, *violations in (line.split("\t") for line in done.stdout.splitlines())}

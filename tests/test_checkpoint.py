@@ -81,7 +81,7 @@ def test_a_checkpoint_of_another_format_is_refused(folder, tmp_path):
 
 
 def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
-    """Its arguments are no options: only the weights show them."""
+    """The plant's arguments are not options of the run, so only the weights show them."""
     small_run(tmp_path, episodes=1, model_free_policy="mlp", hidden=(4,), **QUICK).train()
     config = json.loads((tmp_path / "config.json").read_text())
 

@@ -12,7 +12,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 def system(plant, batch=1, **options):
-    """A real system, what acts on it, and the policy behind that; alike at every call."""
+    """A real system, the actor on it, and the actor's policy; every call makes them alike."""
     generator = torch.Generator().manual_seed(1)
     policy = plant.make_policy(generator)
     actor = LivePolicy(plant, policy, ExplorationConfig(correlation_time=3.0 * plant.dt), generator=generator)

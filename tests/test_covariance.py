@@ -78,7 +78,7 @@ def test_scores_of_white_noise_sum_to_their_variance():
 
 
 def test_named_errors_follow_from_those_of_the_logarithms():
-    """Of a = e^w to first order, σ_a = a σ_w."""
+    """The standard error of a = e^w is, to first order, σ_a = a σ_w."""
     plant = FlappingWing(horizon=0.03)
     segments = flown(plant, torch.Generator().manual_seed(0), (60,))
     closure = QuasiSteadyPolar.true().requires_grad_(True)

@@ -46,7 +46,7 @@ def transitions(observation, action, reward, following, done=False):
 
 
 def filled(data, found, seed=1, **options):
-    """The learner's memory with just these transitions."""
+    """The learner's memory with these transitions alone."""
     found.memory = LongTermMemory(LongTermMemoryConfig(capacity=len(data), **options), generator=seeded(seed))
     found.memory.store(data, found.td_errors(data))
     return found.memory

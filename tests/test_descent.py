@@ -142,7 +142,7 @@ def test_state_round_trip_continues_identically():
 
 
 class Cliff(Bowl):
-    """The bowl, which diverges where the second weight is below −1: in one of three ways."""
+    """The bowl, which diverges in one of three ways where the second weight is below −1."""
 
     def __init__(self, point, kind):
         super().__init__(point)

@@ -49,7 +49,7 @@ def distilled(live, idle, **options):
 
 
 def test_a_perceptron_learns_an_affine_law():
-    """On observations it has not been shown, and at the cost of the teacher."""
+    """The clone agrees on observations that it has not been shown, and costs as much as the teacher."""
     live, idle = affine([-0.8, -1.1]), perceptron()
     before = weights(live)
     found = distilled(live, idle)
@@ -156,7 +156,7 @@ def test_wrong_counts_are_refused(argument):
 
 
 def test_a_copy_of_weights_is_no_clone_of_another_activation():
-    """Same names and shapes, other functions: copied weights would make another policy."""
+    """Weights have the same names and shapes but make other functions, so a copy of them is another policy."""
 
     def network(activation, generator_seed=0):
         torch.manual_seed(generator_seed)

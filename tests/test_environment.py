@@ -12,7 +12,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 def act(env, found, action):
-    """One step; the TensorDict with ``next``."""
+    """Make one step and return its TensorDict, with ``next``."""
     return env.step(found.clone().set("action", action))
 
 
@@ -66,7 +66,7 @@ def test_input_of_an_interval_is_that_of_the_draw():
 
 
 class Clock(LinearQuadratic):
-    """Shows the time, moves and costs by it."""
+    """A plant whose observation, motion and cost depend on the time."""
 
     def vector_field(self, t, state, action, exogenous, closure):
         return torch.ones_like(state) * t.unsqueeze(-1)

@@ -106,7 +106,7 @@ LAGS = (-8, -4, -1, 0, 1, 4, 8)
 
 
 def cross_covariance(found, h):
-    """Of the first component, h samples later, and the second."""
+    """Covariance of the first component, h samples later, with the second."""
     return (found.covariance[abs(h)] if h >= 0 else found.covariance[abs(h)].T)[0, 1].item()
 
 

@@ -10,7 +10,7 @@ from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
 
 class Held(torch.nn.Module):
-    """Asks for the same action always."""
+    """A policy that always asks for the same action."""
 
     def __init__(self, action):
         super().__init__()
@@ -21,7 +21,7 @@ class Held(torch.nn.Module):
 
 
 def noise(plant, n=40_000, *, strength=1.0, **options):
-    """What a policy that asks for mid-range is made to do, over half the range."""
+    """Actions that noise makes of a policy that asks for mid-range, as shares of half the range."""
     middle = torch.tensor([0.5 * (a.low + a.high) for a in plant.actions], dtype=torch.float64)
     config = ExplorationConfig(spread=0.1, **options)
     actor = LivePolicy(plant, Held(middle), config, generator=torch.Generator().manual_seed(0))

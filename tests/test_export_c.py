@@ -39,7 +39,7 @@ def unbounded(n):
 
 
 def build(path, function):
-    """Compiled with all warnings as errors, called without the library's own loader."""
+    """A library of the C file, compiled with all warnings as errors and called without this library's loader."""
     library = path.with_suffix(".so")
     subprocess.run([COMPILER, "-std=c99", *STRICT, "-shared", "-fPIC", path, "-o", library, "-lm"], check=True)
     return getattr(ctypes.CDLL(str(library)), function)
@@ -156,7 +156,7 @@ FORMULAS = {
 
 
 def named(values):
-    """An action for every element of every value, named after it: an error then tells where it is."""
+    """Actions, one for every element of every value and named after it, so that an error tells the element."""
     names = [f"{name.replace(' ', '_')}_{k}" for name, value in values.items() for k in range(value.shape[-1])]
     return [Signal(symbol="a", name=name, unit="-") for name in names]
 

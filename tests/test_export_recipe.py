@@ -29,7 +29,7 @@ def recipe(name):
 
 
 def leave_run(folder, name, **options):
-    """What Run.train writes of a run, as it writes it, with random weights."""
+    """Write the files of a run as Run.train writes them, with random weights."""
     config = config_class_of(RECIPES / f"{name}.py")(seed=3, log_dir=folder, **options)
     plant, generator = config.plant(), torch.Generator().manual_seed(7)
     parts = {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}

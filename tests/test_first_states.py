@@ -58,7 +58,7 @@ def test_nothing_is_drawn_from_a_record_without_noise():
 
 @pytest.mark.parametrize("initial", ["measured", "estimated"])
 def test_what_is_reported_of_segments_is_the_cost_of_whole_records(initial):
-    """With the start that suits the whole record best, here a regression on what the slope leaves."""
+    """J_p has the start that suits the whole record best, which is here a regression on the residuals of the slope."""
     record, closure = lines()[0], Slope()
     found = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
     found = found.update([record], [], 1, torch.Generator())
@@ -99,14 +99,14 @@ def test_what_first_states_need_is_demanded(options):
 
 
 class Capped(Slope):
-    """ẋ = min(w_0, 1): above one the weight shows nowhere."""
+    """ẋ = min(w_0, 1): above one the weight has no effect."""
 
     def forward(self, features):
         return self.w[:1].clamp(max=1.0).expand_as(features)
 
 
 def test_the_error_of_a_first_sample_does_not_leave_a_weight_where_it_shows_nowhere():
-    """From the first sample, two metres too low, the best slope is above the cap, where no gradient leads back."""
+    """With the first sample, two metres too low, the best slope is above the cap, from where no gradient leads back."""
     values = 0.9 * 0.1 * np.arange(101) + 0.01 * noise_of(101, 0)
     values[0] -= 2.0
     segments, closure = [line_segment(values)], Capped()

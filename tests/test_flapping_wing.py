@@ -28,7 +28,7 @@ def double(*values):
 
 
 class Converged(FlappingWing):
-    """Without the errors of quadrature and floor, to compare formulas."""
+    """The plant without the errors of quadrature and floor, for comparisons of formulas."""
 
     span_nodes = 40
     smallest_airspeed = 1e-9
@@ -56,7 +56,7 @@ def plant():
 
 
 def mean_force(plant, amplitude, stroke_angle=0.0, headwind=0.0):
-    """Over one beat, over the weight, at rest."""
+    """Mean force over one beat at rest, divided by the weight."""
     n = 400
     t = torch.arange(n, dtype=torch.float64) / (n * FREQUENCY)
     acceleration = plant.vector_field(

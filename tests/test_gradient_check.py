@@ -10,7 +10,7 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 
 
 class TwoParts(nn.Module):
-    """A closure of which one part can be held."""
+    """A closure with a part that can be frozen."""
 
     def __init__(self, plant):
         super().__init__()

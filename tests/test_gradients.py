@@ -96,7 +96,7 @@ class Case:
         return control_cost(self.plant, flown).sum() + projected / self.plant.n_steps
 
     def leaves(self):
-        """Everything a gradient can be asked for, by name, with the size of a typical change."""
+        """Tensors that a gradient can be taken by, by name, with the size of a typical change."""
         found = {
             "initial_state": (self.initial_state, self.state_scale),
             "exogenous": (self.exogenous, 1.0 + self.exogenous.abs().mean((0, 1))),
@@ -159,7 +159,7 @@ def test_parallel_equals_autograd_and_differences(plant, closure, driver, batch)
 
 @pytest.mark.parametrize("driver", ["commands", "policy"])
 def test_continuous_adjoint_is_of_fourth_order(driver):
-    """One drive, constant over 0.4 s, on ever finer steps: the gap to the exact gradient falls like dt⁴."""
+    """With a drive that is constant over 0.4 s, on ever finer steps, the gap to the exact gradient falls like dt⁴."""
     gaps = []
     for refinement in (1, 2, 4, 8):
         case = Case(LinearQuadratic(dt=0.4, horizon=4.0), "perceptron", driver, 4).refined(refinement)
@@ -192,7 +192,7 @@ def test_continuous_adjoint_of_a_linear_system_is_exact_but_for_the_weights():
 
 @pytest.mark.parametrize("driver", ["perceptron", "commands"])
 def test_products_are_made_in_pieces(driver, monkeypatch):
-    """A tape of at most 50 intervals at a time, of 160 in all; the gradients are those of one piece, and exact."""
+    """The tape holds at most 50 of 160 intervals at a time; the gradients are exact and equal those of one piece."""
     case, seen = Case(PLANTS["linear_quadratic"](), "perceptron", driver, 4), []
     whole = case.gradients("parallel")
     monkeypatch.setattr(linearisation, "PIECE", 50)
@@ -236,7 +236,7 @@ print("compared")
 @pytest.mark.slow
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_compiled_equals_eager():
-    """In a process of its own: the run-time checks of this one cannot be compiled."""
+    """The test runs in a process of its own, because the run-time checks of this one cannot be compiled."""
     root = Path(__file__).parent.parent
     done = subprocess.run([sys.executable, "-c", COMPARISON], cwd=root, capture_output=True, text=True)
     assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]

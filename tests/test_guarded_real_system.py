@@ -34,7 +34,7 @@ class InShares(gymnasium.ActionWrapper):
 
 
 class Failing(gymnasium.ObservationWrapper):
-    """Reports no numbers at one step."""
+    """A system that reports NaN at one step."""
 
     def __init__(self, env, broken):
         super().__init__(env)

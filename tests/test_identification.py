@@ -207,7 +207,7 @@ print("equal")
 @pytest.mark.slow
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_a_compiled_interval_gives_the_same_for_every_length():
-    """In a process of its own, because annotations that are checked at run time cannot be compiled."""
+    """The test runs in a process of its own, because annotations that are checked at run time cannot be compiled."""
     root = Path(__file__).parent.parent
     done = subprocess.run([sys.executable, "-c", COMPARISON], cwd=root, capture_output=True, text=True)
     assert done.stdout.strip() == "equal", done.stderr[-3000:]

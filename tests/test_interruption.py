@@ -24,7 +24,7 @@ def press():
 
 @contextlib.contextmanager
 def pressed_after(seconds):
-    """Ctrl-C in the middle of whatever is done then."""
+    """Press Ctrl-C after this time, whatever is under way."""
     before = signal.signal(signal.SIGALRM, lambda number, frame: press())
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
@@ -81,7 +81,7 @@ def deterministic(episodes):
 
 
 def require_nothing_lost(folder, whole, seconds):
-    """A training that is interrupted then, and resumed, has the episodes of one that was not."""
+    """Require that a training which is interrupted at this time and resumed has the episodes of one that is not."""
     found = None
     try:
         run = small_run(folder, episodes=EPISODES, **QUICK)
@@ -123,7 +123,7 @@ def test_an_interrupt_at_any_moment_loses_nothing_but_the_episode_under_way(tmp_
 
 
 def test_an_interrupt_stops_within_an_iteration(tmp_path, monkeypatch):
-    """Of step 2 with iterations without end: TorchRL has swapped weights in most of its time."""
+    """Step 2 iterates without an end here, and TorchRL has swapped weights for most of its time."""
     small = small_run(tmp_path, episodes=2, **QUICK)
     run_one, update = small.algorithm.episode, DDPG.update
 

@@ -68,13 +68,13 @@ def test_full_information_costs_what_riccati_says_and_less_than_two_signals(answ
 
 
 def test_the_learners_discount_leaves_room(answer):
-    """A learner without error but for its discount ends within 2 %, measured 1.0 %; 5 % and 10 % are fair to ask."""
+    """A learner whose only error is its discount ends within 2 % (measured 1.0 %), so 5 % and 10 % are fair bounds."""
     found = root(answer.policy_gradient, answer.gain[0], args=(LEARNER.discount,))
     assert found.success and 0.0 < answer.excess(found.x) < 0.02
 
 
 def half_alone(gain, *, seed):
-    """The model-free half of the algorithm, with both its policies at a gain; which learner it is, is said here."""
+    """The model-free half of the algorithm with both policies at a gain; its learner is chosen here."""
     plant = HiddenForce()
     return ReinforcementTwinning(
         PlantEnv(plant, seed=1000 + seed),

@@ -129,7 +129,7 @@ def test_an_own_recipe_is_exported_with_the_plant_beside_it(own_run, tmp_path):
 
 
 class Own(RunConfig):
-    """In an importable module, without a plant."""
+    """A configuration in an importable module, without a plant."""
 
 
 def test_a_plant_that_no_recipe_makes_is_given(tmp_path):

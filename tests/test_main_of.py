@@ -13,7 +13,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 
 @dataclass(frozen=True, kw_only=True)
 class Config(RunConfig):
-    """A recipe's."""
+    """Configuration of a recipe."""
 
 
 @pytest.mark.parametrize(

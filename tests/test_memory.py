@@ -70,7 +70,7 @@ def test_index_of_a_sample_is_its_place():
 
 
 def test_eviction_goes_by_the_present_priorities():
-    """Filled with errors that rank one way, refreshed to rank the other way: what is now least goes first."""
+    """Errors rank one way at first and the other way after a refresh; the transitions that are now least go first."""
     found = memory(capacity=6)
     found.store(transitions([0.0, 1.0, 2.0, 3.0]), torch.tensor([9.0, 8.0, 0.1, 0.2]))
     found.store(transitions([4.0, 5.0]), torch.tensor([5.0, 5.0]))

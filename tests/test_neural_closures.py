@@ -1,4 +1,4 @@
-"""Closures with a perceptron in them: where they start, what keeps their physics, how they are identified."""
+"""Closures with a perceptron in them: their start, the bounds that keep their physics, their identification."""
 
 import importlib.util
 import sys
@@ -42,7 +42,7 @@ def points(plant, count=200):
 
 
 def disturbed(plant, scale=1.0):
-    """A neural closure whose perceptron says something."""
+    """A neural closure whose perceptron is not zero."""
     closure = plant.make_neural_closure(seeded(), (8, 8))
     with torch.no_grad():
         closure.correction.network[-1].weight.normal_(0.0, scale, generator=seeded(2))
@@ -96,7 +96,7 @@ def test_the_tanks_coefficients_stay_within_a_factor_of_two():
 
 
 def test_jacobians_by_rows_are_those_by_columns(plant):
-    """Reverse mode against forward mode, on visited intervals."""
+    """Jacobians by reverse mode equal those by forward mode, on visited intervals."""
     _, flown, exogenous = recorded(plant, batch=2)
     closure = disturbed(plant, 0.3)
     names = tuple(name for name, _ in closure.named_parameters())
@@ -222,7 +222,7 @@ def load_recipe():
 
 
 def test_the_command_line_trains_a_closure_by_its_own_defaults(monkeypatch):
-    """What is given stays: here the number of records."""
+    """An option that is given keeps its value: here the number of records."""
     recipe, seen = load_recipe(), []
     for options in ([], ["--closure", "mlp"], ["--closure", "mlp", "--twinning.records", "3"]):
         monkeypatch.setattr("sys.argv", ["wind_turbine.py", *options])

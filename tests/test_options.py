@@ -1,4 +1,4 @@
-"""Options that no option of their type can be are refused when a configuration is made in code."""
+"""Values that an option of their type cannot have are refused when a configuration is made in code."""
 
 import math
 import re

@@ -202,7 +202,7 @@ print("compared")
 @pytest.mark.slow
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_compiled_gradients_of_several_shapes_are_the_eager_ones():
-    """In a process of its own, because annotations that are checked at run time cannot be compiled."""
+    """The test runs in a process of its own, because annotations that are checked at run time cannot be compiled."""
     root = Path(__file__).parent.parent
     done = subprocess.run([sys.executable, "-c", COMPILED], cwd=root, capture_output=True, text=True)
     assert done.stdout.strip() == "compared", done.stderr[-3000:]

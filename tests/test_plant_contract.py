@@ -1,4 +1,4 @@
-"""What every plant fulfils: each folder under rt_torchrl.envs, found by itself, and the linear-quadratic oracle."""
+"""The contract of every plant: of each folder under rt_torchrl.envs, found by itself, and of the oracle plant."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ GREATEST_EPISODE = 2000
 
 
 def shortened(kind, steps):
-    """A plant whose episode has at most so many steps."""
+    """A plant whose episode has at most this number of steps."""
     plant = kind()
     return plant if plant.n_steps <= steps else kind(dt=plant.dt, horizon=steps * plant.dt)
 
@@ -36,7 +36,7 @@ def kind(request):
 
 @pytest.fixture
 def plant(kind):
-    """With a short episode, where its length is not the matter."""
+    """The plant with a short episode, for tests in which the length does not matter."""
     return shortened(kind, 50)
 
 
@@ -62,7 +62,7 @@ def test_is_named_after_its_folder(kind, plant):
 
 
 def test_fulfils_the_contract(plant):
-    """With the annotations checked at run time, which tracing does not stand; that is in a process of its own below."""
+    """Annotations are checked at run time here, and cannot be traced; a test below traces in a process of its own."""
     check_plant(plant, episodes=2, steps=10, traced=False)
 
 
@@ -146,7 +146,7 @@ for name, kind in CLASSES.items():
 
 @pytest.fixture(scope="module")
 def checking():
-    """In a process of its own: the run-time checks of this one cannot be traced."""
+    """The check runs in a process of its own, because the run-time checks of this one cannot be traced."""
     root = Path(__file__).parent.parent
     return subprocess.run([sys.executable, "-c", CHECK], cwd=root, capture_output=True, text=True)
 

@@ -1,4 +1,4 @@
-"""Every learner, planner and referee, those of the documentation among them, through the same checks."""
+"""The same checks of every learner, planner and referee, also of those in the documentation."""
 
 import copy
 import io
@@ -30,7 +30,7 @@ SMALL = {"critic_iterations": 4, "actor_iterations": 3, "batch_size": 16, "criti
 
 
 def documented(page, name):
-    """The class of that name that a page of the documentation writes."""
+    """The class of this name from the code on a page of the documentation."""
     (code,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
     scope = {}
     exec(code, scope)
@@ -72,7 +72,7 @@ def algorithm(**parts):
 
 
 def saved(state):
-    """The state as a file gives it back that may hold tensors and plain containers only."""
+    """The state after it was saved to and loaded from a file that may hold only tensors and plain containers."""
     file = io.BytesIO()
     torch.save(state, file)
     file.seek(0)
@@ -84,7 +84,7 @@ def saved(state):
     [("learner", Learner, LEARNERS), ("planner", Planner, PLANNERS), ("referee", Referee, REFEREES)],
 )
 def test_a_training_with_each_goes_on_from_its_state_as_if_never_interrupted(part, protocol, makers):
-    """To the bit, with the other two parts by default."""
+    """The result is the same to the bit; the other two parts are the default ones."""
     for name, make in makers.items():
         one, other = algorithm(**{part: make}), algorithm(**{part: make})
         assert isinstance(getattr(one, part), protocol), name

@@ -78,7 +78,7 @@ def test_a_name_that_does_not_exist_is_refused():
 
 
 def test_the_import_waits_for_nothing():
-    """Who asks for a version, or misspells a command, needs neither PyTorch nor TorchRL."""
+    """A user who asks for a version, or misspells a command, needs neither PyTorch nor TorchRL."""
     code = (
         "import sys, rt_torchrl; rt_torchrl.__version__, dir(rt_torchrl)\n"
         "print([name for name in ('torch', 'torchrl', 'sklearn', 'scipy', 'matplotlib') if name in sys.modules])"

@@ -1,4 +1,4 @@
-"""What the README shows is true."""
+"""The code and the commands of the README are right."""
 
 import os
 import re
@@ -29,7 +29,7 @@ def test_its_files_exist():
 
 
 def test_the_tutorial_runs(tmp_path):
-    """In a process of its own, as a user runs it: the check of the plant traces, which this process could not."""
+    """The tutorial runs in a process of its own, because the check of its plant traces, which fails in this one."""
     text = (ROOT / "recipes" / "own_plant.md").read_text(encoding="utf-8")
     code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     lines = [line for line in code.splitlines() if line.strip() and not line.strip().startswith("#")]

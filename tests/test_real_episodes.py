@@ -135,7 +135,7 @@ def test_an_environment_that_terminates_is_refused_with_what_to_do():
 
 
 def test_a_layer_that_loses_patience_is_refused_with_what_to_do():
-    """Its shutdown truncates the episode, which is then no whole one."""
+    """The layer's shutdown truncates the episode, which then is not whole."""
     plant = LinearQuadratic(horizon=HORIZON)
     config = SafetyConfig(interval=0.1, patience=0.0)
     layer = SafetyLayer(Blind(plant), config, fallback=(0.0,))
@@ -144,7 +144,7 @@ def test_a_layer_that_loses_patience_is_refused_with_what_to_do():
 
 
 class Blind(PlantEnv):
-    """Reports no numbers from its fourth interval on."""
+    """A system that reports NaN from its fourth interval on."""
 
     def _step(self, tensordict):
         found = super()._step(tensordict)

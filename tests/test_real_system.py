@@ -221,7 +221,7 @@ def test_an_episode_that_ends_early_is_refused():
 
 
 class Forgetful(Rig):
-    """Reports nothing of one kind from its third step on."""
+    """A rig that leaves one entry out of its report from its third step on."""
 
     def __init__(self, plant, forgets):
         super().__init__(plant)
@@ -257,7 +257,7 @@ def test_a_time_limit_below_the_horizon_is_refused_before_anything_moves():
 
 
 def test_a_reading_that_is_not_finite_is_refused():
-    """When it is read; of the zeros that stand in for a report before that, it may be anything."""
+    """It is refused when it is read; before that, zeros take the place of a report, and may read as anything."""
     plant = LinearQuadratic()
     share = Reading(keys=(("sensors", "encoder"),), of=lambda mm: mm / mm.abs().sum())
     system = connected(plant, rig=Rig(plant), state=share)

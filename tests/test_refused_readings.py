@@ -1,4 +1,4 @@
-"""Readings that the watchdog refuses: what they are called, that nothing is learned from them, and what goes on."""
+"""Readings that the watchdog refuses: their names, the episodes that are not learned from, and the next episode."""
 
 import re
 
@@ -91,7 +91,7 @@ def test_a_real_system_passes_the_refusals_of_its_layer_on():
 
 
 class Worthless(PlantEnv):
-    """Its own reward is no number."""
+    """A system whose own reward is NaN."""
 
     def _step(self, tensordict):
         found = super()._step(tensordict)
@@ -99,7 +99,7 @@ class Worthless(PlantEnv):
 
 
 def test_a_reward_is_no_reading():
-    """It trips nothing: a real system does not use it, and where one is used the episode is refused."""
+    """A bad reward trips nothing: a real system does not use it, and where it is used the episode is refused."""
     plant = LinearQuadratic(horizon=HORIZON)
     env = layer(Worthless(plant))
     assert fly(env, [0.5] * 20)["next", "applied"].eq(0.5).all() and not env.report.events
@@ -108,7 +108,7 @@ def test_a_reward_is_no_reading():
 
 
 class Silent(PlantEnv):
-    """Leaves its observation out from its third step on."""
+    """A system that leaves out its observation from its third step on."""
 
     def _step(self, tensordict):
         found = super()._step(tensordict)

@@ -1,4 +1,4 @@
-"""The results in numbers: what JSON has no number for, and which policy is called the better one."""
+"""The results in numbers: values that JSON cannot write, and the choice of the better policy."""
 
 import dataclasses
 import json
@@ -43,7 +43,7 @@ def test_infinite_costs_are_dashes_in_the_table(tmp_path):
 
 
 def judged(seed):
-    """Unseen episodes of two, whose means depend on the draw."""
+    """Two unseen episodes, whose mean costs depend on the draw."""
     return UnseenEpisodes(LinearQuadratic(horizon=1.0, noise=0.5), 2, seed=seed)
 
 

@@ -26,7 +26,7 @@ def test_no_room_imports_one_above_it():
 
 
 def test_no_module_of_the_library_imports_from_its_top():
-    """The public names of ``rt_torchrl`` come from every floor: an import of one would hide where it points to."""
+    """The public names of ``rt_torchrl`` come from every floor; an import of one would hide its floor."""
     rooms = {room for floor in layers() for room in floor} | {"envs"}
     for path in [p for folder in ("rt_torchrl", "envs") for p in (ROOT / folder).rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

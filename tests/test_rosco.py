@@ -19,7 +19,7 @@ def rosco():
 
 
 class Held(torch.nn.Module):
-    """One command whatever is seen."""
+    """A policy with one command for every observation."""
 
     def forward(self, observation):
         return observation.new_tensor([35e3, 2.0]).expand(*observation.shape[:-1], 2)

@@ -21,7 +21,7 @@ DT = 0.1
 
 
 class Clock:
-    """Time passes when the test says so."""
+    """A clock that the test moves."""
 
     now = 0.0
 
@@ -57,7 +57,7 @@ def failing(clock=None, horizon=2.0, broken=(), late=(), value=float("nan"), **o
 
 
 def fly(env, asked, steps=None):
-    """An episode in which the policy asks for these numbers."""
+    """Fly an episode in which the policy asks for these actions."""
     asked = iter(asked)
     policy = TensorDictModule(
         lambda e: torch.full((*e.shape[:-1], 1), float(next(asked)), dtype=torch.float64), ["observation"], ["action"]

@@ -19,12 +19,12 @@ def double(*values):
 
 
 def pressures(n=301):
-    """No nodes of the fit among them but the two ends."""
+    """Pressures that are not nodes of the fit, except for the two ends."""
     return np.linspace(LOW, HIGH, n)
 
 
 def from_coolprop(fluid, p):
-    """By CoolProp's high-level interface, where the fit uses the low-level one."""
+    """Properties by CoolProp's high-level interface; the fit uses the low-level one."""
     return np.array([CP.PropsSI(key, "P", p, "Q", quality, fluid) for key, quality in KEYS.values()])
 
 

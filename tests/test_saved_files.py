@@ -116,7 +116,7 @@ def test_a_foreign_file_is_refused_by_name(tmp_path, content):
 
 
 class Full:
-    """A file on a full disk: a part of what is written fits."""
+    """A file on a full disk, which takes only a part of the content."""
 
     def __init__(self, file):
         self.file = file
@@ -145,7 +145,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
 
 
 def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
-    """Killed at the end of the writing, when all is on the disk but the name."""
+    """The process is killed at the end of the writing, when only the new name is not on the disk yet."""
     file = tmp_path / "metrics.json"
     write_json(file, {"old": 1})
 

@@ -13,7 +13,7 @@ from rt_torchrl.twinning.exogenous import ExogenousProcess
 
 
 class Seasonal(LinearQuadratic):
-    """Its force comes and goes with the time."""
+    """A plant whose force comes and goes with the time."""
 
     def vector_field(self, t, state, action, exogenous, closure):
         return super().vector_field(t, state, action * torch.cos(3.0 * t).unsqueeze(-1), exogenous, closure)
@@ -38,7 +38,7 @@ def replayed(*records):
 
 
 def test_segments_start_at_their_own_time_and_state():
-    """Of two records of 50 intervals, in segments of 12: J_p is the mean of what a loop over the segments finds."""
+    """Two records of 50 intervals are cut into segments of 12; J_p is the mean of what a loop over them finds."""
     plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
     records, expected = [flight(plant, seed) for seed in (0, 1)], []
     for record in records:
@@ -73,7 +73,7 @@ def test_what_is_reported_is_the_cost_of_whole_records(method):
 
 
 def test_sensitivities_start_at_their_own_time():
-    """Two pieces together against each alone."""
+    """Two pieces together have the sensitivities of each alone."""
     plant, record = Seasonal(), flight(Seasonal())
     pieces = torch.tensor([0.0, 2.5], dtype=torch.float64)
     rows = [(record.states[k], record.exogenous[k : k + 25], record.actions[k : k + 25]) for k in (0, 25)]

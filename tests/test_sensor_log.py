@@ -116,7 +116,7 @@ def test_dates_are_counted_from_the_first_row(tmp_path):
         (TABLE, ["when=time"], "column 'when' for 'time'"),
         (TABLE, ["t=clock"], "has the signals time, position"),
         (TABLE, ["t=time", "x_mm=position", "velocity=position"], "name a signal twice"),
-        (TABLE, ["t=time", "note=position"], "what is no number"),
+        (TABLE, ["t=time", "note=position"], "an entry that is not a number"),
         ("time,force\n0,1\n0.1,1\n", [], "no column disturbance"),
         (TABLE.replace("100,", "0,"), ["t=time"], "row 1 of the log .* the same time"),
         (TABLE.replace("250,", "50,"), ["t=time"], "row 2 of the log .* an earlier time"),
@@ -153,7 +153,7 @@ def test_bad_rows_become_gaps_on_demand():
 
 
 def test_instantaneous_signals_are_interpolated():
-    """A line exactly, a sine to h²/8 of its curvature, h the longest interval."""
+    """A line is exact; a sine has an error of at most h²/8 times its curvature, with h the longest interval."""
     times = jittered(200)
     log = signals(times, position=2.0 - 0.3 * times, velocity=np.sin(times))
     (segment,) = resample(log, PLANT).segments
@@ -165,7 +165,7 @@ def test_instantaneous_signals_are_interpolated():
 
 
 def test_held_signals_are_averaged_over_the_interval():
-    """Against the integral of the steps by a fine sum, and with nothing lost over the whole record."""
+    """The means equal the integral of the steps by a fine sum, and nothing is lost over the whole record."""
     times = jittered(50)
     values = np.random.default_rng(1).normal(size=50)
     grid = 0.1 * np.arange(45)
@@ -234,7 +234,7 @@ def test_states_that_no_sensor_gives_are_refused_by_name():
 
 
 def test_the_turbine_completes_its_filters():
-    """From the rotor speed alone, against the plant's own integration of them."""
+    """The plant completes its states from the rotor speed alone; they equal those of its own integration."""
     plant = WindTurbine(horizon=120.0)
     generator = torch.Generator().manual_seed(1)
     wind = plant.draw_exogenous(1, generator)

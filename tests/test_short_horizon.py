@@ -46,7 +46,7 @@ def test_targets_are_discounted_sums():
 
 
 def test_the_critic_learns_what_the_policy_costs():
-    """With a policy that stands still: the critic against discounted sums over long flights, which it never sees."""
+    """With a policy that stands still, the critic equals discounted sums over long flights, which it never sees."""
     plant = LinearQuadratic(noise=0.0)
     plan = planner(plant, dataclasses.replace(CONFIG, policy_rate=1e-12, discount=0.9))
     for k in range(30):

@@ -86,7 +86,7 @@ def test_engines_fly_the_same_trajectory(batch):
 
 
 class Clock(LinearQuadratic):
-    """Shows the policy the time, and costs it."""
+    """A plant that shows the policy the time, and whose cost depends on it."""
 
     def observe(self, t, state, exogenous):
         time = t.unsqueeze(-1).expand_as(state[..., :1])

@@ -1,4 +1,4 @@
-"""The digital twin: what is varied when it replays and when it is planned on."""
+"""The digital twin: the weights that vary when it replays and when a policy is planned on it."""
 
 import copy
 

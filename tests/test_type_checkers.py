@@ -48,7 +48,7 @@ def test_every_module_of_the_plants_is_found(checker, probe):
 
 @pytest.mark.parametrize("checker", COMMANDS)
 def test_a_module_that_does_not_exist_is_reported(checker, probe):
-    """Otherwise the test above would show nothing."""
+    """Without this refusal the test above would show nothing."""
     status, output = checked(checker, probe, "import rt_torchrl.envs.wind_turbine.plnt\n")
     assert status == 1 and "rt_torchrl.envs.wind_turbine.plnt" in output
 

@@ -1,4 +1,4 @@
-"""Wind of the turbine: the Kaimal spectrum against its formula, and what is drawn from records."""
+"""Wind of the turbine: the Kaimal spectrum against its formula, and draws from records."""
 
 import math
 

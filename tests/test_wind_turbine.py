@@ -44,7 +44,7 @@ def steady(u):
 
 
 def start(plant, omega, *, u, command=(0.0, 0.0)):
-    """Filters settled, actuators at the command."""
+    """A state with settled filters and the actuators at the command."""
     return torch.tensor([[omega, N_G * omega, u, 0.0, *command]], dtype=torch.float64)
 
 

@@ -1,1 +1,1 @@
-"""How good twin and policies are on episodes that no training has drawn."""
+"""Evaluation of twin and policies on episodes that no training has drawn."""

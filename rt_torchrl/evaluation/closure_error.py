@@ -1,4 +1,4 @@
-"""Where a closure was asked: a twin can only know what the real system has visited."""
+"""The error of a closure where the real system has been, because a twin can only learn there."""
 
 import torch
 from jaxtyping import Float
@@ -9,10 +9,10 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class Probe(nn.Module):
-    """A closure that answers as another one and keeps what it was asked for.
+    """A closure that returns what another closure returns, and keeps the features that it was called with.
 
     Args:
-        closure: gives the coefficients.
+        closure: closure that gives the coefficients.
     """
 
     def __init__(self, closure: nn.Module):
@@ -26,11 +26,11 @@ class Probe(nn.Module):
 
 @torch.no_grad()
 def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elements n_f"]:
-    """What the vector field asks its closure in every sample of a real episode.
+    """The features on which the vector field calls its closure, in every sample of a real episode.
 
     Args:
-        plant: with the closure of the real system.
-        record: the episode.
+        plant: plant with the closure of the real system.
+        record: the real episode.
     """
     probe = Probe(plant.closure)
     t = plant.dt * torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
@@ -42,6 +42,6 @@ def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elem
 def rms_error(
     closure: nn.Module, true: nn.Module, features: Float[Tensor, "*points n_f"]
 ) -> Float[Tensor, " n_coefficients"]:
-    """Root of the mean squared error of every coefficient over the points."""
+    """Root mean square error of every coefficient of a closure over the points."""
     error = closure(features) - true(features)
     return error.flatten(0, -2).square().mean(0).sqrt()

@@ -1,4 +1,4 @@
-"""The check a run makes before it trains: the exact gradient against a second engine, the paper's adjoint."""
+"""The check that a run makes before it trains: it compares the exact gradient with that of a second engine."""
 
 import torch
 from torch import Tensor, nn
@@ -11,10 +11,11 @@ STEPS = 40
 
 
 def engine_gap(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes) -> float:
-    """Relative gap ‖g_parallel − g_reference‖/‖g_reference‖ of dJ_a over closure and policy weights.
+    """Relative gap ‖g_parallel − g_reference‖/‖g_reference‖ of the gradients of J_a by closure and policy weights.
 
-    The reference is ``odeint_adjoint``, or ``autograd`` for a plant with a scheme of its own. Over a short horizon and
-    two episodes, eager, so that it costs seconds and not minutes. Weights that are not trained are left out.
+    The reference engine is ``odeint_adjoint``, the paper's adjoint, or ``autograd`` for a plant with a scheme of its
+    own. Both run eagerly over a short horizon and two episodes, so that the check takes seconds and not minutes.
+    Weights that are not trained are left out.
 
     Raises:
         ValueError: if no weight of the closure or the policy is trained.

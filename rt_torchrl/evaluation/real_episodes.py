@@ -19,7 +19,7 @@ class RealController(nn.Module, ABC):
 
     Args:
         plant: physics and control problem of the twin.
-        compiled: compile what can be.
+        compiled: whether to compile the parts that can be compiled.
     """
 
     def __init__(self, plant: Plant, *, compiled: bool = False):
@@ -28,23 +28,23 @@ class RealController(nn.Module, ABC):
 
     @abstractmethod
     def fly_real(self, count: int, *, seed: int) -> Trajectory:
-        """As many episodes of the sequence that belongs to a seed."""
+        """Fly the first ``count`` episodes of the sequence that belongs to a seed."""
 
 
 Baseline = ClassicalController | RealController
-"""What policies are compared with: on the plant, or on a real system of which no closure is known."""
+"""A controller that policies are compared with: on the plant, or on a real system whose closure is not known."""
 
 
 class RealEpisodes(UnseenEpisodes):
-    """Episodes flown on the real system itself, without exploration, each time they are asked for.
+    """Episodes that are flown on the real system itself, without exploration, each time they are asked for.
 
-    A system that takes a seed flies the same episodes for every policy, and its sequence of training episodes goes on
-    afterwards as if nothing had been flown. Another one flies what comes.
+    A system that takes a seed flies the same episodes for every policy, and its sequence of training episodes then
+    goes on as if nothing had been flown in between. A system without a seed flies other episodes each time.
 
     Args:
         system: the real system.
         count: number of episodes, at least 2.
-        device: where the twin is, whose replay of them is judged.
+        device: device of the twin, which replays the episodes.
     """
 
     def __init__(self, system: RealSystem, count: int = 20, *, device: torch.device | str = "cpu"):
@@ -56,10 +56,10 @@ class RealEpisodes(UnseenEpisodes):
         return self._flown(policy, self._count)
 
     def validation(self) -> None:
-        """None: a real episode may take hours."""
+        """No validation episodes, because a real episode may take hours."""
 
     def untrained_cost(self, policy: nn.Module) -> float:
-        """J_a of one episode: that of a random policy is a matter of its order of size."""
+        """J_a of one episode, which is enough because only the magnitude of a random policy's cost matters."""
         return self.judge(self._flown(policy, 1)).control_costs.mean().item()
 
     def fly_baseline(self, law: RealController) -> Trajectory:
@@ -78,5 +78,5 @@ class RealEpisodes(UnseenEpisodes):
         return Trajectory(states, found["next", "applied"], found["exogenous"])
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
-        """None: what acts from outside need not be the same each time."""
+        """No categories, because the exogenous inputs need not be the same each time."""
         return {}

@@ -1,4 +1,4 @@
-"""How good twin and policies are on episodes they were never trained on."""
+"""Evaluation of twin and policies on episodes that they were never trained on."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identif
 UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
 VALIDATION_SEED = 2_000_000
-"""Seed of the episodes that a choice is made on whose result is reported on the unseen ones."""
+"""Seed of the validation episodes, on which a policy is chosen; its cost is then reported on the unseen episodes."""
 
 
 class UnseenEpisodes:
@@ -26,11 +26,11 @@ class UnseenEpisodes:
     The true closure is the plant's own; assign :attr:`closure` for a system that has worn.
 
     Args:
-        plant: the real system.
+        plant: the real system in simulation.
         count: number of episodes, at least 2.
-        compiled: compile the rollouts.
-        device: where they run.
-        seed: of their draws.
+        compiled: whether to compile the rollouts.
+        device: device on which the rollouts run.
+        seed: seed of the draws of initial states and disturbances.
     """
 
     def __init__(
@@ -52,12 +52,12 @@ class UnseenEpisodes:
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
-        """The episodes under a policy, on the real system."""
+        """Fly the episodes with a policy on the real system."""
         rollout = Rollout(self.plant, self.closure, policy, compiled=self._compiled)
         return rollout(self.initial_state, self.exogenous)
 
     def fly_baseline(self, law: ClassicalController) -> Trajectory:
-        """The episodes under a classical controller, on the system as it is."""
+        """Fly the episodes with a classical controller on the real system as it is now."""
         return law.fly(self.initial_state, self.exogenous, self.closure)
 
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
@@ -65,9 +65,9 @@ class UnseenEpisodes:
         return control_cost(self.plant, self.fly(policy))
 
     def validation(self) -> "UnseenEpisodes | None":
-        """As many episodes of other draws, on the system as it is now; None where they cannot be had for nothing.
+        """Validation episodes: as many, with other draws, on the system as it is now; None if they would cost flights.
 
-        A policy that is chosen for its cost on some episodes costs less on them than it does on others.
+        A policy that is chosen by its cost on some episodes costs less on these than on others.
         """
         device = self.initial_state.device
         count = len(self.initial_state)
@@ -76,26 +76,26 @@ class UnseenEpisodes:
         return found
 
     def untrained_cost(self, policy: nn.Module) -> float:
-        """Mean J_a of one of many random initial policies."""
+        """Mean J_a of one random initial policy."""
         return self.control_costs(policy).mean().item()
 
     def judge(self, flown: Trajectory) -> "Judged":
-        """J_a and the plant's own quantities of the episodes as flown."""
+        """J_a and the plant's own quantities in flown episodes."""
         costs = control_cost(self.plant, flown)
         return Judged(costs, self.plant.merit(flown.states, flown.actions, flown.exogenous))
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
-        """The kinds of episodes that this plant's results are also shown apart for."""
+        """The kinds of episodes for which this plant's results are also shown separately."""
         return self.plant.categories(self.exogenous)
 
     @torch.no_grad()
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
-        """J_p of each episode: a twin replays what was flown, under the true disturbances.
+        """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
         Args:
-            physics: the twin's, which need not be those of the real system.
-            closure: the twin's.
-            flown: the episodes on the real system.
+            physics: physics of the twin, which need not be that of the real system.
+            closure: closure of the twin.
+            flown: the episodes as flown on the real system.
         """
         rollout = Rollout(physics, closure, compiled=self._compiled)
         replayed = rollout(flown.states[:, 0], flown.exogenous, flown.actions)
@@ -109,7 +109,11 @@ class Judged(NamedTuple):
     merit: dict[str, Float[Tensor, " count"]]
 
     def statistics(self, chosen: Bool[Tensor, " count"] | None = None) -> dict[str, Any]:
-        """``J_a`` and ``merit``: mean with confidence interval, and median; of the ``chosen`` episodes only."""
+        """Mean and confidence interval of ``J_a`` and of each quantity in ``merit``, which also has its median.
+
+        Args:
+            chosen: episodes to take; None for all.
+        """
         chosen = torch.ones_like(self.control_costs, dtype=torch.bool) if chosen is None else chosen
         merit = {
             name: mean_with_confidence(values[chosen]) | {"median": values[chosen].median().item()}
@@ -126,13 +130,13 @@ def untrained_costs(
     starts: int,
     seed: int = UNSEEN_SEED,
 ) -> Float[Tensor, " {starts}"]:
-    """Mean J_a of random initial policies, the scale that a training's cost is seen on whatever start it drew itself.
+    """Mean J_a of random initial policies; a training's cost over it does not depend on the training's own start.
 
     Args:
-        unseen: the episodes.
-        make_policy: draws a policy of the class.
+        unseen: the unseen episodes.
+        make_policy: function that draws a random policy of the class.
         starts: number of policies.
-        seed: of their weights.
+        seed: seed of the policies' weights.
     """
     device = unseen.initial_state.device
     generator = torch.Generator(device=device).manual_seed(seed)
@@ -141,7 +145,7 @@ def untrained_costs(
 
 
 class Optimum(NamedTuple):
-    """Best mean J_a found, the policy that has it, and the cost that every start reached on a few of the episodes."""
+    """Best mean J_a found, its policy, and the cost that each start reached on the first few episodes."""
 
     cost: float
     policy: nn.Module
@@ -158,19 +162,19 @@ def exact_optimum(
     polish: int = 20,
     seed: int = UNSEEN_SEED,
 ) -> Optimum:
-    """The best a class of policies can do: exact gradients on the *true* plant, on the episodes it is judged on.
+    """The best policy of a class, found by exact gradients on the *true* plant and on the unseen episodes themselves.
 
-    Every start descends on a few episodes, because a gradient over a hundred takes ten times as long and points where
-    one over ten does; the best of them goes on with all.
+    Every start descends on a few episodes, because a gradient over a hundred episodes takes ten times as long and has
+    the same direction as one over ten. The best start goes on with all episodes.
 
     Args:
-        unseen: the episodes.
-        make_policy: draws a policy of the class.
-        starts: number of initial weights.
-        iterations: gradients from each, on the first ``few`` episodes.
-        few: number of these.
-        polish: gradients of the best, on all episodes.
-        seed: of the initial weights.
+        unseen: the unseen episodes.
+        make_policy: function that draws a random policy of the class.
+        starts: number of random initial policies.
+        iterations: gradients from each start, on the first ``few`` episodes.
+        few: number of episodes on which every start descends.
+        polish: gradients of the best start, on all episodes.
+        seed: seed of the initial weights.
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
@@ -190,7 +194,7 @@ def exact_optimum(
 
 
 def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:
-    """Mean and percentile-bootstrap confidence interval (2000 resamples), as it is written into ``metrics.json``."""
+    """Mean and percentile-bootstrap confidence interval (2000 resamples), as ``metrics.json`` holds them."""
     from scipy.stats import bootstrap  # here, because it takes a second to load and only results need it
 
     numbers = values.detach().cpu().numpy().astype(np.float64)

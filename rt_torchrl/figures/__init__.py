@@ -22,11 +22,11 @@ __all__ = [
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
-    """Every figure of this package there is something to show in, by name.
+    """Figures of this package by name; a figure with nothing to show is left out.
 
-    Left out: ``exogenous`` and ``closure_weights`` in an arm that trains no twin, ``exogenous`` also on a plant without
-    inputs, ``closure_weights`` also if no episode reports coefficients by name, ``learning_curves`` before the first
-    episode is reported, ``seconds`` if no episode reports them.
+    ``exogenous`` needs an arm that trains a twin, and a plant with inputs. ``closure_weights`` needs an arm that trains
+    a twin, and episodes that report coefficients by name. ``learning_curves`` needs a reported episode, and
+    ``seconds`` an episode that reports them.
     """
     twin = snapshot.large_scale is not None
     chosen = [states, actions, policy_contours]

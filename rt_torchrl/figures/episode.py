@@ -1,4 +1,4 @@
-"""The last real episode: its states beside the twin's, its actions, its exogenous input."""
+"""Figures of the last real episode: its states beside the twin's, its actions and its exogenous input."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,7 +25,7 @@ from rt_torchrl.twinning.referees import Role
 
 
 def states(snapshot: Snapshot) -> Figure:
-    """Every state over time, measured and replayed by the twin under the same actions, with their RMS difference."""
+    """Every state over time, as measured and as the twin replays it with the same actions, and the RMS difference."""
     signals, real, twin = snapshot.plant.states, array(snapshot.record.states), array(snapshot.replay)
     time, label = time_axis(snapshot.plant, len(real))
     columns = 1 if len(signals) <= 3 else 2
@@ -45,7 +45,7 @@ def states(snapshot: Snapshot) -> Figure:
         caption(ax, signal.label, f"RMS {with_unit(rms, signal.unit)}")
     for ax in axes.flat[len(signals) :]:
         ax.remove()
-    # The last panel of each column, which need not be in the last row.
+    # The last panel of a column, which need not be in the last row, has the label of the time axis.
     for ax in axes.flat[len(signals) - columns : len(signals)]:
         ax.set_xlabel(label)
         ax.tick_params(labelbottom=True)
@@ -55,7 +55,7 @@ def states(snapshot: Snapshot) -> Figure:
 
 
 def actions(snapshot: Snapshot) -> Figure:
-    """Every applied action over time, held over its interval, between its limits."""
+    """Every applied action over time, held over each interval, with its limits."""
     signals, applied = snapshot.plant.actions, array(snapshot.record.actions)
     time, label = time_axis(snapshot.plant, len(applied))
     actor = _actor(snapshot)
@@ -76,9 +76,9 @@ def actions(snapshot: Snapshot) -> Figure:
 
 
 def exogenous(snapshot: Snapshot) -> Figure:
-    """Each exogenous input as recorded around its large scale, and, below, what else it could have been.
+    """Each exogenous input as recorded, with its large scale, and below it samples of other possible inputs.
 
-    One column per input. In an arm that trains no twin there is the record alone.
+    Each input has a column. In an arm that trains no twin the figure shows the record alone.
     """
     signals, recorded = snapshot.plant.inputs, array(snapshot.record.exogenous)
     time, label = time_axis(snapshot.plant, len(recorded))
@@ -109,5 +109,5 @@ def exogenous(snapshot: Snapshot) -> Figure:
 
 
 def _actor(snapshot: Snapshot) -> Role:
-    """Who acted in the record; the live policy of the snapshot may have changed after it."""
+    """Role that acted in the record; the snapshot's live policy may have changed since then."""
     return (snapshot.episodes[-1].get("live") if snapshot.episodes else None) or snapshot.live

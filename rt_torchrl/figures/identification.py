@@ -1,4 +1,4 @@
-"""An identification from a log: the twin beside the log, and the weights with their standard errors."""
+"""Figures of an identification: the twin beside the log, and the weights with their standard errors."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ def twin_and_log(
 ) -> Figure:
     """Every logged state over time, as logged and as the twin replays it before and after; held-out time is shaded.
 
-    The notes are the root mean square errors on what was held out.
+    The notes give the root mean square errors on the held-out segments.
     """
     unit, length = time_unit(held_out[-1].start + plant.dt * len(held_out[-1].actions) - training[0].start)
     figure, axes = panels(len(shown), title="Twin and log", size=(9.0, 1.2 + 2.2 * len(shown)), sharex=True)
@@ -34,7 +34,7 @@ def twin_and_log(
             ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
         log = np.concatenate([array(s.states[:, k]) for s in (*training, *held_out)])
         margin = 0.1 * np.ptp(log) or 1.0
-        # A twin that is far off before must not flatten what is compared.
+        # A twin that is far off before the identification must not flatten the other curves.
         ax.set_ylim(log.min() - margin, log.max() + margin)
         signal = plant.states[k]
         rms = [with_unit(judged.rms[k].item(), signal.unit) for judged in found.held_out]
@@ -45,7 +45,10 @@ def twin_and_log(
 
 
 def weights(found: Identified) -> Figure:
-    """Every weight before and after, over its value after, with two standard errors; hidden ones have no bar."""
+    """Every weight before and after, divided by its size after, with a bar of two standard errors.
+
+    A weight of which the segments say nothing has no bar.
+    """
     names = list(found.weights)
     figure, ((ax,),) = panels(1, title="Weights", size=(max(5.0, 1.5 + 0.8 * len(names)), 4.2))
     after = np.array([entry["after"] for entry in found.weights.values()])

@@ -1,4 +1,4 @@
-"""What changed from episode to episode: costs, roles, computing time."""
+"""Figures over the episodes: costs, roles, computing time and closure weights."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -41,15 +41,15 @@ EVENTS: dict[str, dict[str, Any]] = {
     "clone": {"color": "0.35", "linewidth": 1.4, "linestyle": ":", "label": "clone"},
 }
 WIDE_RANGE = 5.0
-"""Ratio of the greatest to the least value from which a weight is drawn on a logarithmic axis."""
+"""Ratio of a weight's greatest to its least value from which its axis is logarithmic."""
 
 
 def learning_curves(snapshot: Snapshot) -> Figure:
-    """Over the episodes: the cost of control, real and of both policies on the twin; the twin's error; who was live.
+    """Costs of control on the real system and on the twin, the twin's error, and the live policy, over the episodes.
 
-    The bottom strip is the timeline, a row per policy, filled where it was live and pale where it was idle. Vertical
-    lines are swaps and clones; they lie between the episodes because that is when they happen. A panel whose values
-    an arm does not report is left out.
+    The strip at the bottom has a row for each policy, which is filled where the policy was live and pale where it was
+    idle. Vertical lines are swaps and clones; they lie between the episodes because they happen there. A panel is left
+    out if the arm does not report its values.
     """
     episodes = snapshot.episodes
     shown = [
@@ -75,7 +75,7 @@ def learning_curves(snapshot: Snapshot) -> Figure:
 
 
 def seconds(snapshot: Snapshot) -> Figure:
-    """Wall-clock time of every episode, stacked by step in the order in which the steps are made."""
+    """Wall-clock time of every episode, stacked by step in the order of the steps."""
     spent = [episode.get("seconds") or {} for episode in snapshot.episodes]
     steps = list(dict.fromkeys(step for episode in spent for step in episode))
     figure, ((ax,),) = panels(1, title="Computing time per episode", size=(8.5, 4.2))
@@ -88,7 +88,7 @@ def seconds(snapshot: Snapshot) -> Figure:
     ax.set_xlabel("episode")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlim(-0.5, len(spent) - 0.5)
-    # Reversed, so that the legend is stacked as the bars are.
+    # The legend is reversed, so that its entries have the order of the stacked bars.
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles[::-1], labels[::-1], loc="outside right upper", fontsize=9.5, frameon=False)
     return figure
@@ -96,14 +96,14 @@ def seconds(snapshot: Snapshot) -> Figure:
 
 @torch.no_grad()
 def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] | None = None) -> Figure:
-    """Each named coefficient of the twin after every episode, with its start and, where known, its true value.
+    """Each named coefficient of the twin after every episode, with its initial and, if it is known, its true value.
 
-    The number above a panel is how far the last value is from the true one.
+    The number above a panel is the relative difference between the last value and the true one.
 
     Args:
-        snapshot: its episodes report ``closure``, see :func:`tracked_weights`.
-        labels: for the name of a coefficient, its label with the unit and what to multiply it by to get that unit; by
-            default the name alone.
+        snapshot: snapshot whose episodes report ``closure``, see :func:`tracked_weights`.
+        labels: label with unit, and factor from the coefficient to that unit, by the coefficient's name; by default the
+            name is the label.
     """
     columns = tracked_weights(snapshot.episodes)
     true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
@@ -136,21 +136,21 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
 
 
 def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarray, " episodes"]]:
-    """The coefficients that the episodes report by name as a number; nan in an episode that does not.
+    """Coefficients that episodes report as a number with a name; nan in an episode that does not report them.
 
-    There are none in runs older than the key ``closure``, nor for a closure whose weights have no names.
+    There are none in runs that are older than the key ``closure``, nor for a closure whose weights have no names.
     """
     reported = [_numbers(episode.get("closure")) for episode in episodes]
     return {name: _column(reported, name) for name in dict.fromkeys(name for found in reported for name in found)}
 
 
 def _numbers(closure: dict[str, Any] | None) -> dict[str, float]:
-    """Of the weights that :func:`named_weights` gives, those that are numbers with a name."""
+    """Weights from :func:`named_weights` that are numbers with a name."""
     return {name: value for name, value in (closure or {}).items() if isinstance(value, float)}
 
 
 def _column(episodes: list[dict[str, Any]], key: str) -> np.ndarray:
-    """A value per episode; nan where the arm has none."""
+    """One value per episode; nan in an episode that does not report it."""
     values = (episode.get(key) for episode in episodes)
     return np.array([np.nan if value is None else float(value) for value in values])
 
@@ -165,7 +165,11 @@ def _draw_costs(ax: Axes, episodes: list[dict[str, Any]], curves: dict[str, dict
 
 
 def _logarithmic(ax: Axes, least_range: float = 1.0) -> bool:
-    """A logarithmic axis, unless a value is not positive, which it would hide, or all are within a factor.
+    """Make the axis logarithmic, unless it would hide a value that is not positive, or all values are close together.
+
+    Args:
+        ax: axis with its lines.
+        least_range: ratio of the greatest to the least value from which the axis becomes logarithmic.
 
     Returns:
         Whether the axis is logarithmic.
@@ -175,7 +179,7 @@ def _logarithmic(ax: Axes, least_range: float = 1.0) -> bool:
     if values.size == 0 or values.min() <= 0.0 or values.max() < least_range * values.min():
         return False
     ax.set_yscale("log")
-    # A decade or so needs numbers between the powers of ten.
+    # An axis of about a decade needs numbers between the powers of ten.
     ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
     ax.grid(True, which="minor", axis="y", color="0.95", linewidth=0.5)
     ax.tick_params(which="minor", labelsize=8)
@@ -193,7 +197,7 @@ def _draw_events(ax: Axes, episodes: list[dict[str, Any]]) -> None:
 
 
 def _draw_timeline(ax: Axes, episodes: list[dict[str, Any]], live: Role) -> None:
-    """A row per policy: filled in the episodes in which it was live, pale in the others."""
+    """Draw a row for each policy, filled in the episodes in which it was live and pale in the others."""
     acted = [episode.get("live") or live for episode in episodes]
     for row, role in enumerate(reversed(ROLES)):
         for is_live, alpha in ((True, 1.0), (False, 0.15)):

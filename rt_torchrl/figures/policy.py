@@ -1,4 +1,4 @@
-"""Both policies as functions of what they observe."""
+"""Figures of both policies as functions of their observations."""
 
 import math
 from collections.abc import Mapping
@@ -18,24 +18,24 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.twinning.referees import Role
 
 RESOLUTION = 81
-"""Points along each observation."""
+"""Number of points along each observation."""
 SHOWN = 400
-"""Visited observations that are shown at most; more would hide the contours."""
+"""Greatest number of visited observations that are shown; more would hide the contours."""
 
 
 def policy_contours(snapshot: Snapshot) -> Figure:
     """Every action as a function of the observations, model-based beside model-free on the same colour scale.
 
-    Dots are observations of the last real episode; the axes span the declared range of the observations and those.
-    With one observation the figure holds curves, on both sides of zero error; with more than two, contours over the
-    first two, the others held at their mean in the episode.
+    Dots are observations of the last real episode; the axes span these and the declared ranges of the observations.
+    With one observation the figure shows curves on both sides of zero error. With more observations it shows contours
+    over the first two; the others have their mean value in the episode.
     """
     return _curves(snapshot) if len(snapshot.plant.observations) == 1 else _contours(snapshot)
 
 
 @torch.no_grad()
 def visited_observations(snapshot: Snapshot) -> Float[Tensor, "n n_o"]:
-    """What the live policy saw in the last real episode."""
+    """Observations of the live policy in the last real episode."""
     plant, record = snapshot.plant, snapshot.record
     t = plant.dt * torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
     return plant.observe(t, record.states[:-1], record.exogenous)
@@ -43,7 +43,7 @@ def visited_observations(snapshot: Snapshot) -> Float[Tensor, "n n_o"]:
 
 def _curves(snapshot: Snapshot) -> Figure:
     plant, seen = snapshot.plant, visited_observations(snapshot)
-    # Errors of both signs, so that the target is in sight.
+    # The axis has errors of both signs, so that it shows the target.
     axis = _axis(plant.observations[0], torch.cat([seen[:, 0], -seen[:, 0]]))
     figure, axes = panels(
         len(plant.actions),
@@ -98,10 +98,10 @@ def contours(
     """Draw one action over pairs of observations, all on one colour scale.
 
     Args:
-        snapshot: has the policies and what they have seen.
+        snapshot: snapshot with the policies and the record.
         action: index of the action.
-        planes: for each pair of observations, by index, two axes: for the model-based and the model-free policy.
-        others: values at which the observations outside a pair are held.
+        planes: two axes, for the model-based and the model-free policy, for each pair of observations by index.
+        others: values of the observations that are not in the pair.
     """
     signals, seen = snapshot.plant.observations, visited_observations(snapshot)
     grids = {plane: [_axis(signals[i], seen[:, i]) for i in plane] for plane in planes}
@@ -137,9 +137,9 @@ def _evaluate(snapshot: Snapshot, role: Role, points: Float[Tensor, "m n_o"]) ->
 
 
 def _axis(signal: Signal, seen: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
-    """Points from end to end of what is declared and what was visited, so that no dot lies outside.
+    """Points over the declared range and the visited values of a signal, so that no dot lies outside.
 
-    Where no end is declared there is a margin.
+    At an end that is not declared there is a margin beyond the visited values.
     """
     least, greatest = seen.min().item(), seen.max().item()
     margin = 0.05 * (greatest - least) or 1.0
@@ -149,7 +149,7 @@ def _axis(signal: Signal, seen: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
 
 
 def _levels(fields: list[Float[np.ndarray, "m m"]]) -> Float[np.ndarray, " levels"]:
-    """Round levels around everything the policies do here; a constant gets levels of its own."""
+    """Round levels that include all values of the policies; a constant policy has levels around its value."""
     low, high = min(field.min() for field in fields), max(field.max() for field in fields)
     margin = max(1e-6 * max(abs(low), abs(high)), 1e-12) if high - low < 1e-9 * max(abs(low), abs(high), 1e-3) else 0.0
     return np.asarray(MaxNLocator(12).tick_values(low - margin, high + margin))

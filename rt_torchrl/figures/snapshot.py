@@ -1,4 +1,4 @@
-"""What there is to look at after an episode."""
+"""The snapshot of a training after an episode, which figures are drawn from."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,20 +15,20 @@ from rt_torchrl.twinning.referees import Role
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """Input of every figure.
+    """State of a training after an episode, from which every figure is drawn.
 
     Args:
-        plant: with the true closure, if that is known.
-        known: whether it is; not that of a real system.
+        plant: plant with the true closure, if that is known.
+        known: whether the true closure is known; that of a real system may not be.
         closure: the learned closure.
         initial_closure: the closure that the training started from.
-        policies: both policies.
-        live: role of the live one.
+        policies: both policies, by role.
+        live: role of the live policy.
         record: the last real episode.
-        replay: states of the twin under the record's actions and exogenous input.
-        large_scale: d̃ of the record's exogenous input; None if the arm trains no twin.
-        realisations: samples of its exogenous process; None likewise.
-        episodes: one record per episode, as in ``metrics.json``.
+        replay: states of the twin with the record's actions and exogenous input.
+        large_scale: large scale d̃ of the record's exogenous input; None if the arm trains no twin.
+        realisations: samples of the exogenous process of the record; None if the arm trains no twin.
+        episodes: entries of the episodes, as in ``metrics.json``.
     """
 
     plant: Plant
@@ -48,7 +48,7 @@ class Snapshot:
     def take(
         cls, algorithm: ReinforcementTwinning, initial_closure: nn.Module, episodes: list[dict[str, Any]]
     ) -> "Snapshot":
-        """Of an algorithm after an episode; draws its realisations from a generator of its own."""
+        """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
         replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None])
         process = algorithm.virtual.processes[-1] if algorithm.virtual.processes else None

@@ -1,7 +1,7 @@
-"""How every figure looks: colours with one meaning each, bare panels with their label on top, a time axis.
+"""The style of every figure: colours with one meaning each, bare panels with their label on top, a time axis.
 
 The colours are those of Okabe and Ito (2008), which colour-blind readers can tell apart. Figures are made without
-pyplot: they need no backend or display, and are freed with their last reference.
+pyplot, so they need no backend and no display, and are freed with their last reference.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,15 @@ CLOSURE_LINES: dict[str, Any] = {"true": "-", "twin": (0, (5, 2)), "initial twin
 def panels(
     rows: int, columns: int = 1, *, title: str, size: tuple[float, float], **layout: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A titled figure of ``size`` inches at 100 dpi and its axes, ``rows`` by ``columns``; ``layout`` of subplots."""
+    """A figure at 100 dpi and its axes, ``rows`` by ``columns``.
+
+    Args:
+        rows: number of rows of axes.
+        columns: number of columns of axes.
+        title: title of the figure.
+        size: width and height of the figure [inch].
+        layout: further arguments of ``Figure.subplots``.
+    """
     figure = Figure(figsize=size, dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.07))
     figure.suptitle(title, fontsize=12)
     axes = figure.subplots(rows, columns, squeeze=False, **layout)
@@ -52,13 +60,16 @@ def panels(
 
 
 def caption(ax: Axes, label: str, note: str = "") -> None:
-    """What a panel shows, with its unit, above it on the left, where no height is too small for it; a note right."""
+    """Write the label of a panel, with its unit, above the panel on the left, and a note above it on the right.
+
+    There the label fits however low the panel is.
+    """
     ax.set_title(label, loc="left", fontsize=9.5)
     ax.set_title(note, loc="right", fontsize=9, color="0.35")
 
 
 def legend_above(ax: Axes) -> None:
-    """A legend above the panel on the right, clear of its curves."""
+    """Draw a legend above the panel on the right, clear of its curves."""
     entries = _entries([ax])
     if not entries:
         return
@@ -67,7 +78,7 @@ def legend_above(ax: Axes) -> None:
 
 
 def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all panels, under them, in as many columns as fit the figure."""
+    """Draw one legend for all panels below them, in as many columns as fit the figure."""
     entries = _entries(axes)
     # A line's sample takes about five letters of 0.085 inch.
     width = 0.085 * (max(map(len, entries), default=0) + 5)
@@ -77,7 +88,7 @@ def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
 
 
 def _entries(axes: Sequence[Axes]) -> dict[str, Artist]:
-    """What carries each label; a label that several share appears once."""
+    """Artist of each label; a label that several artists share appears once."""
     entries: dict[str, Artist] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
@@ -86,37 +97,37 @@ def _entries(axes: Sequence[Axes]) -> dict[str, Artist]:
 
 
 def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
-    """The finite ends of a signal's range, in ``scale`` of its unit, dashed."""
+    """Draw the finite ends of a signal's range, times ``scale``, as dashed lines."""
     for bound in filter(np.isfinite, (signal.low, signal.high)):
         ax.axhline(bound * scale, label="limits", **LIMIT_LINE)
 
 
 def veil(ax: Axes, x: np.ndarray, visited: np.ndarray) -> None:
-    """Make a panel pale at every x that was not visited: what a twin says there, it was never told."""
+    """Make a panel pale at every x that was not visited, because no record has taught the twin its values there."""
     whole: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "white", "linewidth": 0}
     ax.fill_between(x, 0.0, 1.0, where=~visited, alpha=0.65, zorder=2.5, **whole)
 
 
 def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
-    """Times of the samples in s, min or h, whichever is read best, and the axis label."""
+    """Times of the samples in s, min or h, whichever reads best, and the label of the axis."""
     unit, length = time_unit(plant.dt * samples)
     return plant.dt / length * np.arange(samples), f"time [{unit}]"
 
 
 def time_unit(seconds: float) -> tuple[str, float]:
-    """Unit in which a length of time is read best, and its length [s]."""
+    """Unit in which a length of time reads best, and the length of that unit [s]."""
     return ("s", 1.0) if seconds <= 1500.0 else ("min", 60.0) if seconds <= 10_800.0 else ("h", 3600.0)
 
 
 def with_unit(value: float, unit: str) -> str:
-    """A number to two digits with its unit, which is left out when there is none."""
-    # Rounded first, so that hundreds are not written as powers of ten.
+    """A number to two digits with its unit; a pure number has none."""
+    # The number is rounded first, so that hundreds are not written as powers of ten.
     number = f"{float(f'{value:.2g}'):g}"
     return number if unit == "-" else f"{number} {unit}"
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """A tensor as matplotlib reads it."""
+    """A tensor as an array that matplotlib can draw."""
     return tensor.detach().cpu().numpy()
 
 
@@ -126,15 +137,15 @@ def closures(snapshot: Snapshot) -> dict[str, nn.Module]:
 
 
 def last_episode(snapshot: Snapshot) -> int:
-    """Number of the episode that the record is of, from 0 as in ``metrics.json``."""
+    """Number of the record's episode, from 0 as in ``metrics.json``."""
     return max(len(snapshot.episodes) - 1, 0)
 
 
 def twin_label(snapshot: Snapshot) -> str:
-    """What the twin's line is called; without a large scale the arm trains no twin."""
+    """Label of the twin's line; without a large scale the arm trains no twin."""
     return "twin" if snapshot.large_scale is not None else "twin, not trained in this arm"
 
 
 def role_name(role: Role) -> str:
-    """What a policy is called in a figure."""
+    """Name of a policy in a figure."""
     return role.replace("_", "-")

@@ -1,4 +1,4 @@
-"""How good the controllers are on episodes they were never trained on."""
+"""The figure of the controllers' results on episodes that they were never trained on."""
 
 from typing import Any
 
@@ -12,17 +12,17 @@ from rt_torchrl.evaluation.unseen import Judged
 from rt_torchrl.figures.style import REFERENCE, ROLES, array, caption, legend_below, panels
 
 MARKERS = ("o", "^", "s", "D")
-"""One for each kind of episodes."""
+"""Marker of each kind of episodes."""
 WIDEST_LINEAR = 30.0
-"""Ratio of the largest to the smallest value above which a panel is logarithmic."""
+"""Ratio of the greatest to the least value above which a panel is logarithmic."""
 
 
 def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count"]]) -> Figure:
-    """J_a and every quantity of the plant's merit, a point for each episode and a bar at each mean, by controller.
+    """J_a and every quantity of the plant's merit by controller, a point for each episode and a bar at each mean.
 
     Args:
-        judged: by controller, the policies first.
-        categories: the kinds of episodes, told apart by the marker.
+        judged: results of each controller by name, with the policies first.
+        categories: episodes of each kind by name; each kind has its own marker.
     """
     first = next(iter(judged.values()))
     quantities = {"$J_a$": {name: found.control_costs for name, found in judged.items()}}
@@ -35,7 +35,7 @@ def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count
         _strip(ax, {who: array(found) for who, found in values.items()}, kinds)
         caption(ax, name)
     if categories:
-        # In grey: the marker tells the kind, the colour the controller.
+        # The legend is grey, because the marker tells the kind and the colour tells the controller.
         for marker, kind in zip(MARKERS, kinds, strict=False):
             axes[0, 0].plot([], [], marker, color="0.4", markersize=6, markeredgewidth=0.0, label=kind)
         legend_below(figure, [axes[0, 0]])
@@ -43,7 +43,7 @@ def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count
 
 
 def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]) -> None:
-    """One column of points per controller, spread sideways so that they do not hide each other."""
+    """Draw a column of points for each controller, spread sideways so that they do not hide each other."""
     rng = np.random.default_rng(0)
     colours = {str(role): colour for role, colour in ROLES.items()}
     for column, (who, found) in enumerate(values.items()):
@@ -55,6 +55,6 @@ def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]
     together = np.concatenate(list(values.values()))
     if together.min() > 0.0 and together.max() > WIDEST_LINEAR * together.min():
         ax.set_yscale("log")
-    # In two lines: beside each other, four names are wider than a panel.
+    # Names take two lines, because four of them beside each other are wider than a panel.
     ax.set_xticks(range(len(values)), [who.replace("_", "-\n") for who in values])
     ax.set_xlim(-0.6, len(values) - 0.4)

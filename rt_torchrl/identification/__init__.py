@@ -1,1 +1,1 @@
-"""Twins from logs of a plant that nobody controls."""
+"""Identification of a twin from sensor logs, without control of the real system."""

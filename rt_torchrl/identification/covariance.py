@@ -8,9 +8,9 @@ the estimate scatters by
     M = \Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top), \quad
     \Gamma_l = \sum_kg_kg_{k+l}^\top
 
-which needs neither the noise's variance, nor that it is the same in all samples and sensors, nor that neighbouring
-samples are independent, as interpolation makes them depend. It does take the physics to be right: what a closure cannot
-fit at all is bias, and no record shows its size.
+This formula does not need the variance of the noise. The noise may differ between samples and sensors, and
+neighbouring samples may depend on each other, as they do after interpolation. The formula does assume that the physics
+is right: an error that no weights of the closure can remove is bias, and no record shows its size.
 
 Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631.
 """
@@ -25,12 +25,15 @@ from torch import Tensor, nn
 from rt_torchrl.identification.output_error import OutputError
 
 LEAST_EIGENVALUE = 1e-12
-"""Of H with unit diagonal, below which a direction of the weights is not shown by the record."""
+"""Eigenvalue of H, scaled to unit diagonal, below which the record says nothing of that direction of the weights."""
 
 
 @torch.no_grad()
 def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
-    """Of the closure's weights at a minimum of J_p; inf on the diagonal for a weight that the segments do not show."""
+    """Covariance of the closure's weights at a minimum of J_p.
+
+    It is infinite on the diagonal for a weight of which the segments say nothing.
+    """
     replays = output_error.replays()
     H = output_error.normal_equations(replays).matrix
     M, samples = torch.zeros_like(H), 0
@@ -53,7 +56,7 @@ def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
-    """M of one segment, with L = ⌈4 (n/100)^{2/9}⌉."""
+    """The matrix M of one segment of n samples, with L = ⌈4 (n/100)^{2/9}⌉."""
     lags = min(math.ceil(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0)), len(scores) - 1)
     found = scores.T @ scores
     for lag in range(1, lags + 1):
@@ -63,7 +66,10 @@ def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
 
 
 def standard_errors(output_error: OutputError) -> dict[str, float]:
-    """Of every named value of the closure, to first order; inf where the segments do not show it."""
+    """Standard error of every named value of the closure, to first order.
+
+    It is infinite for a value of which the segments say nothing.
+    """
     closure = output_error.twin.closure
     weights = [w for w in closure.parameters() if w.requires_grad]
     found = covariance(output_error)
@@ -80,7 +86,7 @@ def standard_errors(output_error: OutputError) -> dict[str, float]:
 
 
 def named_values(closure: nn.Module) -> dict[str, Tensor]:
-    """``named_coefficients`` of a closure that has them, else every trainable weight by its parameter and place."""
+    """``named_coefficients`` of a closure that has them; otherwise every trainable weight by parameter and place."""
     if hasattr(closure, "named_coefficients"):
         return closure.named_coefficients()
     return {

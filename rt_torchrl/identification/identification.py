@@ -1,4 +1,4 @@
-"""Identification from a recorded log: the closure is trained without control, and judged on what was held out."""
+"""Identification from a recorded log: a closure is trained without control, and judged on held-out segments."""
 
 import copy
 from collections.abc import Sequence
@@ -26,13 +26,15 @@ Optimiser = Literal["levenberg_marquardt", "adam", "lbfgs"]
 
 @dataclass(frozen=True, kw_only=True)
 class IdentificationConfig:
-    """How the closure's weights are found.
+    """Parameters of an identification.
 
     Args:
         iterations: trial steps of each descent, see :class:`Identification`.
-        optimiser: levenberg_marquardt, for closures of some ten weights; adam or lbfgs for more.
-        rate: learning rate of adam, first step length of lbfgs.
-        initial: estimated takes the initial state of each segment as unknown, measured as its first sample says.
+        optimiser: method of the descent: levenberg_marquardt for closures of some ten weights, or adam or lbfgs for
+            closures of more weights.
+        rate: learning rate of adam, or first step length of lbfgs.
+        initial: initial state of each segment: estimated, as an unknown of which the first sample is a measurement, or
+            measured, as in the first sample.
     """
 
     iterations: int = 30
@@ -49,7 +51,7 @@ class IdentificationConfig:
 
 
 class Judgement(NamedTuple):
-    """A twin on segments: J_p summed over them, their length [s], errors, and the states as it replays them."""
+    """Result of a twin on segments: the sum of J_p, the total length [s], RMS errors, and the states as replayed."""
 
     J_p: float
     seconds: float
@@ -58,30 +60,30 @@ class Judgement(NamedTuple):
 
 
 class Identified(NamedTuple):
-    """What an identification found; the closure itself is trained in place."""
+    """Result of an identification; the closure itself is trained in place."""
 
-    weights: dict[str, dict[str, float]]  # before, after, standard_error of each, by name
+    weights: dict[str, dict[str, float]]  # by name: before, after and standard_error of each weight
     training: tuple[Judgement, Judgement]  # before and after
     held_out: tuple[Judgement, Judgement]
-    autocorrelation: Float[Tensor, " n_s"]  # of the residuals from sample to sample; near 0 for white noise
+    autocorrelation: Float[Tensor, " n_s"]  # correlation of neighbouring residuals; near 0 for white noise
     iterations: int
 
 
 class Identification:
     """Trains a closure on segments of a log.
 
-    The twin is driven by the actions and the exogenous input that were logged; what it is compared in is the plant's
-    own J_p. Where initial states are unknown there are two ways, and the weights with the lower J_p stay: weights and
-    initial states together, and the weights alone before both. On the first, initial states can be drawn away to make
-    up for weights far from the right ones; on the second, weights can be driven by the error of a first sample to where
-    the states no longer depend on them.
+    The logged actions and the logged exogenous input drive the twin, and the plant's own J_p compares it with the log.
+    If initial states are unknown, the closure is trained in two ways, and the weights with the lower J_p stay. The
+    first way descends over weights and initial states together; there, initial states can drift to make up for weights
+    that are far off. The second way descends over the weights alone, then over both; there, the error of a first sample
+    can drive the weights to where the states no longer depend on them.
 
     Args:
-        plant: the twin's physics.
-        closure: trained in place.
+        plant: physics of the twin.
+        closure: closure of the twin, trained in place.
         free: indices of the states whose initial value is estimated, see :func:`measured_states`.
-        config: see :class:`IdentificationConfig`.
-        compiled: compile one interval.
+        config: parameters of the identification.
+        compiled: whether to compile one interval.
     """
 
     def __init__(
@@ -98,7 +100,7 @@ class Identification:
         self._sensitivities = Sensitivities(plant, closure, compiled_step=compiled)
 
     def run(self, training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> Identified:
-        """Train on some segments and judge on others; the initial states of both are treated the same way.
+        """Train on some segments and judge on both kinds; the initial states of both are treated the same way.
 
         Raises:
             DivergenceError: if the twin diverges under the weights that it starts from.
@@ -117,7 +119,10 @@ class Identification:
         return Identified(weights, *zip(before, after, strict=True), autocorrelation, done)
 
     def judge(self, segments: Sequence[Trajectory]) -> Judgement:
-        """The twin with its present weights, from the initial states that suit it best, or from the measured ones."""
+        """Judge the twin with its present weights.
+
+        It starts from the initial states that suit it best if these are estimated, otherwise from the measured ones.
+        """
         plant = self.twin.plant
         output_error = self._output_error(segments, self.free, weights=False)
         if self.free:
@@ -136,7 +141,10 @@ class Identification:
         return OutputError(self.twin, segments, initial, weights=weights, sensitivities=self._sensitivities)
 
     def _train(self, segments: Sequence[Trajectory]) -> tuple[OutputError, int]:
-        """The output error at its minimum, and the trial steps taken; both ways where initial states are unknown."""
+        """The output error at its minimum, and the number of trial steps.
+
+        If initial states are unknown, both ways of :class:`Identification` are taken.
+        """
         closure = self.twin.closure
         start = copy.deepcopy(closure.state_dict())
         together = self._output_error(segments, self.free)
@@ -163,18 +171,18 @@ class Identification:
 
 
 def measured_states(plant: Plant, log: SensorLog) -> list[int]:
-    """Indices of the states that a log holds."""
+    """Indices of the plant's states that a log holds."""
     names = [state.name for state in logged_states(plant) if state.name in log.columns]
     return [k for k, state in enumerate(plant.states) if state.name in names]
 
 
 def coefficients(closure: nn.Module) -> dict[str, float]:
-    """The weights by name, in physical units where the closure has ``named_coefficients``."""
+    """The closure's weights by name; they are in physical units if the closure has ``named_coefficients``."""
     return {name: value.item() for name, value in named_values(closure).items()}
 
 
 def lag_one(plant: Plant, segments: Sequence[Trajectory], states: Sequence[Tensor]) -> Float[Tensor, " n_s"]:
-    """Correlation of the residuals of neighbouring samples; nan for a state without residuals."""
+    """Correlation of the residuals of neighbouring samples, for each state; nan for a state without residuals."""
     pairs = zip(states, segments, strict=True)
     residuals = [differences(plant.states, found, segment.states) for found, segment in pairs]
     products = sum((r[1:] * r[:-1]).sum(0) for r in residuals)
@@ -184,7 +192,8 @@ def lag_one(plant: Plant, segments: Sequence[Trajectory], states: Sequence[Tenso
 def held_back(plant: Plant, segments: Sequence[Trajectory]) -> dict[str, float]:
     """Share of the control intervals in which the plant's actuators would not have applied the logged action.
 
-    The twin is then driven by what they allow: a sign of wrong rate limits, units or columns.
+    In these intervals the action that the actuators allow drives the twin. They are a sign of wrong rate limits, units
+    or columns.
     """
     found = []
     for segment in segments:

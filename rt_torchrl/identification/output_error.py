@@ -1,9 +1,10 @@
-r"""How far a twin is from segments of a log, and how that changes with the closure's weights and the initial states.
+r"""The output error J_p of a twin on segments of a log, and its derivatives by weights and initial states.
 
 .. math:: J_p(w, s_0^1, \dots, s_0^m) = \sum_i\sum_{k=0}^{n_i} L_p(s^i_k, \check s^i_k)\,\Delta t
 
-A sensor's first sample is as noisy as any other, and a system that forgets slowly carries its error through the whole
-segment. The initial states are therefore unknowns beside the weights, and their samples count as any other.
+A sensor's first sample is as noisy as any other, and a system that forgets slowly carries the error of its first sample
+through the whole segment. The initial states are therefore unknowns beside the weights, and first samples count as much
+as any other samples.
 """
 
 from collections.abc import Sequence
@@ -22,20 +23,20 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 NOISE_TOLERANCE = 1e-8
-"""Levenberg-Marquardt ends where a step promises less than this share of J_p. One standard error of a weight changes
-J_p by one part in the number of samples, so that the default for noise-free records would end too early here."""
+"""Levenberg-Marquardt ends where a step promises to lower J_p by less than this share. One standard error of a weight
+changes J_p by about one part in the number of samples, so the default for noise-free records would end too early."""
 INITIAL_ITERATIONS = 10
-"""Trial steps for initial states alone: J_p is nearly quadratic in them."""
+"""Number of trial steps for initial states alone; it is small because J_p is nearly quadratic in them."""
 REMEDY = "Check the units of what was recorded, use a smaller dt, or start from a closure nearer to the system."
 
 
 class InitialStates(nn.Module):
-    """s_0 of every segment: what was measured, plus trainable offsets of the measured components.
+    """Initial state s_0 of every segment: the measured state plus trainable offsets.
 
     Args:
-        segments: of the log.
+        segments: segments of the log.
         free: indices of the states that have an offset.
-        scale: unit of the offsets, by state; about the noise, so that a step of one is neither long nor short.
+        scale: unit of the offset of each state; it is about the noise, so that a step of 1 is neither long nor short.
     """
 
     def __init__(self, segments: Sequence[Trajectory], free: Sequence[int], scale: Float[Tensor, " n_s"]):
@@ -50,14 +51,17 @@ class InitialStates(nn.Module):
 
     @classmethod
     def as_measured(cls, segments: Sequence[Trajectory]) -> "InitialStates":
-        """Without offsets."""
+        """Initial states without offsets."""
         return cls(segments, (), torch.ones_like(segments[0].states[0]))
 
     @classmethod
     def estimated(
         cls, twin: DigitalTwin, segments: Sequence[Trajectory], free: Sequence[int], sensitivities: Sensitivities
     ) -> "InitialStates":
-        """Offsets in units of the twin's present residual, so that no step leaves what the sensors allow by much."""
+        """Initial states whose offsets have the twin's present RMS residual as their unit.
+
+        No step then leaves by much what the sensors allow.
+        """
         if not free:
             return cls.as_measured(segments)
         fixed = OutputError(twin, segments, cls.as_measured(segments), weights=False, sensitivities=sensitivities)
@@ -69,10 +73,10 @@ class InitialStates(nn.Module):
 
 
 class Replayed(NamedTuple):
-    """A segment as the twin replays it: states s_0 ... s_n, and what every sample says of the unknowns.
+    """A segment as the twin replays it: the states s_0 ... s_n, and the derivatives in every sample.
 
-    ``gradient`` and ``curvature`` are those of L_p by the state, ``sensitivity`` is that of the state by the unknowns
-    with the places ``index`` in the vector of all.
+    ``gradient`` and ``curvature`` are derivatives of L_p by the state. ``sensitivity`` is the derivative of the state
+    by the unknowns of this segment; ``index`` holds their places in the vector of all unknowns.
     """
 
     states: Float[Tensor, "samples n_s"]
@@ -83,14 +87,14 @@ class Replayed(NamedTuple):
 
 
 class OutputError:
-    """J_p of a twin on segments of a log.
+    """The cost J_p of a twin on segments of a log.
 
     Args:
-        twin: its closure's trainable weights come first among the unknowns.
-        segments: of any lengths.
-        initial: the initial states; their offsets come last.
+        twin: the twin; the trainable weights of its closure come first among the unknowns.
+        segments: segments of the log, of any lengths.
+        initial: initial states of the segments; their offsets come last among the unknowns.
         weights: whether the closure's weights are unknowns.
-        sensitivities: of the twin; its own by default.
+        sensitivities: forward sensitivities of the twin; ``twin.sensitivities`` by default.
     """
 
     def __init__(
@@ -113,7 +117,7 @@ class OutputError:
         return self.twin.plant
 
     def cost(self) -> Tensor:
-        """J_p, differentiable by the adjoint of the twin's engine."""
+        """The cost J_p; autograd differentiates it by the adjoint of the twin's engine."""
         total = 0.0
         for (states, actions, exogenous, start), first in zip(self.segments, self.initial(), strict=True):
             flown = self.twin.replay(first[None], exogenous[None], actions[None], start=start)
@@ -122,7 +126,7 @@ class OutputError:
 
     @torch.no_grad()
     def replays(self) -> list[Replayed]:
-        """Every segment under the present unknowns.
+        """Replay every segment with the present unknowns.
 
         Raises:
             DivergenceError: if a state is not finite.
@@ -142,7 +146,11 @@ class OutputError:
 
     @torch.no_grad()
     def normal_equations(self, replays: Sequence[Replayed] | None = None) -> NormalEquations:
-        """J_p, its gradient and its Gauss-Newton matrix by all unknowns, of ``replays`` that were made already."""
+        """J_p, its gradient and its Gauss-Newton matrix by all unknowns.
+
+        Args:
+            replays: result of :meth:`replays` with the present unknowns; None computes it.
+        """
         count = self._shown + self.initial.offsets.numel()
         gradient, matrix = self.initial.measured.new_zeros(count), self.initial.measured.new_zeros(count, count)
         cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
@@ -154,7 +162,7 @@ class OutputError:
         return NormalEquations(cost, gradient, matrix)
 
     def fit_initial_states(self) -> None:
-        """Estimate the initial states under the present weights, of an output error whose only unknowns they are."""
+        """Estimate the initial states with the present weights; ``weights`` must be False."""
         LevenbergMarquardt(self.initial, tolerance=NOISE_TOLERANCE).run(self.normal_equations, INITIAL_ITERATIONS)
 
     def _index(self, number: int) -> Int[Tensor, " n_local"]:
@@ -166,12 +174,12 @@ class OutputError:
 def discrepancy_derivatives(
     plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
 ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
-    """Gradient and Hessian of L_p with respect to every state."""
+    """Gradient and Hessian of L_p by the state, in every sample."""
     pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
     curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
     return pointwise(states, measured), curvature(states, measured)
 
 
 def compared(curvature: Float[Tensor, "batch n n_s n_s"]) -> Bool[Tensor, " n_s"]:
-    """The states that L_p looks at, by its Hessian."""
+    """Whether L_p depends on each state, as its Hessian shows."""
     return (curvature != 0.0).flatten(0, 2).any(0)

@@ -1,9 +1,10 @@
-r"""From a log at irregular instants to records at a plant's control intervals.
+r"""Resampling of a log with irregular instants to segments at a plant's control intervals.
 
-A plant is sampled-data. Its states are instantaneous, so they are interpolated linearly at :math:`t_k`. Its actions and
-exogenous inputs are held over an interval, so the one of :math:`[t_k, t_{k+1}]` is the mean over that interval of what
-the log held, which keeps the impulse of a force and the energy of a load whatever the instants were. A periodic state
-is interpolated the short way round: between two rows it turns by less than half a turn.
+A plant is a sampled-data system. Its states are instantaneous, so they are interpolated linearly at :math:`t_k`. Its
+actions and exogenous inputs are held over an interval, so the value over :math:`[t_k, t_{k+1}]` is the mean of the
+log's held values over that interval. The mean keeps the impulse of a force and the energy of a load, however irregular
+the instants are. A periodic state is interpolated the short way round: between two rows it turns by less than half a
+turn.
 """
 
 from collections.abc import Sequence
@@ -19,37 +20,37 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 GAP_INTERVALS = 3.0
-"""Sampling intervals after which a pause counts as a gap, unless a limit is stated."""
+"""Number of sampling intervals after which a pause counts as a gap, unless a limit is given."""
 INTERVALS_PER_ROW = 50
-"""Control intervals for each row of a log beyond which its time has another unit, or nothing is known between rows."""
+"""Greatest number of control intervals for each row of a log; with more, its time probably has another unit."""
 ROUNDING = 1e-6
 """Share of an interval by which an instant may miss the grid."""
 
 
 class Resampled(NamedTuple):
-    """Segments of a log, in order, and what became of the rest; times in s."""
+    """Segments of a log, in order, and the parts that were left out; times are in s."""
 
     segments: list[Trajectory]
     interval: float  # median sampling interval
     jitter: float  # standard deviation of the intervals within the segments, over their median
-    gap: float  # limit that was used
-    gaps: list[tuple[float, float]]  # last time before and first time after each
-    too_short: list[tuple[float, float]]  # first and last time of the parts that were left out
+    gap: float  # longest time between two rows that was bridged
+    gaps: list[tuple[float, float]]  # last time before and first time after each gap
+    too_short: list[tuple[float, float]]  # first and last time of each part that was left out
 
 
 def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest: int = 10) -> Resampled:
     """Cut a log at its gaps and bring each part to the plant's control intervals.
 
     Args:
-        log: see :func:`rt_torchrl.identification.sensor_log.checked`.
-        plant: its control interval dt, and :meth:`Plant.complete_states`.
+        log: log that :func:`rt_torchrl.identification.sensor_log.checked` has returned.
+        plant: plant that gives the control interval dt and :meth:`Plant.complete_states`.
         gap: longest time between two rows that is bridged [s]; None for three median sampling intervals, but not less
             than dt.
-        shortest: control intervals below which a part is left out.
+        shortest: number of control intervals below which a part is left out.
 
     Raises:
-        ValueError: if an argument is out of its range, no part is long enough, the control intervals are far more than
-            the rows, or states are missing that the plant cannot complete.
+        ValueError: if an argument is out of its range, no part is long enough, there are far more control intervals
+            than rows, or a state is missing that the plant cannot complete.
     """
     intervals = np.diff(log.times)
     interval = float(np.median(intervals))
@@ -76,13 +77,14 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
 
 
 def hold_out(segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10) -> tuple[list, list]:
-    """Segments to train on and, last in time, segments to judge by; the one in which the cut falls is divided.
+    """Split segments into those to train on and later ones to judge by; the segment at the cut is divided.
 
     Args:
-        segments: in order.
+        segments: segments of the log, in order.
         dt: control interval [s].
-        share: of all control intervals that is held out.
-        shortest: control intervals that a part needs; a shorter one goes whole to the other side.
+        share: share of all control intervals that is held out to judge by.
+        shortest: number of control intervals that a part of the divided segment needs; a segment with a shorter part
+            stays whole.
 
     Raises:
         ValueError: if the share is not between 0 and 1, or one side is left empty.
@@ -112,13 +114,13 @@ def hold_out(segments: Sequence[Trajectory], dt: float, share: float, *, shortes
 def hold_means(
     times: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " samples"]
 ) -> Float[np.ndarray, " intervals"]:
-    """Mean over every interval of the grid of a signal that is held from each time to the next; exact."""
+    """Exact means, over every interval of a grid, of a signal that holds its value from each time to the next."""
     integral = np.append(0.0, np.cumsum(values[:-1] * np.diff(times)))
     return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
 
 
 def _require_rows(log: SensorLog, steps: int, interval: float, plant: Plant) -> None:
-    """Refuse a log that would grow beyond all it knows, before memory is taken for it."""
+    """Refuse a log that would give far more control intervals than it has rows, before it takes memory."""
     rows = len(log.times)
     if steps > INTERVALS_PER_ROW * rows:
         raise ValueError(

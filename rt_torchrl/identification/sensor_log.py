@@ -1,4 +1,4 @@
-"""Recorded logs of a real system: what its sensors and actuators wrote down, in a CSV or Parquet file."""
+"""Recorded logs of a real system's sensors and actuators, in CSV or Parquet files."""
 
 import re
 from collections.abc import Sequence
@@ -23,17 +23,18 @@ COLUMN = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    r"""Which column of a file holds which signal, and in which unit: by its name, or value = factor·number + offset.
+    r"""A column of a file, the signal that it holds, and its unit: a name, or value = factor·number + offset.
 
     Args:
-        header: of the column in the file.
+        header: header of the column in the file.
         signal: name of the plant's signal, or ``time``.
-        factor: signal's unit over the column's.
-        offset: in the signal's unit.
-        unit: of the column, see :func:`converted`; None for that of the signal, or where there are factor and offset.
+        factor: factor from the column's numbers to the signal's unit.
+        offset: value of the signal where the column holds zero, in the signal's unit.
+        unit: unit of the column's numbers, see :func:`converted`; None if they have the unit of the signal, or if
+            factor and offset convert them.
 
     Raises:
-        ValueError: if the factor is zero, one of the two numbers is not finite, or there is a unit beside them.
+        ValueError: if the factor is zero, factor or offset is not finite, or there is a unit beside them.
     """
 
     header: str
@@ -56,7 +57,7 @@ class Column:
 
     @classmethod
     def parse(cls, text: str) -> "Column":
-        """From ``HEADER=SIGNAL``, ``HEADER=SIGNAL[UNIT]`` or ``HEADER=SIGNAL*FACTOR+OFFSET``.
+        """The column that ``HEADER=SIGNAL``, ``HEADER=SIGNAL[UNIT]`` or ``HEADER=SIGNAL*FACTOR+OFFSET`` describes.
 
         Raises:
             ValueError: if the text has another form.
@@ -78,12 +79,12 @@ class Column:
 class SensorLog:
     """Signals of a real system, sampled together at instants that need not be regular.
 
-    A row is what a controller knows and does at one instant: states are instantaneous, actions and exogenous inputs are
-    held from there until the next row.
+    A row holds what a controller knows and does at one instant. States are instantaneous; actions and exogenous inputs
+    are held until the next row.
 
     Args:
-        times: instants [s], increasing.
-        columns: values of every signal by its name, in its unit; NaN where a sensor gave none.
+        times: instants of the rows [s], increasing.
+        columns: values of every signal by name, in the signal's unit; NaN where a sensor gave no value.
 
     Raises:
         ValueError: if the times are not finite and increasing, or a column has another length.
@@ -112,15 +113,18 @@ class SensorLog:
                 raise ValueError(f"column {name!r} has shape {values.shape}; the log has {len(t)} rows.")
 
     def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":
-        """Of some rows only; what is left out becomes a gap."""
+        """The log of some of its rows; rows that are left out become a gap."""
         return SensorLog(times=self.times[rows], columns={name: values[rows] for name, values in self.columns.items()})
 
     def without(self, names: Sequence[str]) -> "SensorLog":
-        """Without some columns."""
+        """The log without the columns of these names."""
         return SensorLog(times=self.times, columns={k: v for k, v in self.columns.items() if k not in names})
 
     def write(self, path: Path) -> None:
-        """As CSV, or Parquet if the name ends so; read again by :func:`read_log` without a mapping."""
+        """Write the log as Parquet if the path ends in ``.parquet``, otherwise as CSV.
+
+        :func:`read_log` reads it without a mapping of columns.
+        """
         frame = pandas().DataFrame({TIME: self.times, **self.columns})
         if path.suffix == ".parquet":
             frame.to_parquet(path, index=False)
@@ -129,28 +133,28 @@ class SensorLog:
 
 
 def logged_states(plant: Plant | type[Plant]) -> tuple[Signal, ...]:
-    """States with a column of their own; one that remembers an action or input by its name has none."""
+    """States that have a column of their own in a log; a state with the name of an action or input has none."""
     driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
     return tuple(state for state in plant.states if state.name not in driven)
 
 
 def logged_signals(plant: Plant) -> tuple[Signal, ...]:
-    """All signals that a log of this plant can hold: its states, actions and exogenous inputs."""
+    """Signals that a log of this plant can hold: its states, actions and exogenous inputs."""
     return (*logged_states(plant), *plant.actions, *plant.inputs)
 
 
 def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
-    """The columns of a file that are signals of a plant; others are left alone.
+    """Read the columns of a file that hold signals of a plant; other columns are ignored.
 
     Args:
-        path: a file ending in ``.csv`` or ``.parquet``. The time is a number of seconds on the plant's clock, or a
-            date and time of day (ISO 8601), which is counted from the first row.
-        plant: names the signals.
-        columns: those whose header is not the name of their signal, or whose unit is another.
+        path: file whose name ends in ``.csv`` or ``.parquet``. Its time is a number of seconds on the plant's clock, or
+            a date and time of day (ISO 8601), which is counted from the first row.
+        plant: plant whose signals the file holds.
+        columns: columns whose header is not the name of their signal, or whose unit is not that of their signal.
 
     Raises:
-        ValueError: if the file cannot be read, a column is missing, of an unknown signal or not numeric, or the times
-            are not increasing, or the unit of a column measures something else than its signal's.
+        ValueError: if the file cannot be read, a column is missing, names an unknown signal or is not numeric, the
+            times are not increasing, or the unit of a column measures another quantity than the unit of its signal.
     """
     frame = _read(path)
     names = [signal.name for signal in logged_signals(plant)]
@@ -162,7 +166,7 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Sensor
             )
     declared = {column.signal: column for column in columns}
     if len(declared) < len(columns):
-        raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; one column for each.")
+        raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; give each signal one column.")
     by_name = {name: Column(header=name, signal=name) for name in (TIME, *names) if name in frame}
     chosen = by_name | declared
     if TIME not in chosen:
@@ -173,12 +177,12 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Sensor
 
 
 def checked(log: SensorLog, plant: Plant, *, drop: bool = False) -> SensorLog:
-    """A log that a twin of this plant can be driven by.
+    """The log, once it is certain that it can drive a twin of this plant.
 
     Args:
-        log: as read.
-        plant: says what is needed, and the range of each signal.
-        drop: leave out rows in which a value is missing or out of range, instead of refusing the log.
+        log: log as it was read.
+        plant: plant that gives the signals that are needed and the range of each signal.
+        drop: whether to leave out rows in which a value is missing or out of range, instead of refusing the log.
 
     Raises:
         ValueError: if an action or input has no column; without ``drop`` also if a value is missing or out of range.
@@ -219,7 +223,7 @@ def _read(path: Path) -> Any:
 
 
 def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndarray, " rows"]:
-    """Numbers of a column in the signal's unit; a date becomes the seconds since the first."""
+    """Numbers of a column in the signal's unit; a date becomes the seconds since the first date."""
     pd = pandas()
     if series.empty:
         return np.empty(0)
@@ -233,7 +237,7 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndar
         else:
             numbers = pd.to_numeric(series)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"column {column.header!r} of {path} holds what is no number: {error}") from error
+        raise ValueError(f"column {column.header!r} of {path} holds an entry that is not a number: {error}") from error
     values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
     if column.unit is None:
         return column.factor * values + column.offset
@@ -244,7 +248,7 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndar
 
 
 def pandas() -> Any:
-    """The library that reads and writes tables, which only logs need.
+    """The library pandas, which reads and writes tables; only logs need it.
 
     Raises:
         ValueError: if it is not installed.

@@ -1,4 +1,4 @@
-"""What a data logger writes of a simulated real system: irregular instants, noisy sensors."""
+"""Logs of a simulated real system, with irregular instants and noisy sensors."""
 
 from collections.abc import Callable
 
@@ -13,16 +13,16 @@ from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.plants.plant import Plant
 
 Law = Callable[[Float[Tensor, ""], Float[Tensor, "1 n_s"], Float[Tensor, "1 n_z"]], Float[Tensor, "1 n_a"]]
-"""Time [s], state and exogenous input to a command; may remember."""
+"""A control law: a function from time [s], state and exogenous input to a command. It may have a memory."""
 
 
 def policy_law(plant: Plant, policy: nn.Module) -> Law:
-    """A policy of the plant's observation."""
+    """A policy of the plant's observation as a control law."""
     return lambda t, state, exogenous: policy(plant.observe(t, state, exogenous))
 
 
 class ClassicalLaw:
-    """A classical controller with its memory, for one episode."""
+    """A classical controller with its memory as a control law for one episode."""
 
     def __init__(self, controller: ClassicalController):
         self._controller, self._memory = controller, None
@@ -42,17 +42,17 @@ def recorded(
 
     .. math:: t_j = (j + \eta_j)\,\Delta t, \qquad \eta_j \sim U(-\tfrac12, \tfrac12)\cdot\mathrm{jitter}
 
-    At t_j the loop observes and acts; action and exogenous input are held until t_{j+1}, over which the plant is
-    integrated by one step. The loop acts on the true state; what is logged has the sensors' noise.
+    At t_j the loop observes and acts. Action and exogenous input are held until t_{j+1}, and one step integrates the
+    plant over that interval. The loop acts on the true state; the log holds the state with the sensors' noise.
 
-    A plant with a scheme of its own knows no interval but Δt, and is recorded without jitter.
+    A plant with a scheme of its own can only step by Δt, and so must be recorded without jitter.
 
     Args:
-        plant: its own closure is the true one.
-        law: see :data:`Law`.
+        plant: plant whose own closure is the true one.
+        law: control law, see :data:`Law`.
         generator: source of initial state, exogenous input, jitter and noise, in this order.
-        jitter: greatest difference of an interval from dt, as a share of dt; in [0, 1).
-        noise: standard deviation of the sensors of the states, as a share of what they read.
+        jitter: greatest difference between an interval and dt, as a share of dt; it lies in [0, 1).
+        noise: standard deviation of the sensors of the states, as a share of the value that they read.
 
     Raises:
         ValueError: if an argument is out of its range, or there is jitter and the plant has a scheme of its own.
@@ -85,7 +85,7 @@ def recorded(
 
 
 def _held(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, length: float) -> Tensor:
-    """The state after an interval of any length."""
+    """The state after an interval of any length, over which action and input are held."""
     end = rk4_step(lambda t, s: plant.vector_field(t, s, applied, z, plant.closure), t, state, length)
     return plant.latch(end, applied)
 

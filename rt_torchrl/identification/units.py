@@ -1,4 +1,4 @@
-"""Converts columns of a log to the units of a plant's signals."""
+"""Conversion of a log's columns to the units of a plant's signals."""
 
 from functools import cache
 from typing import Any
@@ -10,14 +10,16 @@ EXAMPLES = "write it as in rpm, m/s^2, kN m, degC."
 
 
 def converted(values: Float[np.ndarray, " rows"], unit: str, to: str) -> Float[np.ndarray, " rows"]:
-    """Values in another unit, by the library pint.
+    """The values in another unit, converted by the library pint.
 
-    Angles are not pure numbers here, as they are to pint: Hz and rad/s, which differ by 2π, do not measure the same.
+    To pint an angle is a pure number; here it is not. Hz and rad/s, which differ by 2π, therefore measure different
+    quantities.
 
     Args:
-        values: in ``unit``.
-        unit: such as ``rpm``, ``kN m``, ``degF``, ``%``; temperatures are absolute, ``delta_degF`` is a difference.
-        to: unit of the result; ``-`` is that of a pure number.
+        values: numbers in ``unit``.
+        unit: unit of the values, such as ``rpm``, ``kN m``, ``degF`` or ``%``. Temperatures are absolute;
+            ``delta_degF`` is the unit of a difference.
+        to: unit of the result; ``-`` is the unit of a pure number.
 
     Raises:
         ValueError: if a unit is unknown, the two measure different things, or pint is not installed.
@@ -30,9 +32,9 @@ def converted(values: Float[np.ndarray, " rows"], unit: str, to: str) -> Float[n
             return registry.Quantity(values, have).to(want).magnitude
     except pint.UndefinedUnitError as error:
         raise ValueError(f"unit {unit!r} is not known ({error}); {EXAMPLES}") from error
-    except Exception as error:  # the parser of pint lets through what Python's own raises
+    except Exception as error:  # pint's parser lets errors of Python's own parser through
         raise ValueError(f"unit {unit!r} is not understood; {EXAMPLES}") from error
-    raise ValueError(f"{unit!r} (base units {base}) and {to!r} ({wanted}) do not measure the same.")
+    raise ValueError(f"{unit!r} (base units {base}) and {to!r} ({wanted}) do not measure the same quantity.")
 
 
 @cache

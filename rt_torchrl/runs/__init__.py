@@ -1,1 +1,1 @@
-"""A training with everything around it: options, progress, checkpoints, results."""
+"""Runs of a training, with their options, progress, checkpoints and results."""

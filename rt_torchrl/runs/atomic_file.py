@@ -12,10 +12,10 @@ PARTIAL = ".partial"
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Put ``content`` in the place of a file; whatever happens, the file is the old one or the new one.
+    """Write a file whole or not at all: whatever happens, it has its old content or ``content``.
 
     Raises:
-        OSError: if it cannot be written, such as on a full disk; the old file is left as it was.
+        OSError: if the file cannot be written, such as on a full disk; its old content stays.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PARTIAL}")
     try:
@@ -34,23 +34,23 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what writers that were killed have left in a folder where nobody else writes."""
+    """Remove partial files that killed processes have left; no other process may write in the folder."""
     for partial in folder.glob(f".*{PARTIAL}"):
         partial.unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON as its standard has it, which knows no NaN and no infinity; see :func:`finite`.
+    """Write standard JSON, which has no NaN and no infinity; :func:`finite` replaces them.
 
     Raises:
         ValueError: if a number is not finite.
-        OSError: see :func:`write_atomically`.
+        OSError: if the file cannot be written, see :func:`write_atomically`.
     """
     write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 def finite(content: Any) -> Any:
-    """The same with None for every number that is not finite."""
+    """The content with None in place of every number that is not finite."""
     if isinstance(content, float):
         return content if math.isfinite(content) else None
     if isinstance(content, dict):

@@ -1,4 +1,4 @@
-"""Save a training after any episode and go on with it later, to the bit."""
+"""Checkpoints of a training after an episode, from which it goes on as if it had never stopped, to the bit."""
 
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ def state_of(algorithm: ReinforcementTwinning) -> dict[str, Any]:
 
 
 def restore(algorithm: ReinforcementTwinning, state: dict[str, Any]) -> None:
-    """Put an algorithm, built with the same configuration, into a saved state.
+    """Put an algorithm that was built with the same configuration into a saved state.
 
     Raises:
-        ValueError: if the state is of another plant, or does not fit.
+        ValueError: if the state belongs to another plant, or does not fit.
     """
     name = algorithm.twin.plant.name
     if state.get("plant") != name:
@@ -35,11 +35,11 @@ def restore(algorithm: ReinforcementTwinning, state: dict[str, Any]) -> None:
 
 
 def save(path: Path, algorithm: ReinforcementTwinning, episodes: list[dict[str, Any]]) -> None:
-    """Write a checkpoint; whatever happens while it is written leaves the one before intact.
+    """Write a checkpoint; the earlier checkpoint stays intact until the new one is complete.
 
     Raises:
-        ValueError: if a part's state is more than tensors, numbers and strings, such as an environment's.
-        OSError: if it cannot be written.
+        ValueError: if a component's state, such as an environment's, holds more than tensors, numbers and strings.
+        OSError: if the checkpoint cannot be written.
     """
     save_tensors(path, {"format": FORMAT, "episodes": episodes, "state": state_of(algorithm)})
 
@@ -48,7 +48,8 @@ def load(path: Path, algorithm: ReinforcementTwinning) -> list[dict[str, Any]]:
     """Restore a checkpoint and return the records of its episodes.
 
     Raises:
-        ValueError: if there is none at ``path``, it is damaged, of another format or plant, or does not fit.
+        ValueError: if there is no checkpoint at ``path``, or it is damaged, has another format, belongs to another
+            plant, or does not fit.
     """
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path} to go on from.")

@@ -1,4 +1,4 @@
-"""A recipe as a module: what a file with a ``Config`` and a ``main`` defines."""
+"""Recipes, which are files with a ``Config`` and a ``main``, and their command lines."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +14,14 @@ Configuration = TypeVar("Configuration")
 
 
 def from_command_line(config_class: type[Configuration], arguments: Sequence[str] | None = None) -> Configuration:
-    """The configuration of a command line, by default of this process.
+    """The configuration that a command line asks for.
 
-    That of a recipe is read twice: some of its options have other defaults for others, see :meth:`RunConfig.defaults`;
-    what is given stays.
+    The command line of a recipe is read twice, because the defaults of some options depend on other options; see
+    :meth:`RunConfig.defaults`. Options that are given stay as they are.
+
+    Args:
+        config_class: class of the configuration.
+        arguments: words of the command line; by default those of this process.
     """
     config = tyro.cli(config_class, args=arguments)
     if isinstance(config, RunConfig):
@@ -26,10 +30,10 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
 
 
 def load_recipe(path: Path) -> ModuleType:
-    """The recipe in a file, imported once.
+    """The module of the recipe in a file, which is imported only once.
 
     Raises:
-        ValueError: if there is no such file, or it defines no ``Config`` derived from ``RunConfig``, or no ``main``.
+        ValueError: if there is no such file, or it lacks a ``Config`` derived from ``RunConfig`` or a ``main``.
     """
     if not path.is_file():
         raise ValueError(f"recipe={path} does not exist; give the file of a recipe.")

@@ -1,4 +1,4 @@
-"""TensorBoard: one scalar per quantity and episode, and the figures."""
+"""The TensorBoard dashboard of a run: one scalar per quantity and episode, and the figures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,21 +31,25 @@ TAGS = {
     "distillation_error": "switch/RMS action error of a distilled clone, share of range",
     "distillation_cost_ratio": "switch/J_a of a distilled clone over that of the live policy (twin)",
 }
-"""Tag of each entry of an episode's record; entries without one are not scalars."""
+"""Tag of each scalar entry of an episode's record."""
 
 
 class Dashboard:
-    """Writes TensorBoard events.
+    """A dashboard, which writes TensorBoard events.
 
     Args:
-        folder: where the event file goes.
+        folder: folder of the event file.
     """
 
     def __init__(self, folder: Path):
         self._writer = SummaryWriter(str(folder))
 
     def episode(self, record: Mapping[str, Any]) -> None:
-        """The scalars of one episode, from its record in ``metrics.json``."""
+        """Write the scalars of one episode.
+
+        Args:
+            record: entry of the episode in ``metrics.json``.
+        """
         step = record["episode"]
         for key, tag in TAGS.items():
             if key in record:
@@ -57,12 +61,12 @@ class Dashboard:
             self._writer.add_scalar(f"seconds/{name}", seconds, step)
 
     def figures(self, figures: Mapping[str, Figure], step: int) -> None:
-        """Figures as they are after an episode."""
+        """Write the figures of an episode, whose number is ``step``."""
         for name, figure in figures.items():
             self._writer.add_figure(name, figure, step, close=False)
 
     def scalar(self, tag: str, value: float) -> None:
-        """A figure of the run as a whole."""
+        """Write a scalar of the run as a whole."""
         self._writer.add_scalar(tag, value, 0)
 
     def close(self) -> None:

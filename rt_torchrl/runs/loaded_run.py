@@ -1,4 +1,4 @@
-"""A run folder read back: the plant, the trained policies and the closure, without training anything."""
+"""Loading a run folder: its plant, its trained policies and its closure, without a training."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +17,13 @@ from rt_torchrl.runs.user_code import named
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedRun:
-    """What a run left, on the CPU; see :func:`load_run`.
+    """A finished run as :func:`load_run` reads it from its folder, on the CPU.
 
     Args:
         config: options of the run, as they were asked for.
-        plant: the real system in simulation, new.
-        policies: as trained, by role: ``model_based`` and ``model_free``.
-        closure: of the twin, as trained.
+        plant: the real system in simulation, newly made.
+        policies: trained policies by role: ``model_based`` and ``model_free``.
+        closure: trained closure of the twin.
     """
 
     config: RunConfig
@@ -52,13 +52,13 @@ def load_run(
 
     Args:
         folder: the run folder, with ``config.json`` and ``weights.pt``.
-        recipe: the recipe, where it has moved or the run does not name it: its file, ``package.module:Config``, or the
-            class itself. By default the one that the run names.
-        plant: the plant of the run, where the recipe's ``Config`` has no method ``plant()`` that makes it.
+        recipe: the recipe, if it has moved or the run does not name it: its file, ``package.module:Config``, or the
+            class itself; by default the recipe that the run names.
+        plant: the plant of the run, if the recipe's ``Config`` has no method ``plant()`` that makes it.
 
     Raises:
-        ValueError: if the folder holds no finished run, its recipe is not found, or one that the recipe of today cannot
-            rebuild.
+        ValueError: if the folder holds no finished run, its recipe is not found, or the present recipe cannot rebuild
+            the run.
     """
     folder = Path(folder)
     settings = read_settings(folder)
@@ -77,7 +77,7 @@ def load_run(
 def _rebuilt(
     folder: Path, settings: dict[str, Any], config_class: type[RunConfig], plant: Plant | None
 ) -> tuple[RunConfig, Plant]:
-    """Configuration and plant of the settings of a run; the plant may be given."""
+    """The configuration and the plant that a run's settings describe; a given plant is taken as it is."""
     if plant is None and not hasattr(config_class, "plant"):
         raise ValueError(
             f"{config_class.__qualname__} has no method plant() that makes the plant from its options; write one, or "
@@ -91,15 +91,15 @@ def _rebuilt(
         raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error
     name = settings["plant"]
     if plant.name != name:
-        raise ValueError(f"{folder} is a run of plant {name!r}, the recipe is of {plant.name!r}; use the run's own.")
+        raise ValueError(f"{folder} is a run of plant {name!r}, the recipe is of {plant.name!r}; use the run's recipe.")
     return config, plant
 
 
 def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
-    """The configuration's class of a recipe: the class itself, ``Config`` of a file, or ``package.module:Config``.
+    """The configuration class of a recipe, given as the class, as its file, or as ``package.module:Config``.
 
     Raises:
-        ValueError: if there is no such file or module, or what it defines is no recipe; see :func:`load_recipe`.
+        ValueError: if there is no such file or module, or it defines no recipe; see :func:`load_recipe`.
     """
     if isinstance(recipe, type):
         return require_config(recipe, recipe.__qualname__)
@@ -109,7 +109,7 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
 
 
 def _parts(config: RunConfig, plant: Plant) -> dict[str, nn.Module]:
-    """Policies and closure as a run makes them before it trains them."""
+    """Policies and closure of a run before their training."""
     generator = torch.Generator().manual_seed(config.seed)
     return {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
 

@@ -1,4 +1,4 @@
-"""What this machine can run."""
+"""Devices and compilation on this machine, and the libraries' log lines."""
 
 import logging
 import warnings
@@ -8,22 +8,22 @@ import torch
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 
 NOISY = ("torchrl", "torch.utils.cpp_extension")
-"""Loggers that report how a library works inside."""
+"""Loggers that report the inner work of a library."""
 
 
 def quieten_libraries() -> None:
-    """Keep off the terminal what libraries say of themselves, of which nothing is the user's to mend."""
+    """Keep log lines and warnings off the terminal that concern the libraries' own code, which a user cannot mend."""
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Of TorchRL's own code, and only with new versions of PyTorch.
+    # TorchRL's own code causes this warning, with new versions of PyTorch.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*is deprecated", category=FutureWarning)
 
 
 def require_device(name: str) -> torch.device:
-    """The device of that name.
+    """The device of this name.
 
     Raises:
-        ValueError: if there is no such device on this machine.
+        ValueError: if this machine has no such device.
     """
     try:
         device = torch.device(name)
@@ -34,7 +34,7 @@ def require_device(name: str) -> torch.device:
 
 
 def can_compile(device: torch.device) -> bool:
-    """Whether this machine has what torch.compile needs; if not, says on the terminal what is missing."""
+    """Whether this machine has what torch.compile needs; if not, the terminal shows what is missing."""
     missing = missing_for_compilation() if device.type == "cpu" else None
     if missing:
         print(f"This machine lacks {missing}: running without torch.compile, several times slower.")

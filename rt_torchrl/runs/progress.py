@@ -1,4 +1,4 @@
-"""The bar of a training: what it is doing, from the first second to the last."""
+"""The progress bar of a training, which shows what the training does from the first second to the last."""
 
 import sys
 import threading
@@ -18,20 +18,20 @@ WORDS = {
     "plan": "planning",
     "switch_policies": "comparing policies",
 }
-"""How the steps of the algorithm are shown."""
+"""Words in which the bar shows each step of the algorithm."""
 ON_TERMINAL, IN_FILE = 0.5, 30.0
-"""Seconds between two refreshes: a file keeps every one of them."""
+"""Time between two refreshes [s]; it is longer in a file, which keeps every one of them."""
 
 
 class Progress:
-    """A bar over the real episodes that moves while a step is under way.
+    """A bar over the real episodes that also moves during a step.
 
-    It shows the costs of the last episode, what is being done, for how long, and whether it is the compiler's time: the
-    first graphs take a minute in which nothing else would move.
+    It shows the costs of the last episode, the present step with its time, and whether the compiler is at work. The
+    first graphs take a minute to compile, in which nothing else would move.
 
     Args:
-        total: real episodes of the training.
-        done: those that were done before.
+        total: number of real episodes of the training.
+        done: number of episodes that were done before.
     """
 
     def __init__(self, total: int, done: int = 0):
@@ -56,7 +56,7 @@ class Progress:
         self._bar.close()
 
     def doing(self, what: str) -> None:
-        """Say what begins now: a step of the algorithm, or anything else in words."""
+        """Show what begins now: the name of a step of the algorithm, or any other words."""
         self._doing, self._since = WORDS.get(what, what), time.perf_counter()
         self._show()
 
@@ -67,7 +67,7 @@ class Progress:
         self._show()
 
     def write(self, line: str) -> None:
-        """A line above the bar."""
+        """Write a line above the bar."""
         self._bar.write(line)
 
     def _compilation(self, under_way: bool) -> None:

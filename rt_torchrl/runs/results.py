@@ -19,12 +19,12 @@ ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
 
 def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, Any]:
-    """One entry of ``episodes``: what :meth:`ReinforcementTwinning.episode` found, as plain numbers.
+    """One entry of ``episodes`` in ``metrics.json``, in plain numbers.
 
     Args:
-        found: its return value.
+        found: return value of :meth:`ReinforcementTwinning.episode`.
         episode: number of the episode, from 0.
-        live: role that acted on the real system in it.
+        live: role that acted on the real system in this episode.
     """
     record: dict[str, Any] = {"episode": episode, "live": live, "event": "keep"}
     for key in found.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
@@ -38,7 +38,13 @@ def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, A
 
 @torch.no_grad()
 def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: dict[str, Baseline]) -> dict[str, Judged]:
-    """Both policies as flown, then the classical controllers, on the unseen episodes of the system as it is."""
+    """Judge both policies by their flights, and fly and judge the classical controllers, on the unseen episodes.
+
+    Args:
+        unseen: unseen episodes on the real system as it is now.
+        flights: flights of both policies on these episodes.
+        baselines: controllers to compare the policies with, by name.
+    """
     judged = {role: unseen.judge(flights[role]) for role in ROLES}
     return judged | {name: unseen.judge(unseen.fly_baseline(law)) for name, law in baselines.items()}
 
@@ -55,9 +61,10 @@ def summarise(
     untrained: Float[Tensor, " starts"] | None,
     optimum: Optimum | None,
 ) -> dict[str, Any]:
-    """The entry ``summary`` of ``metrics.json``; every ratio is a cost after training over the cost before, unseen.
+    """The entry ``summary`` of ``metrics.json``.
 
-    J_p before and after are of the same episodes, flown by the final live policy.
+    Every ratio is a cost on the unseen episodes after training over the same cost before. J_p before and after belong
+    to the same episodes, which the final live policy has flown.
     """
     closure, live = algorithm.twin.closure, algorithm.referee.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
@@ -89,10 +96,10 @@ def summarise(
 
 @torch.no_grad()
 def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple[Role, str]:
-    """The better policy, and what it was chosen on, which are not the episodes that its cost is reported on.
+    """The better policy, and the name of the episodes that decided; its cost is reported on other episodes.
 
-    It has the smaller mean J_a on validation episodes; on a real system of unknown closure, where these would have to
-    be flown, it is the live one, which the algorithm has chosen on the twin.
+    It is the policy with the smaller mean J_a on validation episodes. On a real system of unknown closure these would
+    have to be flown; there it is the live policy, which the algorithm has chosen on the twin.
     """
     validation = unseen.validation()
     if validation is None:
@@ -102,7 +109,7 @@ def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple
 
 
 def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"] | None) -> dict[str, float]:
-    """Mean J_a after training over that of random starts; nothing without these."""
+    """Mean J_a after training over the mean J_a of random initial policies; empty without these."""
     if untrained is None:
         return {}
     return {f"J_a_over_untrained_{role}": cost / untrained.mean().item() for role, cost in after.items()}
@@ -111,13 +118,13 @@ def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"]
 def twin_costs(
     unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module, flown: Trajectory
 ) -> list[Float[Tensor, " count"]]:
-    """J_p of the twin as it is and as it was, on the unseen episodes as flown."""
+    """J_p of the twin with its present and with its initial closure, on the unseen episodes as flown."""
     twin = algorithm.twin
     return [unseen.identification_costs(twin.plant, closure, flown) for closure in (twin.closure, initial_closure)]
 
 
 def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:
-    """What the controllers reach on all unseen episodes, and on each kind of them apart."""
+    """Statistics of all controllers on all unseen episodes, and on each kind of these episodes."""
     overall = {name: found.statistics() for name, found in judged.items()}
     kinds = {name: chosen for name, chosen in unseen.categories().items() if chosen.sum() > 1}
     return {
@@ -135,9 +142,9 @@ def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]
 def closure_errors(
     algorithm: ReinforcementTwinning, laws: dict[str, nn.Module | None]
 ) -> dict[str, list[float]] | None:
-    """RMS error of every coefficient of the closures ``found`` and ``start`` where the last real episode went.
+    """RMS error of every coefficient of the closures ``found`` and ``start`` along the last real episode.
 
-    None if the real system's closure is not known.
+    It is None if the real system's closure is not known.
     """
     if laws["true"] is None:
         return None

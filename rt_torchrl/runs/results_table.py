@@ -6,7 +6,7 @@ from rt_torchrl.runs.results import ROLES
 
 
 def progress(record: dict[str, Any]) -> str:
-    """The part of the progress line behind the bar."""
+    """The costs of an episode and its live policy, as the progress bar shows them."""
     costs = [(name, record.get(key)) for name, key in (("J_p", "J_p"), ("J_a mb", "J_a_model_based"))]
     costs += [("J_a mf", record.get("J_a_model_free")), ("real", record["real_cost"])]
     shown = [f"{name} {value:.3g}" for name, value in costs if value is not None]
@@ -14,7 +14,7 @@ def progress(record: dict[str, Any]) -> str:
 
 
 def results_table(metrics: dict[str, Any]) -> str:
-    """The results for the terminal."""
+    """The table of results that the terminal shows at the end of a run."""
     found = metrics["summary"]
     unseen, n = found["unseen"], found["unseen"]["episodes"]
     lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones"]
@@ -45,7 +45,7 @@ def results_table(metrics: dict[str, Any]) -> str:
 
 
 def _number(value: float | None, digits: str) -> str:
-    """A number; a dash for one that is not finite, which JSON has no number for."""
+    """A number as text; None, which stands for a number that is not finite, becomes a dash."""
     return "-" if value is None else format(value, digits)
 
 
@@ -59,7 +59,7 @@ def _interval(found: dict[str, Any]) -> str:
 
 
 def merit_lines(unseen: dict[str, Any]) -> list[str]:
-    """The plant's own quantities under every controller: of all episodes, then with J_a of each kind apart."""
+    """Lines with the plant's own quantities under every controller: over all episodes, then over each kind with J_a."""
     merits = {role: unseen["merit"][role] for role in ROLES}
     merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
     if not merits[ROLES[0]]:
@@ -73,7 +73,7 @@ def merit_lines(unseen: dict[str, Any]) -> list[str]:
 
 
 def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
-    """A line for each quantity."""
+    """Lines of a table, one for each quantity."""
     lines = []
     for name in next(iter(columns.values())):
         values = [merit[name] for merit in columns.values()]
@@ -85,7 +85,7 @@ def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def closure_lines(closure: dict[str, Any]) -> list[str]:
-    """Weights found, beside the true ones where the real plant has some of the same names."""
+    """Lines with the closure's weights at the start and as found, and the true weights of the same names, if any."""
     if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
         return []
     true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}

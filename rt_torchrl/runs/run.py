@@ -1,4 +1,4 @@
-"""What a recipe's main calls: the algorithm with progress, dashboard, checkpoints and results around it."""
+"""A run, which a recipe's main makes: the algorithm with its progress, dashboard, checkpoints and results."""
 
 import copy
 import functools
@@ -40,33 +40,33 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.referees import Role
 
 CHECKED_STEPS = 10
-"""Control intervals that a plant is checked on before a run; ``check_plant`` alone looks at more."""
+"""Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
 PlantFigures = Callable[[Snapshot], dict[str, Figure]]
 
 
 class Run:
-    """One training with everything around it.
+    """One training with its run folder, progress, dashboard, checkpoints and results.
 
-    It holds its folder from its construction to the end of :meth:`train`: no other training may write there.
+    A run holds its folder from its construction to the end of :meth:`train`: no other training may write there.
 
     Args:
-        config: see :class:`RunConfig`.
+        config: options of the run.
         plant: the real system in simulation, and the twin's physics.
-        env: the real system, where it is not a plant in simulation. It is judged on ``plant`` under ``env.closure``;
-            where that is not known, on real episodes: four times ``unseen`` of them (both policies before and after),
-            and one for each of the random starts, ``untrained``.
-        believed: the twin's physics where they are not those of the real system; None where they are.
-        plant_figures: figures only this plant has.
-        baselines: controllers to judge beside the policies, by name: classical ones, or with an ``env`` of unknown
-            closure a :class:`RealController`.
-        animate: writes an animation of the last real episode to a path, ``figures/animation.gif``.
+        env: the real system, if it is not a plant in simulation. Policies are judged on ``plant`` with ``env.closure``.
+            If that closure is not known, they are judged on real episodes: four times ``unseen`` (both policies before
+            and after the training), and one for each of the ``untrained`` random starts.
+        believed: physics of the twin, if it differs from that of the real system; None if it does not.
+        plant_figures: function that draws the figures that only this plant has.
+        baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
+            unknown closure, a :class:`RealController`.
+        animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
-        PlantContractError: before any work, if a plant breaks its contract; what takes seconds to find, ``check_plant``
-            finds.
-        ValueError: before any work, if the device does not exist, the run folder cannot be written, is in use or
-            holds a run, the run to resume had other options, its checkpoint is damaged or does not fit, or options
-            need a plant in simulation and there is an ``env``.
+        PlantContractError: before any work, if a plant breaks its contract in a way that is found at once;
+            ``check_plant`` also finds what takes seconds to find.
+        ValueError: before any work, if the device does not exist, the run folder cannot be written, is in use or holds
+            a run, the run to resume had other options, its checkpoint is damaged or does not fit, or options need a
+            plant in simulation and there is an ``env``.
     """
 
     def __init__(
@@ -125,21 +125,21 @@ class Run:
     def train(self) -> dict[str, Any]:
         """Train, evaluate and write the results.
 
-        Ctrl-C ends the training after the iteration under way, and goes on with the episodes done so far. A second
-        one, or one after the training, leaves at once; the run can then be resumed.
+        Ctrl-C ends the training after the present iteration; the evaluation then takes the episodes done so far. A
+        second Ctrl-C, or one after the training, ends the run at once; the run can then be resumed.
 
         Returns:
-            The content of ``metrics.json``.
+            Content of ``metrics.json``.
 
         Raises:
-            KeyboardInterrupt: if it was left at once.
-            ValueError: if another training has taken the folder since an earlier one of this object.
+            KeyboardInterrupt: if Ctrl-C ended the run at once.
+            ValueError: if another training has taken the folder since an earlier call of this method.
         """
         self._held.hold()
         try:
             return self._train()
         except KeyboardInterrupt:
-            print(f"left at once: {len(self.episodes)} episodes done are in {self.folder}, which --resume goes on with")
+            print(f"ended at once: {len(self.episodes)} episodes done are in {self.folder}; --resume goes on with them")
             raise
         finally:
             self._held.release()
@@ -169,7 +169,7 @@ class Run:
         return metrics
 
     def _all_episodes(self, dashboard: Dashboard, bar: Progress) -> None:
-        """Those that are left, or as many of them as are done when Ctrl-C is pressed."""
+        """Make the remaining episodes, or as many of them as are done when Ctrl-C is pressed."""
         with Interruption() as interruption:
             try:
                 while len(self.episodes) < self.config.episodes:
@@ -178,11 +178,11 @@ class Run:
                     bar.episode(self.episodes[-1])
             except BaseException as error:
                 if interruption.at_once:
-                    # Torch and TorchRL may have made another error of it.
+                    # Torch and TorchRL may have turned the KeyboardInterrupt into another error.
                     raise KeyboardInterrupt from error
                 if not isinstance(error, KeyboardInterrupt):
                     raise
-                bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to leave at once)")
+                bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to end at once)")
 
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         live = self.algorithm.referee.live
@@ -202,12 +202,12 @@ class Run:
             dashboard.figures(self._figures(self._snapshot()), len(self.episodes) - 1)
 
     def _follow_wear(self) -> None:
-        """Judge on the real system as it is now; one of unknown closure is judged itself."""
+        """Give the unseen episodes the real system's present closure, if it is known."""
         if self.algorithm.env.closure is not None:
             self.unseen.closure = self.algorithm.env.closure
 
     def _drop_half_an_episode(self) -> None:
-        """After an interrupt, go back to the end of the last whole episode."""
+        """Go back to the end of the last whole episode after an interrupt."""
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
             self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
 
@@ -222,7 +222,7 @@ class Run:
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}
-        # Not the metrics of an earlier end beside these weights: they are what says that the run is finished.
+        # Metrics of an earlier end must not lie beside these weights, because they say that the run is finished.
         (self.folder / "metrics.json").unlink(missing_ok=True)
         save_tensors(self.folder / "weights.pt", weights | {"closure": self.algorithm.twin.closure.state_dict()})
         write_json(self.folder / "metrics.json", metrics)
@@ -246,7 +246,7 @@ class Run:
 
 
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
-    """Run a recipe's main on its command line; what the user can mend is told in one line, without a traceback."""
+    """Run a recipe's main on its command line; an error that the user can mend is one line, without a traceback."""
     try:
         main(from_command_line(config_class))
     except (ValueError, OSError, DivergenceError) as error:
@@ -264,7 +264,7 @@ def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled
 def judged_on(
     plant: Plant, env: RealSystem | None, count: int, *, device: torch.device, compiled: bool
 ) -> UnseenEpisodes:
-    """The unseen episodes: on the plant, or on a real system of which no closure is known."""
+    """The unseen episodes: on the plant, or on the real system itself if its closure is not known."""
     if env is None or env.closure is not None:
         return UnseenEpisodes(plant, count, compiled=compiled, device=device)
     return RealEpisodes(env, count, device=device)
@@ -273,15 +273,15 @@ def judged_on(
 def require_simulation(
     config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
 ) -> None:
-    """Refuse with a real system what only a plant in simulation can do.
+    """Refuse options that only a plant in simulation can carry out, if there is a real system.
 
     Raises:
-        ValueError: naming the option.
+        ValueError: if there is such an option; it names it.
     """
     if env is None:
         return
     if config.noise or config.wear(plant) is not None:
-        raise ValueError(f"noise={config.noise} and wear are of a plant in simulation; this run has a real system.")
+        raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
     on_the_plant = [name for name, law in (baselines or {}).items() if not issubclass(law, RealController)]
     if env.closure is None and (config.reference or on_the_plant):
         raise ValueError(

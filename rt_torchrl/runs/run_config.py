@@ -1,4 +1,4 @@
-"""Options that every recipe has."""
+"""The options that every recipe has."""
 
 import copy
 import dataclasses
@@ -19,42 +19,47 @@ from rt_torchrl.twinning.referees import Role
 
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
 GREATEST_SEED = 2**63 - 2
-"""Torch takes whole numbers of 64 bits with a sign; the sensors of a simulated system take the next one."""
+"""Greatest seed: torch takes signed integers of 64 bits, and the sensors of a simulated system take ``seed`` + 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """Options every recipe has.
+    """The options that every recipe has.
 
     Args:
-        policy: plant for the plant's own, or mlp. A recipe may call its plant's own policy paper, and offer others.
+        policy: kind of both policies: plant for the plant's own policy, or mlp. A recipe may call its plant's own
+            policy paper, and offer other policies.
         hidden: widths of the hidden layers of an mlp policy.
-        model_free_policy: another of these for the model-free policy alone; same for that of the model-based one, from
-            the same initial weights.
-        closure: plant for the plant's own law in the twin, or mlp for a law with a perceptron in it. A recipe may call
-            the plant's own law paper, and train an mlp with other defaults of twinning.records and
-            twinning.assimilation: its NEURAL.
+        model_free_policy: kind of the model-free policy, one of the choices of policy; same for the kind and the
+            initial weights of the model-based policy.
+        closure: law in the twin: plant for the plant's own law, or mlp for a law with a perceptron in it. A recipe may
+            call its plant's own law paper, and may train an mlp with other defaults of twinning.records and
+            twinning.assimilation, which it calls NEURAL.
         closure_hidden: widths of the hidden layers of an mlp closure.
-        episodes: number of real episodes n_e.
-        seed: of weights, disturbances, exploration and sampling; the same seed gives the same run.
+        episodes: number n_e of real episodes.
+        seed: seed of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: parallel (exact, fast), odeint_adjoint (the paper's continuous
             adjoint, slow) or autograd (exact, slow).
-        compiled: compile with torch.compile; by default where this machine has what that needs, otherwise a notice
-            says so. Without it nothing has to be compiled first, and every step is several times slower.
-        device: where everything runs, such as cpu or cuda.
+        compiled: whether to compile with torch.compile. By default a run compiles if this machine can, and a notice
+            says if it cannot. A run that does not compile starts at once, but every step is several times slower.
+        device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
-        resume: go on from the checkpoint in log_dir.
-        overwrite: replace what an earlier run left in log_dir.
-        quick: a whole small run: at most 3 episodes, 200 critic and actor iterations, 5 unseen episodes.
+        resume: whether to go on from the checkpoint in log_dir.
+        overwrite: whether to replace the files that an earlier run left in log_dir.
+        quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
+            unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end.
-        untrained: number of random starts whose mean cost on the unseen episodes the costs are also compared with; 0
-            leaves that out.
-        reference: also compute what exact gradients on the true plant reach for this policy on the unseen episodes.
-        figures: draw the figures at all; a training among many is done sooner without.
-        figures_every: draw the figures into the dashboard every so many episodes, and at the end; 0 only at the end.
-        unseen_every: judge the live policy on the unseen episodes after every so many episodes; 0 only at the end.
-        noise: standard deviation of the real system's sensors, as a share of what they read.
+        untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
+            compared with; 0 leaves this comparison out.
+        reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
+            unseen episodes.
+        figures: whether to draw figures; without them a training among many ends sooner.
+        figures_every: number of episodes after which the figures are drawn into the dashboard again; they are drawn at
+            the end too, and with 0 only there.
+        unseen_every: number of episodes after which the live policy is judged on the unseen episodes again; with 0 it
+            is judged only at the end.
+        noise: standard deviation of the real system's sensors, as a share of the value that they read.
         twinning: hyper-parameters of the six steps.
 
     Raises:
@@ -118,18 +123,18 @@ class RunConfig:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
 
     def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
-        """The policy asked for, with random initial weights.
+        """The policy that the options ask for, with random initial weights.
 
-        Override it, and the ``Literal`` that ``policy`` is declared as, for policies of your own.
+        Override this method, and the ``Literal`` that declares ``policy``, for policies of your own.
         """
         if self.policy == "mlp":
             return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
         return plant.make_policy(generator)
 
     def make_closure(self, plant: Plant, generator: torch.Generator) -> nn.Module:
-        """The twin's closure asked for, w_p⁰.
+        """The twin's closure that the options ask for, with its initial weights w_p⁰.
 
-        Override it, and the ``Literal`` that ``closure`` is declared as, for closures of your own.
+        Override this method, and the ``Literal`` that declares ``closure``, for closures of your own.
 
         Raises:
             ValueError: if the plant has no neural closure.
@@ -139,7 +144,7 @@ class RunConfig:
         return plant.make_closure(generator)
 
     def make_policies(self, plant: Plant, generator: torch.Generator) -> dict[Role, nn.Module]:
-        """π_mb and π_mf: with the same initial weights where they are of the same kind."""
+        """The policies π_mb and π_mf; with ``model_free_policy`` same they have the same initial weights."""
         model_based = self.make_policy(plant, generator)
         if self.model_free_policy == "same":
             return {"model_based": model_based, "model_free": copy.deepcopy(model_based)}
@@ -147,18 +152,22 @@ class RunConfig:
         return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
 
     def defaults(self) -> "RunConfig":
-        """The defaults that go with the closure and the sensors asked for; override it where one is not like another.
+        """The defaults of all options, given the closure and the sensors that the options ask for.
 
-        See :func:`rt_torchrl.runs.command_line.from_command_line`.
+        Override this method if some defaults depend on other options; see
+        :func:`rt_torchrl.runs.command_line.from_command_line`.
         """
         return type(self)()
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
-        """Closure of the real system in each episode, if it wears; override it for a system that does."""
+        """Function from an episode's number to the real system's closure; None if the real system does not wear.
+
+        Override this method for a system that wears.
+        """
         return None
 
     def effective(self) -> "RunConfig":
-        """With ``quick`` carried out."""
+        """The options that the run carries out, in which ``quick`` has replaced other options."""
         if not self.quick:
             return self
         learner = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""The folder of one run: whose it is, who writes in it, and what of an earlier run is in it."""
+"""The folder of one run, in which one training at a time writes and an earlier run may have left files."""
 
 import os
 import time
@@ -13,21 +13,21 @@ from rt_torchrl.runs.run_config import RunConfig
 RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
 LEFT = ("events.out.tfevents.*", "figures/*.png", "figures/animation.gif", *WRITTEN)
-"""What a run leaves, in the order in which it is removed: ``config.json`` last, because it says what the rest is of."""
+"""Files of a run, in the order of their removal: ``config.json`` comes last, because it tells what the others are."""
 
 
 class RunFolder:
     """A folder in which no other training writes as long as this object holds it.
 
-    The operating system lets go of it when the process ends, however that happens.
+    The operating system releases the folder when the process ends, however it ends.
 
     Args:
         config: options of the run.
-        plant: name of its plant.
+        plant: name of the run's plant.
 
     Raises:
-        ValueError: if the folder cannot be written, is in use, holds another run and neither ``resume`` nor
-            ``overwrite`` is asked for, or holds none that could be resumed with these options.
+        ValueError: if the folder cannot be written or is in use; if it holds a run and neither ``resume`` nor
+            ``overwrite`` is asked for; if it is to be resumed and holds no run with these options.
     """
 
     def __init__(self, config: RunConfig, plant: str):
@@ -39,7 +39,7 @@ class RunFolder:
         self.path = config.log_dir or Path("runs") / plant / f"{stamp}-seed-{config.seed}"
         self._config, self._plant = config, plant
         self._require_writable()
-        # Not of a thread: a run may be made in one and trained in another.
+        # The lock belongs to no thread, because a run may be made in one thread and trained in another.
         self._lock = filelock.FileLock(self.path / ".lock", thread_local=False)
         self.hold()
         try:
@@ -60,10 +60,10 @@ class RunFolder:
             ) from error
 
     def hold(self) -> None:
-        """Keep other trainings out, from now on.
+        """Keep other trainings out of the folder from now on.
 
         Raises:
-            ValueError: if one is in it.
+            ValueError: if another training uses the folder, or it cannot be locked.
         """
         if self._lock.is_locked:
             return
@@ -78,7 +78,7 @@ class RunFolder:
         remove_partials(self.path)
 
     def release(self) -> None:
-        """Let others in."""
+        """Let other trainings use the folder."""
         self._lock.release(force=True)
 
     def _require_own(self) -> None:
@@ -104,22 +104,22 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Where the checkpoint is, or will be."""
+        """Path of the checkpoint, whether or not it exists yet."""
         return self.path / "checkpoint.pt"
 
     def resumes(self) -> bool:
-        """Whether there is a checkpoint to go on from; a run that has none yet is resumed from its beginning."""
+        """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
         if self._config.resume and not self.checkpoint.is_file():
             print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
         return self._config.resume and self.checkpoint.is_file()
 
     def begin(self, effective: RunConfig) -> None:
-        """Remove what is to be overwritten, then say in ``config.json`` whose folder this is.
+        """Remove the files that are to be overwritten, then write ``config.json``.
 
-        In this order, so that at no moment results of one run are beside the options of another.
+        In this order the results of one run never lie beside the options of another.
 
         Args:
-            effective: the options as carried out.
+            effective: options that the run carries out.
 
         Raises:
             OSError: if the folder cannot be written.

@@ -1,4 +1,4 @@
-"""What ``config.json`` holds: the options asked for and what ran, and how the options of two starts differ."""
+"""Writing ``config.json``, and the comparison of its options with those of a resumed run."""
 
 import dataclasses
 import importlib.metadata
@@ -21,15 +21,21 @@ HARMLESS = {
     *("threads", "compiled"),
     *("log_dir", "resume", "overwrite"),
 }
-"""Options that a resumed run may have otherwise than it began: how long it is, what it reports, how fast it is."""
+"""Options that may differ when a run is resumed: those of its length, its reports and its speed."""
 ABSENT = "nothing"
 
 
 def write_settings(folder: Path, asked: RunConfig, effective: RunConfig, plant: str) -> None:
-    """Write ``config.json``: the options asked for, ``plant``, and ``ran``, an entry for every start of the run.
+    """Write ``config.json``: the settings of the run, and ``ran`` with an entry for every start of the run.
+
+    Args:
+        folder: run folder.
+        asked: options as they were asked for.
+        effective: options that the run carries out.
+        plant: name of the plant.
 
     Raises:
-        OSError: if it cannot be written.
+        OSError: if the file cannot be written.
     """
     before = read_settings(folder).get(RAN, []) if asked.resume else []
     ran = {
@@ -39,12 +45,12 @@ def write_settings(folder: Path, asked: RunConfig, effective: RunConfig, plant: 
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     settings = settings_of(asked, plant) | {RAN: [*before, ran]}
-    # Options may be infinite: JSON of Python's kind, so that they come back as they are.
+    # Options may be infinite; JSON as Python writes it keeps them as they are.
     write_atomically(folder / FILE, (json.dumps(settings, indent=2, default=str) + "\n").encode())
 
 
 def versions() -> dict[str, str | None]:
-    """Of this library, of what it computes with, and of Python; None for one that is not installed as a package."""
+    """Versions of Python, this library and the libraries it computes with; None for one that is not a package."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for name in VERSIONS_OF:
         try:
@@ -55,17 +61,17 @@ def versions() -> dict[str, str | None]:
 
 
 def as_written(config: RunConfig) -> dict[str, Any]:
-    """The options as they are read back from JSON."""
+    """The options as JSON gives them back."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
 def require_same(folder: Path, asked: RunConfig) -> None:
-    """Refuse to go on with a run under other options than its own, except for harmless ones.
+    """Refuse to go on with a run under options that differ from its own, except for harmless ones.
 
-    ``unseen`` is harmless too, where no episode was judged on the unseen ones so far.
+    ``unseen`` is harmless too if the run has not judged any training episode on the unseen episodes.
 
     Raises:
-        ValueError: naming each option that differs, with both values.
+        ValueError: if an option differs; it names each such option with both values.
     """
     its = flat(read_settings(folder))
     asks = flat(as_written(asked))
@@ -75,19 +81,19 @@ def require_same(folder: Path, asked: RunConfig) -> None:
     for name in sorted(its.keys() | asks.keys()):
         if name.split(".")[0] in harmless | set(BESIDE):
             continue
-        # A run of an earlier version had what is the default of an option that is new since then.
+        # A run of an earlier version had, for an option that is new since then, the value that is now its default.
         was, now = its.get(name, defaults.get(name, ABSENT)), asks.get(name, ABSENT)
         if was != now:
             found.append(f"{name} is {now} here and was {was} in the run")
     if found:
         raise ValueError(
             f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(found)}. Give the run's "
-            "own, or another folder for a new run."
+            "own options, or another folder for a new run."
         )
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested options by their dotted names, as on the command line."""
+    """Nested options by their dotted names, as the command line has them."""
     found: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, dict) and value:

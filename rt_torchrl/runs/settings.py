@@ -18,31 +18,31 @@ from rt_torchrl.runs.user_code import PREFIX, attribute, module_of
 
 FILE = "config.json"
 RAN = "ran"
-"""Key of what ran, an entry for every start of the run."""
+"""Key of the list with an entry for every start of the run."""
 BESIDE = ("plant", "recipe", RAN)
-"""Keys beside the options."""
+"""Keys of ``config.json`` that are not options."""
 GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
 
 
 def settings_of(config: RunConfig, plant: str) -> dict[str, Any]:
-    """What ``config.json`` holds of a run.
+    """Settings of a run for ``config.json``.
 
     Args:
-        config: as asked for.
+        config: options as they were asked for.
         plant: name of the plant.
 
     Returns:
-        Every option; ``plant``; and ``recipe``, which says where the class of the configuration is defined: ``class``,
-        ``module`` (null for a script) and ``file`` (null for an interactive session).
+        Every option; ``plant``; and ``recipe``, the place where the class of the configuration is defined, with
+        ``class``, ``module`` (null for a script) and ``file`` (null for an interactive session).
     """
     return dataclasses.asdict(config) | {"plant": plant, "recipe": _origin(type(config))}
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """What :func:`settings_of` gave when the run of a folder was made; runs of version 0.1 have no ``recipe``.
+    """The result of :func:`settings_of` when the run of a folder was made; runs of version 0.1 have no ``recipe``.
 
     Raises:
-        ValueError: if the folder is not that of a run.
+        ValueError: if the folder is not a run folder, or its settings are damaged.
     """
     file = folder / FILE
     if not file.is_file():
@@ -60,10 +60,10 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def config_of(config_class: type[RunConfig], options: dict[str, Any]) -> RunConfig:
-    """A configuration from its options as JSON holds them; an option that is new since then has its default.
+    """The configuration of options that were read from JSON; an option that is missing there has its default.
 
     Raises:
-        ValueError: if the class, or one that it holds, has no such option, or refuses its value.
+        ValueError: if the class, or the class of a nested configuration, has no such option or refuses its value.
     """
     try:
         return _converter().structure(options, config_class)
@@ -72,10 +72,11 @@ def config_of(config_class: type[RunConfig], options: dict[str, Any]) -> RunConf
 
 
 def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
-    """The configuration's class that the settings of a run name; its module is imported.
+    """The configuration class that the settings of a run name, from its module, which is imported.
 
     Raises:
-        ValueError: if they name none, or what they name is not there any more, is none, or lies in the run folder.
+        ValueError: if the settings name no class, or the name is not found any more, belongs to no configuration, or
+            is defined in the run folder itself.
     """
     origin, place = settings.get("recipe"), folder / FILE
     try:
@@ -89,18 +90,18 @@ def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
     try:
         return require_config(attribute(_module(module, file), name), name)
     except (ValueError, ImportError) as error:
-        raise ValueError(f"the recipe that {place} names is not to be had: {error} If it has moved, {GIVE}.") from error
+        raise ValueError(f"the recipe that {place} names is not found: {error} If it has moved, {GIVE}.") from error
 
 
 def require_config(found: Any, name: str) -> type[RunConfig]:
-    """Refuse what is no class derived from ``RunConfig``.
+    """The object, once it is certain that it is a class derived from ``RunConfig``.
 
     Args:
-        found: what may be one.
-        name: what it is called, for the message.
+        found: object to check.
+        name: name of the object in an error.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if it is not such a class.
     """
     if not (isinstance(found, type) and issubclass(found, RunConfig)):
         raise ValueError(f"{name} is no class derived from RunConfig.")
@@ -118,7 +119,10 @@ def _origin(config_class: type) -> dict[str, str | None]:
 
 
 def _module(name: str | None, file: str | None) -> ModuleType:
-    """By its name where that leads to the file, or the file is not here; the script under way is not run again."""
+    """The module of a recipe: imported by its name if the name leads to the file or the file is missing, else by file.
+
+    A script that is running is not run again.
+    """
     for loaded in (sys.modules.get("__main__"), sys.modules.get(name or "")):
         if file and loaded and _same(getattr(loaded, "__file__", None), file):
             return loaded
@@ -140,12 +144,12 @@ def _same(one: str | None, other: str) -> bool:
 
 @cache
 def _converter() -> cattrs.Converter:
-    """Strict: cattrs alone would make a number of a string, and a truth of anything."""
+    """A strict converter; cattrs alone would turn a string into a number, and anything into a bool."""
     converter = cattrs.Converter(forbid_extra_keys=True)
     for kind in (bool, int, float, str):
         converter.register_structure_hook(kind, _primitive)
     converter.register_structure_hook(Path, lambda value, _: Path(_primitive(value, str)))
-    # The class says best itself what it refuses.
+    # The class itself refuses a wrong choice, with the better message.
     converter.register_structure_hook_func(lambda kind: typing.get_origin(kind) is Literal, lambda value, _: value)
     converter.register_structure_hook_func(
         lambda kind: typing.get_origin(kind) is Sequence,

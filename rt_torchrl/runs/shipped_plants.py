@@ -1,4 +1,4 @@
-"""Finds plants by their folders, or by where they are defined: there is no registry to edit."""
+"""Plants, found by their folders or by the place of their definition, so that there is no registry to edit."""
 
 import importlib
 import inspect
@@ -10,15 +10,18 @@ from rt_torchrl.runs.user_code import named
 
 
 def shipped_plants() -> dict[str, type[Plant]]:
-    """The plant of each folder under ``rt_torchrl.envs``, by the folder's name."""
+    """The plant class of each folder under ``rt_torchrl.envs``, by the folder's name."""
     return {m.name: plant_of(m.name) for m in pkgutil.iter_modules(rt_torchrl.envs.__path__) if m.ispkg}
 
 
 def plant_class(name: str) -> type[Plant]:
-    """A plant by the name of its folder under ``rt_torchrl.envs``, or as ``FILE.py:NAME`` or ``package.module:NAME``.
+    """The plant class that a name stands for.
+
+    Args:
+        name: folder of the plant under ``rt_torchrl.envs``, or ``FILE.py:NAME`` or ``package.module:NAME``.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if there is no such plant.
     """
     known = shipped_plants()
     if ":" not in name:
@@ -35,10 +38,10 @@ def plant_class(name: str) -> type[Plant]:
 
 
 def plant_of(folder: str) -> type[Plant]:
-    """The one plant that ``<folder>/plant.py`` defines.
+    """The one plant class that ``<folder>/plant.py`` defines.
 
     Raises:
-        ValueError: if there is none, or more than one.
+        ValueError: if it defines no plant, or more than one.
     """
     module = importlib.import_module(f"rt_torchrl.envs.{folder}.plant")
     found = [

@@ -1,4 +1,4 @@
-"""Tensors in plain containers, in a file that runs no code and whose damage is noticed."""
+"""Files of tensors in plain containers, which run no code when they are read, and whose damage is noticed."""
 
 import io
 import pickle
@@ -15,11 +15,11 @@ from rt_torchrl.runs.atomic_file import write_atomically
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors, numbers and strings in dicts, lists and tuples, as ``torch.load`` reads them too.
+    """Write tensors, numbers and strings in dicts, lists and tuples; ``torch.load`` can read the file too.
 
     Raises:
-        ValueError: if there is anything else in them; it names the place.
-        OSError: see :func:`write_atomically`.
+        ValueError: if ``content`` holds anything else; it names the place.
+        OSError: if the file cannot be written, see :func:`write_atomically`.
     """
     buffer = io.BytesIO()
     torch.save(plain(content), buffer)
@@ -27,18 +27,18 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, Any]:
-    """What :func:`save_tensors` wrote, on the CPU.
+    """The content that :func:`save_tensors` wrote, on the CPU.
 
-    Every part of the file is compared with its checksum (CRC-32) first.
+    The checksum (CRC-32) of every part of the file is compared first.
 
     Raises:
-        ValueError: if the file is damaged, or holds anything else than tensors in plain containers, which is then not
-            built.
+        ValueError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
+            object is not built.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             torn = archive.testzip()
-    # What zipfile raises depends on the byte that is wrong; nothing but reading is in the block.
+    # The kind of error depends on the byte that is wrong, and all of them come from reading the file.
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError, zlib.error) as error:
         raise ValueError(f"{path} is damaged, or no file of a run: {error}") from error
     if torn is not None:
@@ -58,15 +58,19 @@ def load_tensors(path: Path) -> dict[str, Any]:
 
 
 def first_line(error: Exception) -> str:
-    """What an error says, without the advice that torch adds to it."""
+    """First line of an error's message, without the advice that torch adds after it."""
     return f"({(str(error).splitlines() or [type(error).__name__])[0]})"
 
 
 def plain(value: Any, place: str = "") -> Any:
-    """The same in the containers and numbers of Python alone.
+    """The value with only Python's own containers and numbers, and with plain tensors.
+
+    Args:
+        value: value to convert.
+        place: place of the value in the whole content, which an error names.
 
     Raises:
-        ValueError: if a value is no tensor, number or string; it names the place.
+        ValueError: if it holds anything but tensors, numbers and strings; it names the place.
     """
     if value is None or type(value) in (bool, int, float, str):
         return value
@@ -86,5 +90,5 @@ def plain(value: Any, place: str = "") -> Any:
 
 
 def _base(value: float | str) -> float | str:
-    """A number or string of a derived class as one of Python's own."""
+    """A number or string of a derived class as one of Python's own classes."""
     return next(kind(value) for kind in (float, int, str) if isinstance(value, kind))

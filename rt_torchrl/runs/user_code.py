@@ -1,4 +1,4 @@
-"""Imports what the user has written, from a file or by an import path."""
+"""Import of a user's code from a file or by an import path."""
 
 import functools
 import importlib
@@ -9,11 +9,11 @@ from types import ModuleType
 from typing import Any
 
 PREFIX = "rt_torchrl_recipe_"
-"""Of the names under which files are imported."""
+"""Prefix of the names under which files are imported."""
 
 
 def module_of(file: Path) -> ModuleType:
-    """The module in a file, imported once; what lies beside the file can be imported in it, as in a script.
+    """The module in a file, imported only once; as a script does, it can import modules that lie beside the file.
 
     Raises:
         ValueError: if there is no such file.
@@ -31,7 +31,7 @@ def _imported(file: Path) -> ModuleType:
     while name in sys.modules:  # a file of the same name in another folder
         name += "_"
     spec = importlib.util.spec_from_file_location(name, file)
-    # Known by its name, because the command line looks up the source of its options for their help.
+    # The module is known by its name, because the command line reads the source of its options for their help.
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
@@ -42,10 +42,10 @@ def _imported(file: Path) -> ModuleType:
 
 
 def named(target: str) -> Any:
-    """What ``FILE.py:NAME`` or ``package.module:NAME`` names.
+    """The object that ``FILE.py:NAME`` or ``package.module:NAME`` names.
 
     Raises:
-        ValueError: if there is no such file or module, or it defines no such name.
+        ValueError: if there is no such file or module, or it does not define the name.
     """
     place, colon, name = target.rpartition(":")
     if not (colon and place and name):
@@ -61,10 +61,10 @@ def named(target: str) -> Any:
 
 
 def attribute(module: ModuleType, name: str) -> Any:
-    """What a module calls by a name, which may have dots.
+    """The object that a module defines under a name, which may have dots.
 
     Raises:
-        ValueError: if it defines no such name.
+        ValueError: if the module does not define the name.
     """
     try:
         return functools.reduce(getattr, name.split("."), module)

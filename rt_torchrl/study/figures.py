@@ -27,10 +27,10 @@ WIDEST_LINEAR_SPAN = 50.0
 def learning(entries: dict[str, list[Entry]]) -> Figure:
     """J_a of the live policy on the unseen episodes over the real episodes: mean and range of the seeds, by plant.
 
-    Dashed is the oracle, thin the classical controllers.
+    The oracle is a dashed line, and the classical controllers are thin lines.
 
     Args:
-        entries: of each plant.
+        entries: entries of each plant.
     """
     title = "Cost on unseen episodes while training; band: range of the seeds"
     figure, axes = panels(1, len(entries), title=title, size=(max(7.5, 4.6 * len(entries)), 4.0))
@@ -74,8 +74,8 @@ def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[E
     """Mean J_a of every arm under sensor noise and model error over twinning's nominal mean, a point for every seed.
 
     Args:
-        entries: of each plant as it is.
-        harder: of each plant and variant.
+        entries: entries of each plant as it is.
+        harder: entries of each plant and variant.
     """
     title = "Noise and model error: $J_a$ over twinning's nominal mean; a point for each seed"
     size = (max(7.5, 4.6 * len(entries)), 4.2)
@@ -100,8 +100,8 @@ def following(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[
     """J_p of twinning's twin after each real episode, on the system that the twin knows and with model error, by plant.
 
     Args:
-        entries: of each plant as it is.
-        harder: of each plant and variant; ``model error`` is shown.
+        entries: entries of each plant as it is.
+        harder: entries of each plant and variant; ``model error`` is shown.
     """
     size = (max(7.5, 4.6 * len(entries)), 3.8)
     figure, axes = panels(1, len(entries), title="The twin's error after each real episode", size=size)
@@ -120,8 +120,8 @@ def cost_line(found: dict[str, Any], entries: list[Entry]) -> Figure:
     """J_a over one quantity, between the arms and yardsticks of the plant.
 
     Args:
-        found: as :func:`rt_torchrl.study.yardsticks.cost_along_gain` and ``cost_over_episodes`` return it.
-        entries: of the plant; twinning, oracle and the classical controllers are drawn as levels.
+        found: result of :func:`rt_torchrl.study.yardsticks.cost_along_gain` or ``cost_over_episodes``.
+        entries: entries of the plant; twinning, oracle and the classical controllers are drawn as levels.
     """
     figure, axes = panels(1, title=f"Cost over {found['name']}, all else as it is", size=(8.0, 4.0))
     ax = axes[0, 0]

@@ -31,9 +31,9 @@ def write(
     """Write ``README.md``, ``report.html`` and ``study.json``. ``report.md.jinja`` holds the sentences.
 
     Args:
-        folder: of the report.
-        results: of the study.
-        figures: in the order of the report.
+        folder: folder of the report.
+        results: results of the study.
+        figures: figures in the order of the report.
         quick: whether to mark the report as one of short trainings.
         command: the command that makes the report.
 
@@ -64,7 +64,7 @@ def compared(first: Entry, second: Entry) -> str:
 
 
 def embedded(path: Path) -> str:
-    """A PNG as a data URI."""
+    """The data URI of a PNG file."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 

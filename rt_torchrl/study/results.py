@@ -115,7 +115,7 @@ class Results(NamedTuple):
     """Everything that the report needs, by plant.
 
     Args:
-        entries: of the nominal table.
+        entries: entries of the nominal table.
         summaries: ``summary`` in ``metrics.json`` of the nominal twinning runs.
         variants: entries of each variant.
     """

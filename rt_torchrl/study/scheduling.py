@@ -30,7 +30,7 @@ def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) 
 
     Args:
         batches: tasks of each batch.
-        backend: of joblib, loky or ray.
+        backend: joblib's backend, loky or ray.
         jobs: number of processes.
 
     Raises:

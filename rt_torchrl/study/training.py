@@ -29,13 +29,14 @@ class Training:
 
     Args:
         recipe: path of the recipe.
-        arm: of the algorithm.
-        seed: of the run.
+        arm: arm of the algorithm.
+        seed: seed of the run.
         variant: key of ``VARIANTS``.
         folder: run folder.
         episodes: number of real episodes.
         options: further options of the recipe.
-        figures: draw its figures. The report shows those of one training of a plant; drawing takes up to 25 s.
+        figures: whether to draw its figures. The report shows those of one training of a plant; drawing takes up to
+            25 s.
     """
 
     recipe: Path

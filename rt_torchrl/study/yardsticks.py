@@ -59,15 +59,15 @@ def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iteratio
     """Optimise the plant's own policy with exact gradients, on the true plant and on the unseen episodes themselves.
 
     Args:
-        recipe: of the plant.
-        options: of its trainings.
+        recipe: recipe of the plant.
+        options: options of its trainings.
         unseen: number of unseen episodes.
         starts: number of random initial weights.
-        iterations: gradients from each, on a few of the episodes.
-        polish: gradients of the best, on all of them.
+        iterations: gradients from each start, on a few of the episodes.
+        polish: gradients of the best start, on all episodes.
 
     Returns:
-        ``J_a_of_each_start``, per-episode ``costs`` of the best and the statistics of :class:`Judged`.
+        ``J_a_of_each_start``, per-episode ``costs`` of the best policy and the statistics of :class:`Judged`.
     """
     episodes = unseen_episodes(configured(recipe, options).plant(), unseen)
     best = exact_optimum(episodes, episodes.plant.make_policy, starts=starts, iterations=iterations, polish=polish)
@@ -87,16 +87,16 @@ def classical(
     """Tune a classical controller by a simplex search on training episodes, and judge it on the unseen episodes.
 
     Args:
-        recipe: of the plant.
-        options: of its trainings; they tell, with those of the model error, how the real system ends.
-        kind: of the controller; one without gains is judged as it is.
+        recipe: recipe of the plant.
+        options: options of its trainings; with those of the model error they give the real system at its end.
+        kind: class of the controller; a controller without gains is judged as it is.
         unseen: number of unseen episodes.
         episodes: number of training episodes.
-        evaluations: flights of all of them that the search may take.
+        evaluations: number of times that the search may fly all training episodes.
 
     Returns:
-        ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`; the same on the system with model error
-        under ``changed``.
+        ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`; ``changed`` holds
+        ``costs`` and statistics on the system with model error.
     """
     plant = configured(recipe, options).plant()
     judged = unseen_episodes(plant, unseen)
@@ -129,11 +129,11 @@ def cost_along_gain(
     """J_a of a classical controller over its first gain; the other gains keep their defaults.
 
     Args:
-        recipe: of the plant.
-        options: of its trainings.
-        kind: of the controller.
+        recipe: recipe of the plant.
+        options: options of its trainings.
+        kind: class of the controller.
         unseen: number of unseen episodes.
-        multiples: of the default gain.
+        multiples: multiples of the default gain.
 
     Returns:
         ``name`` and ``unit`` of the gain, its ``values`` and mean ``costs``.
@@ -156,8 +156,8 @@ def cost_over_episodes(
     A training that meets as many episodes cannot be expected to cost less.
 
     Args:
-        recipe: of the plant.
-        options: of its trainings.
+        recipe: recipe of the plant.
+        options: options of its trainings.
         unseen: number of unseen episodes to judge on.
         counts: numbers of training episodes, whose true disturbances the plan knows.
         iterations: gradients of each plan, from the same initial weights.

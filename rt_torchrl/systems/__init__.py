@@ -1,1 +1,1 @@
-"""Real systems, simulated or not, and what stands between them and a policy."""
+"""Real systems, simulated or not, and the layers between them and a policy."""

@@ -1,4 +1,4 @@
-"""Limits of what is sent to a machine: the range and the rate of every action."""
+"""Limits on the actions that a machine gets: their range and their rate."""
 
 import math
 from collections.abc import Sequence
@@ -9,17 +9,19 @@ from torchrl.data import TensorSpec
 
 
 class ActionLimits:
-    r"""Saturation, then :math:`|a_k - a_{k-1}| \le r\,\Delta t`; from a last action outside the range, the range holds.
+    r"""Limits that saturate an action, and then hold :math:`|a_k - a_{k-1}| \le r\,\Delta t`.
+
+    If the last action lies outside the range, both limits cannot hold; then the range holds.
 
     Args:
-        spec: of the action; its own range always holds.
+        spec: spec of the action; its own range always holds.
         interval: control interval Δt [s].
-        low: least actions, where they are to be above the spec's; −infinity leaves the spec's.
-        high: greatest actions, where they are to be below the spec's; infinity leaves the spec's.
-        rates: greatest change r of each action [unit/s]; infinity does not limit it.
+        low: least value of each action, where it is to be above the spec's; −infinity leaves the spec's.
+        high: greatest value of each action, where it is to be below the spec's; infinity leaves the spec's.
+        rates: greatest rate of change r of each action [unit/s]; infinity does not limit it.
 
     Raises:
-        ValueError: if a number does not fit the actions, the range is empty, or the interval is not positive or not
+        ValueError: if a number does not fit the actions, the range is empty, or the interval is not positive and
             finite.
     """
 
@@ -46,10 +48,10 @@ class ActionLimits:
         self._increment = None if rates is None else interval * self.constant("rates", rates)
 
     def constant(self, argument: str, values: Sequence[float]) -> Tensor:
-        """One number for each action, as an action.
+        """The action of these values, one number for each component.
 
         Raises:
-            ValueError: if their number is wrong or one is NaN.
+            ValueError: if the values are too many or too few, or one is NaN.
         """
         found = torch.tensor(tuple(values), dtype=self.spec.dtype, device=self.spec.device)
         if found.shape != self.spec.shape[-1:] or found.isnan().any():
@@ -57,14 +59,14 @@ class ActionLimits:
         return found.expand(self.spec.shape)
 
     def sendable(self, argument: str, values: Sequence[float]) -> Tensor:
-        """An action that is sent as it is, because it lies in the range.
+        """The action of these values, which must lie in the range, so that it is sent without a change.
 
         Args:
-            argument: its name, for the message.
+            argument: name of the values in an error.
             values: one number for each action.
 
         Raises:
-            ValueError: if their number is wrong, one is not finite, or the action lies outside the range.
+            ValueError: if the values are too many or too few, one is not finite, or one lies outside the range.
         """
         found = self.constant(argument, values)
         if not ((found >= self.low) & (found <= self.high) & found.isfinite()).all():
@@ -75,17 +77,17 @@ class ActionLimits:
         return found
 
     def __call__(self, action: Tensor, last: Tensor | None) -> tuple[Tensor, dict[str, str]]:
-        """The nearest action within the limits, and which components were held by ``range`` and by ``rate``.
+        """The nearest action within the limits, and the components that ``range`` and ``rate`` have changed.
 
         Args:
-            action: finite.
-            last: what was applied before; None leaves the rate free.
+            action: finite action.
+            last: action that was applied before; None leaves the rate free.
         """
         inside = torch.minimum(torch.maximum(action, self.low), self.high)
         reached = inside
         if self._increment is not None and last is not None:
             reached = torch.minimum(torch.maximum(inside, last - self._increment), last + self._increment)
-        # The rate may not lead out of the range, whatever was applied before.
+        # The rate must not lead out of the range, even if the last action was outside it.
         sent = torch.minimum(torch.maximum(reached, self.low), self.high)
         held = {"range": (inside != action) | (sent != reached), "rate": reached != inside}
         return sent, {name: _components(mask) for name, mask in held.items() if mask.any()}

@@ -1,4 +1,4 @@
-"""A simulator that calls its controller, turned round into an environment that is stepped."""
+"""An environment around a simulator that calls its controller instead of being stepped."""
 
 from collections.abc import Callable, Mapping, Sequence
 from queue import SimpleQueue
@@ -19,17 +19,17 @@ Simulation = Callable[[int, Controller], None]
 
 
 class EpisodeAbandoned(BaseException):
-    """Raised in the simulator where it calls its controller, when nobody will go on with its episode."""
+    """Ends an episode that nobody goes on with; it is raised where the simulator calls its controller."""
 
 
 class Conversation:
-    """One episode of a simulator in a thread of its own, and the calls of its controller handed over to this one.
+    """One episode of a simulator in a thread of its own, whose calls of the controller are answered from this thread.
 
     ``ended`` is true once the simulator has returned or failed: nobody listens to an answer any more.
 
     Args:
-        simulate: runs the episode.
-        seed: of the episode.
+        simulate: function that runs the episode.
+        seed: seed of the episode.
     """
 
     def __init__(self, simulate: Simulation, seed: int):
@@ -44,7 +44,7 @@ class Conversation:
             self._simulate(self._seed, self._ask)
         except EpisodeAbandoned:
             pass
-        except BaseException as error:  # whatever it is, it is told to whoever steps, not to a thread nobody sees
+        except BaseException as error:  # any error goes to the thread that steps, because nobody sees this one
             self._reports.put(error)
         self._reports.put(None)
 
@@ -56,10 +56,10 @@ class Conversation:
         return action
 
     def listen(self) -> Report | None:
-        """What the simulator tells its controller next; None once it has ended.
+        """The next report of the simulator to its controller; None once the simulator has ended.
 
         Raises:
-            RuntimeError: if the simulator has failed; with its own error as the cause.
+            RuntimeError: if the simulator has failed; the simulator's own error is its cause.
         """
         found = self._reports.get()
         self.ended = found is None or isinstance(found, BaseException)
@@ -68,35 +68,36 @@ class Conversation:
         return found
 
     def answer(self, action: np.ndarray | None) -> None:
-        """The controller's action; None to abandon the episode."""
+        """Answer the simulator with the controller's action, or with None to abandon the episode."""
         self._actions.put(action)
 
     def end(self) -> None:
-        """Abandon what is left of the episode and wait for the simulator to return."""
+        """Abandon the rest of the episode and wait for the simulator to return."""
         if self._thread.is_alive():
             self.answer(None)
             self._thread.join()
 
 
 class CallingSimulator(EnvBase):
-    """An environment of a simulator that runs whole episodes itself and calls a controller in between.
+    """An environment around a simulator that runs whole episodes itself and calls a controller in them.
 
-    That is how co-simulation, Bladed-style controller libraries and many course codes work: ``simulate(seed,
-    controller)`` runs an episode and asks ``action = controller(reported)`` once for every control interval, the last
-    time at its end, where the answer moves nothing any more. Here the simulator runs in a thread that waits while the
-    environment is not stepped; an episode that is reset before its end gets :class:`EpisodeAbandoned` out of its call.
+    Co-simulation, Bladed-style controller libraries and many course codes work like this: ``simulate(seed,
+    controller)`` runs an episode and calls ``action = controller(reported)`` once for every control interval, and a
+    last time at the end of the episode, where the action has no effect any more. Here the simulator runs in a thread
+    that waits until the environment is stepped. Where an episode is reset before its end, the controller call raises
+    :class:`EpisodeAbandoned` in the simulator.
 
     Args:
-        simulate: the simulator. ``reported`` is a mapping from names to the numbers behind them; the action is a vector
-            in double precision.
-        reports: how many numbers stand behind each name.
-        actions: what is asked for; their ranges become those of the environment's action.
-        seed: of the first episode, until ``set_seed`` gives another; the next ones count on from it.
+        simulate: the simulator. ``reported`` maps names to the numbers behind them; the action is a vector in double
+            precision.
+        reports: number of values behind each reported name.
+        actions: signals that the controller returns; their ranges become those of the environment's action.
+        seed: seed of the first episode, until ``set_seed`` gives another; each later episode adds 1.
 
     Raises:
-        ValueError: if nothing is reported or asked for, or a report lacks a name or has another size.
-        RuntimeError: if the simulator fails, an episode has no call, or a step is asked for where no episode runs:
-            before the first reset, and after an episode's end or failure.
+        ValueError: if ``reports`` or ``actions`` is empty, or a report lacks a name or has another size.
+        RuntimeError: if the simulator fails, an episode never calls the controller, or the environment is stepped
+            while no episode runs: before the first reset, or after an episode has ended or failed.
     """
 
     def __init__(self, simulate: Simulation, reports: Mapping[str, int], actions: Sequence[Signal], *, seed: int = 0):
@@ -125,7 +126,7 @@ class CallingSimulator(EnvBase):
         return self._last.clone()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The next call of the controller; the last report once more, and done, where the simulator has ended."""
+        """Step to the next call of the controller; once the simulator has ended, repeat its last report and be done."""
         if self._conversation is None or self._conversation.ended:
             raise RuntimeError("no episode is running; reset the environment before it is stepped.")
         self._conversation.answer(tensordict["action"].numpy().copy())
@@ -148,7 +149,7 @@ class CallingSimulator(EnvBase):
         return TensorDict(found, batch_size=self.batch_size)
 
     def end_episode(self) -> None:
-        """Abandon the episode that is running, if one is."""
+        """Abandon the running episode, if there is one."""
         if self._conversation is not None:
             self._conversation.end()
             self._conversation = None

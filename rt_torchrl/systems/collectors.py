@@ -1,4 +1,4 @@
-"""Whole real episodes, one a time: stepped, or in simulation by one scan."""
+"""Collectors fly whole real episodes, one at a time: by steps or, in simulation, by one scan."""
 
 import torch
 from jaxtyping import Float
@@ -17,14 +17,14 @@ from rt_torchrl.trajectories.rollout import drive_of, require_finite
 
 
 class ExploringInterval(Interval):
-    """One control interval of the real system: what the sensors read, the live policy with its noise, the plant.
+    """One control interval of the real system: the sensors, the live policy with its noise, and the plant.
 
     The drive's command holds the noise of the exploration and the factors of the sensors.
 
     Args:
-        plant: the physics.
+        plant: physics of the real system.
         closure: the true closure.
-        actor: what acts.
+        actor: the live policy with its noise.
     """
 
     def __init__(self, plant: Plant, closure: nn.Module, actor: LivePolicy):
@@ -33,19 +33,19 @@ class ExploringInterval(Interval):
         self.register_buffer("high", actor.high)
 
     def command(self, state: Tensor, drive: Drive) -> Tensor:
-        """What is asked of the actuators at the start of the interval."""
+        """The command to the actuators at the start of the interval."""
         noise, factor = drive.command.split((len(self.plant.actions), len(self.plant.states)), -1)
         observation = self.plant.observe(drive.t, state * factor, drive.exogenous)
         return (self.policy(observation) + noise).clamp(self.low, self.high)
 
 
 class EpisodeCollector:
-    """Whole episodes by TorchRL's own rollout: each begins with its one reset, whatever became of the last one.
+    """A collector by TorchRL's own rollout: each episode begins with one reset, however the last episode ended.
 
     Args:
         env: the real system.
-        actor: what acts on it.
-        plant: gives the length of an episode.
+        actor: the live policy with its noise.
+        plant: plant that gives the length of an episode.
     """
 
     def __init__(self, env: EnvBase, actor: LivePolicy, plant: Plant):
@@ -54,10 +54,10 @@ class EpisodeCollector:
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
-        """One episode, ``batch n``.
+        """Fly one episode; its TensorDict has the batch size ``batch n``.
 
         Raises:
-            ValueError: if the system ends it before its horizon.
+            ValueError: if the system ends the episode before its horizon.
         """
         pass_over(self.env)
         episode = self.env.rollout(self._plant.n_steps, self._actor)
@@ -67,14 +67,15 @@ class EpisodeCollector:
 
 
 class FlightCollector:
-    """The same for a :class:`PlantEnv`: the same entries and draws, without a Python step per interval.
+    """A collector for a :class:`PlantEnv`: the entries and draws of :class:`EpisodeCollector` by one scan.
 
-    A step of an environment costs some 0.4 ms, an interval in a compiled scan a tenth of it; an episode of the drone or
-    the tank has 10 000 of them. Only for :class:`PlantEnv` itself: the scan never calls the step of a subclass.
+    No interval takes a Python step. A step of an environment costs some 0.4 ms, and an interval in a compiled scan
+    costs a tenth of that; an episode of the drone or the tank has 10 000 intervals. The collector suits
+    :class:`PlantEnv` itself and no subclass, because the scan never calls the step of a subclass.
 
     Args:
         env: the real system in simulation.
-        actor: what acts on it.
+        actor: the live policy with its noise.
     """
 
     def __init__(self, env: PlantEnv, actor: LivePolicy):
@@ -83,7 +84,7 @@ class FlightCollector:
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
-        """One episode, ``batch n``."""
+        """Fly one episode; its TensorDict has the batch size ``batch n``."""
         env = self.env
         pass_over(env)
         env.reset()
@@ -100,15 +101,15 @@ class FlightCollector:
 
 
 def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollector | FlightCollector:
-    """What flies the algorithm's real episodes: a scan for :class:`PlantEnv` itself, steps for everything else.
+    """The collector of the algorithm's real episodes: a scan for :class:`PlantEnv` itself, steps for everything else.
 
     Args:
         env: the real system.
-        actor: what acts on it.
-        plant: gives the length of an episode.
+        actor: the live policy with its noise.
+        plant: plant that gives the length of an episode.
 
     Raises:
-        ValueError: if the system is not one of batch size 1.
+        ValueError: if the batch size of the system is not 1.
     """
     if env.batch_size != torch.Size([1]):
         raise ValueError(
@@ -122,7 +123,7 @@ def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollec
 
 
 def pass_over(env: EnvBase) -> None:
-    """Let a simulation, also one behind a safety layer, pass over one draw before an episode."""
+    """Make a simulation pass over one draw before an episode, also where it is behind a safety layer."""
     if hasattr(env, "pass_over"):
         env.pass_over()
 
@@ -130,12 +131,12 @@ def pass_over(env: EnvBase) -> None:
 def flown(
     interval: ExploringInterval, states: Float[Tensor, "samples batch n_s"], drive: Drive, factors: Tensor
 ) -> TensorDict:
-    """The entries of an episode, ``n batch``, from its true states."""
+    """The entries of an episode, computed from its true states, with the batch size ``n batch``."""
     plant = interval.plant
     command = interval.command(states[:-1], drive)
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
-    # After the last interval there is no further input; the last one stands for it.
+    # There is no input after the last interval; the last input takes its place.
     exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
     truncated = torch.zeros(*reward.shape, 1, dtype=torch.bool, device=states.device)

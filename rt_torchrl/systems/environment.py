@@ -17,7 +17,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 class Draw(NamedTuple):
-    """Initial states and exogenous inputs of episodes, and what the sensors multiply their first state by."""
+    """Initial states and exogenous inputs of episodes, and the sensors' factors on the first state."""
 
     initial_state: Float[Tensor, "batch n_s"]
     exogenous: Float[Tensor, "batch n n_z"]
@@ -27,13 +27,14 @@ class Draw(NamedTuple):
 class PlantEnv(EnvBase):
     r"""A plant with its true closure, stepped by commands.
 
-    The algorithm flies it by a compiled scan, and a subclass, which may override a step, in steps, ten times as slowly.
+    The algorithm flies this class by a compiled scan. It flies a subclass, which may override a step, step by step, and
+    that is ten times slower.
 
-    Entries of its TensorDict, each with the batch size in front:
+    The TensorDict has these entries, each with the batch size in front:
 
     =====================================  ======  ===================================================================
     ``observation``                        n_o     the tracking errors e_k
-    ``state``, ``exogenous``               n_s, z  what a record needs beside the actions, s_k and z_k
+    ``state``, ``exogenous``               n_s, z  s_k and z_k, which a record holds beside the actions
     ``action``                             n_a     the command, within the ranges of the plant's actions
     ``("next", "applied")``                n_a     the action that the actuators applied
     ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k)
@@ -43,12 +44,14 @@ class PlantEnv(EnvBase):
     Args:
         plant: the plant; its own closure is the true one.
         batch_size: number of episodes that run side by side.
-        seed: of the generator that draws initial states and exogenous inputs.
-        device: where it runs.
-        compiled: compile the step.
-        noise: standard deviation of the sensors as a share of what they read: every reported state is s(1 + noise·w),
-            w standard normal, and the observation is computed from it. The reward stays that of the true state.
-        wear: closure of the real system in each of its episodes, counted from 0; None for the plant's own in all.
+        seed: seed of the generator that draws initial states and exogenous inputs.
+        device: device on which the environment runs.
+        compiled: whether to compile the step.
+        noise: standard deviation of the sensors' error as a share of the value that they read. Every reported state is
+            s(1 + noise·w), where w is standard normal, and the observation is computed from it; the reward is that of
+            the true state.
+        wear: function from the number of an episode, counted from 0, to the real system's closure in it; with None the
+            plant's own closure holds in all episodes.
 
     Raises:
         ValueError: if ``batch_size`` or ``noise`` is out of its range.
@@ -73,7 +76,7 @@ class PlantEnv(EnvBase):
         self.plant = plant.to(device)
         self._transition = compiled_if(compiled, _transition)
         self._generator = torch.Generator(device=device)
-        # Of their own, so that sensors of any quality see the same disturbances.
+        # The sensors have their own generator, so that sensors of any quality see the same disturbances.
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
         self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
@@ -81,7 +84,7 @@ class PlantEnv(EnvBase):
 
     @property
     def closure(self) -> nn.Module:
-        """The true closure, as worn as in the episode that was flown last."""
+        """The true closure in the episode that was flown last."""
         return self.plant.closure if self._wear is None else self._wear(max(self._episodes - 1, 0)).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -90,7 +93,7 @@ class PlantEnv(EnvBase):
             self._sensors.manual_seed(seed + 1)
 
     def state_dict(self, *args, **kwargs) -> dict:
-        """Everything the next reset depends on."""
+        """Everything that the next reset depends on."""
         generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
         return generators | {"episodes": self._episodes}
 
@@ -105,10 +108,11 @@ class PlantEnv(EnvBase):
         return self.plant.draw_initial_state(batch, self._generator), self.plant.draw_exogenous(batch, self._generator)
 
     def pass_over(self) -> None:
-        """Draw what a reset would draw, and use it for nothing.
+        """Draw what a reset would draw, and discard it.
 
-        The algorithm does so before each of its episodes: they are every second draw of a seed, as they were in version
-        0.1, whose collector reset twice an episode. So its figures still hold.
+        The algorithm passes over one draw before each of its episodes, so that its episodes are every second draw of a
+        seed. The collector of version 0.1 reset twice in each episode; in this way the figures of version 0.1 still
+        hold.
         """
         self._draw()
         self.sensor_factor()
@@ -129,16 +133,16 @@ class PlantEnv(EnvBase):
         return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
 
     def begin_episode(self) -> nn.Module:
-        """Count an episode and give the closure it has.
+        """Count an episode and return its closure.
 
-        Not counted by a reset, because a reset need not be followed by a flight.
+        A reset does not count an episode, because a reset need not be followed by a flight.
         """
         self._episodes += 1
         return self.closure
 
     @property
     def drawn(self) -> "Draw":
-        """What the last reset has drawn."""
+        """Initial states, exogenous inputs and sensor factors of the last reset."""
         return Draw(self._state, self._exogenous, self._factor)
 
     @torch.no_grad()
@@ -176,7 +180,7 @@ class PlantEnv(EnvBase):
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def sensor_factor(self) -> Float[Tensor, "batch n_s"]:
-        """What the sensors multiply the state by at the next reading, 1 + noise·w."""
+        """The sensors' factors on the state at the next reading, 1 + noise·w."""
         shape, like = (self.batch_size[0], len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
             return torch.ones(shape, **like)
@@ -187,7 +191,7 @@ class PlantEnv(EnvBase):
         return self._step_count.double() * self.plant.dt
 
     def _now(self) -> Float[Tensor, "batch n_z"]:
-        """The input of this interval; after the last one, still that of the last."""
+        """The exogenous input of this interval; after the last interval, that of the last interval."""
         k = self._step_count.clamp(max=self.plant.n_steps - 1)
         return self._exogenous[torch.arange(len(k), device=self.device), k]
 
@@ -218,12 +222,12 @@ def declare_specs(env: EnvBase, plant: Plant) -> None:
 
 
 def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:
-    """The error that an environment has ended an episode before the horizon.
+    """The error that says that an environment has ended an episode before the horizon.
 
     Args:
-        found: what it has reported at the end.
-        count: control intervals until then.
-        plant: whose horizon was to be reached.
+        found: the environment's report at the end of the episode.
+        count: number of control intervals until that end.
+        plant: plant whose horizon the episode has not reached.
     """
     terminated = "terminated" in found and found["terminated"].any()
     return ValueError(

@@ -14,17 +14,19 @@ from rt_torchrl.plants.signal import bounds
 
 @dataclass(frozen=True, kw_only=True)
 class ExplorationConfig:
-    r"""The noise ξ(i)·N(0, Σ_a), with Σ_a diagonal and ξ falling linearly to zero.
+    r"""Parameters of the noise ξ(i)·N(0, Σ_a) in episode i; Σ_a is diagonal, and ξ falls linearly to zero.
 
-    Noise that is new at each control interval hardly moves a plant that is slow beside it, and the critic learns little
-    from it. With a correlation time τ it is an Ornstein-Uhlenbeck process of the same deviation,
+    Noise that is new at each control interval hardly moves a plant whose dynamics are much slower, and the critic
+    learns little from it. With a correlation time τ the noise is an Ornstein-Uhlenbeck process with the same standard
+    deviation,
 
     .. math:: x_{k+1} = \rho x_k + \sqrt{1 - \rho^2}\,w_k, \qquad \rho = e^{-\Delta t/\tau}
 
     Args:
         spread: standard deviation of the noise on each action, as a share of half its range, in the first episode.
-        episodes: number of episodes until ξ is zero; 0 explores in none.
-        correlation_time: τ [s]; 0, as in the paper, for noise that is new at each control interval.
+        episodes: number of episodes until ξ is zero; with 0 no episode explores.
+        correlation_time: correlation time τ of the noise [s]; 0 makes the noise new at each control interval, as in
+            the paper.
 
     Raises:
         ValueError: if a number is negative or not finite.
@@ -47,12 +49,12 @@ class ExplorationConfig:
 
 
 class LivePolicy(nn.Module):
-    """What acts on the real system: the live policy, plus noise, saturated to the ranges of the actions.
+    """The live policy as it acts on the real system: with noise added, and saturated to the ranges of the actions.
 
     Args:
-        plant: gives the ranges and the control interval.
+        plant: plant that gives the ranges of the actions and the control interval.
         policy: the policy that is live.
-        config: see :class:`ExplorationConfig`.
+        config: parameters of the noise.
         generator: source of the noise.
     """
 
@@ -71,7 +73,7 @@ class LivePolicy(nn.Module):
         self.policy, self.strength, self._noise = policy, strength, None
 
     def draw_noise(self, shape: torch.Size | tuple[int, ...]) -> Float[Tensor, "*batch n_a"]:
-        """The noise of the next control interval; zeros, and no draw, where ξ is zero."""
+        """The noise of the next control interval; where ξ is zero, it is zero and nothing is drawn."""
         if self.strength == 0.0:
             return torch.zeros(shape, dtype=torch.float64, device=self.low.device)
         fresh = torch.randn(shape, generator=self._generator, dtype=torch.float64, device=self.low.device)

@@ -1,4 +1,4 @@
-"""Where the vectors of a plant stand in what an environment reports, and where the environment takes its action."""
+"""The places of a plant's vectors in an environment's report, and the place where it takes its action."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,20 +13,21 @@ from rt_torchrl.plants.signal import Signal
 
 
 def joined(*entries: Tensor) -> Tensor:
-    """The entries one behind the other."""
+    """The entries joined into one vector, one behind the other."""
     return torch.cat(entries, -1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """Where a vector of the plant stands in what an environment reports: offset + scale·of(entries).
+    """The place of a plant's vector in an environment's report; the vector is offset + scale·of(entries).
 
     Args:
-        keys: entries of the environment's TensorDict.
-        of: makes the vector of them, handed over in that order in double precision, features last; by default they are
-            joined as they are. For an angle of which sine and cosine are reported, it is an arc tangent.
-        scale: unit of the vector in the plant's units; a number for all signals, or one for each.
-        offset: what the plant reads where the vector is zero, in the plant's units; likewise.
+        keys: entries of the environment's TensorDict that are read.
+        of: function that makes the vector of these entries. It takes them in the order of ``keys``, in double
+            precision, with the features last; by default it joins them. For an angle whose sine and cosine are
+            reported, it is an arc tangent.
+        scale: one unit of the vector in the plant's units: a number for all signals, or one for each signal.
+        offset: value in the plant's units where the vector is zero: a number for all signals, or one for each signal.
 
     Raises:
         ValueError: if a number of ``scale`` or ``offset`` is not finite.
@@ -44,7 +45,7 @@ class Reading:
         """The vector in the plant's units.
 
         Raises:
-            ValueError: as :meth:`vector`, or if the vector is not finite.
+            ValueError: if :meth:`vector` raises it, or the vector is not finite.
         """
         found = self.vector(reported, signals, what)
         if not found.isfinite().all():
@@ -56,7 +57,7 @@ class Reading:
         """The vector in the plant's units, whatever its values.
 
         Raises:
-            ValueError: if an entry is missing, or the vector has not the shape of the signals.
+            ValueError: if an entry is missing, or the vector does not have the shape of the signals.
         """
         self.require(reported, what)
         found = self.of(*(reported.get(key).double() for key in self.keys))
@@ -69,10 +70,10 @@ class Reading:
         return in_units(found, self.scale, self.offset).reshape(1, len(signals))
 
     def require(self, reported: TensorDictBase, what: str) -> None:
-        """Refuse a report that lacks what is read.
+        """Refuse a report that lacks an entry that is read.
 
         Raises:
-            ValueError: naming what is missing and what there is.
+            ValueError: if an entry is missing; it names the missing entries and those that are there.
         """
         missing = [key for key in self.keys if reported.get(key, None) is None]
         if missing:
@@ -82,12 +83,12 @@ class Reading:
 
 @dataclass(frozen=True, kw_only=True)
 class Actuation:
-    """Where an environment takes its action; the plant's command is offset + scale·action.
+    """The place where an environment takes its action; the plant's command is offset + scale·action.
 
     Args:
-        key: entry of the environment's TensorDict.
-        scale: unit of the environment's action in the plant's units; a number for all actions, or one for each.
-        offset: command of the plant that the environment knows as zero; likewise.
+        key: entry of the environment's TensorDict that takes the action.
+        scale: one unit of the environment's action in the plant's units: a number for all actions, or one for each.
+        offset: command of the plant where the environment's action is zero: a number for all actions, or one for each.
 
     Raises:
         ValueError: if a number of ``scale`` or ``offset`` is not finite, or a scale is zero.
@@ -103,7 +104,7 @@ class Actuation:
             raise ValueError(f"scale={self.scale} of the actuation must not be zero.")
 
     def action(self, command: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
-        """What the environment is told for a command in the plant's units."""
+        """The environment's action for a command in the plant's units."""
         scale, offset = (
             torch.as_tensor(x, dtype=torch.float64, device=command.device) for x in (self.scale, self.offset)
         )
@@ -111,10 +112,14 @@ class Actuation:
 
 
 def require_numbers(what: str, **values: float | Sequence[float]) -> None:
-    """Refuse arguments that are NaN or infinite; ``what`` has them, for the message.
+    """Refuse arguments that are NaN or infinite.
+
+    Args:
+        what: object that has these arguments, as the error calls it.
+        values: arguments by name.
 
     Raises:
-        ValueError: naming the first of them.
+        ValueError: if an argument is not finite; it names the first one.
     """
     for argument, value in values.items():
         if not np.isfinite(value).all():

@@ -1,4 +1,4 @@
-"""The real system where it is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
+"""A real system that is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
 
 from collections.abc import Sequence
 
@@ -16,37 +16,44 @@ from rt_torchrl.systems.reading import Actuation, Reading, in_units, require_num
 
 
 def episode_seed(seed: int, number: int) -> int:
-    """What a real system is seeded with for an episode, from 0, of the sequence that belongs to a seed."""
+    """Seed of one episode of a real system.
+
+    Args:
+        seed: seed of the whole sequence of episodes.
+        number: number of the episode in that sequence, from 0.
+    """
     return int(np.random.SeedSequence((seed, number)).generate_state(1)[0] >> 1)
 
 
 class RealSystem(EnvBase):
     """An environment that somebody else wrote, with the entries of a :class:`PlantEnv`.
 
-    State and exogenous input are read from what it reports; observation and reward are the plant's own functions of
-    them, and so mean the same on the real system and on its twin. An episode has the length of the plant's; the
-    environment must not end it before, neither at a time limit of its own nor in a state where it terminates, because
-    the algorithm does not treat termination yet. The environment's own reward is not used. An episode takes one reset,
-    at its beginning.
+    State and exogenous input are read from the environment's report. Observation and reward are the plant's own
+    functions of them, and so mean the same on the real system and on its twin; the environment's own reward is not
+    used. An episode is as long as the plant's and takes one reset, at its beginning. The environment must not end an
+    episode earlier, neither by a time limit nor by a terminal state, because the algorithm does not treat termination
+    yet.
 
     Args:
-        env: a TorchRL environment of one system (batch size () or (1,)); a Gymnasium one in TorchRL's ``GymWrapper``.
-        plant: physics and control problem of the twin. What it draws is not used here.
-        state: where its state is found.
-        exogenous: where its exogenous input is found, which must be that of the interval to come; a constant for each
-            input; or None for a plant without inputs.
-        actuation: where the command goes.
-        applied: where the action is found that was applied in an interval, in what is reported at its end; None to
-            take the plant's word for it (``plant.actuate``).
-        closure: the true closure, where it is known, for judging on the plant; None where it is not.
-        seed: each episode starts from a seed of its own, made of this and its number, so that a training can be
-            resumed; None for a system that takes no seed.
-        device: where its entries go.
+        env: TorchRL environment of one system, with batch size () or (1,); a Gymnasium environment goes into TorchRL's
+            ``GymWrapper`` first.
+        plant: physics and control problem of the twin; its draws are not used here.
+        state: place of the plant's state in the environment's report.
+        exogenous: place of the exogenous input of the coming interval in the environment's report; or a constant for
+            each input; or None for a plant without inputs.
+        actuation: place of the command in the environment.
+        applied: place of the applied action in the report at the end of an interval; with None, ``plant.actuate``
+            tells what was applied.
+        closure: the true closure, on which policies are then judged in simulation; None where it is not known.
+        seed: seed of the sequence of episodes. Each episode has a seed of its own, made of this one and the episode's
+            number, so that a training can be resumed. None for a system that takes no seed.
+        device: device of the entries.
 
     Raises:
-        ValueError: if the environment is none of TorchRL or a batch, an entry is missing or misshapen, a constant input
-            is not finite, its limits on the action do not contain the plant's, or its time limit is shorter than the
-            plant's horizon; in a step, if what is read is not reported, or the episode ends before the horizon.
+        ValueError: if ``env`` is not a TorchRL environment or is a batch of systems, an entry is missing or misshapen,
+            a constant input is not finite, the environment's range of an action does not contain the plant's, or its
+            time limit is shorter than the plant's horizon; in a step, if an entry that is read is not reported, or the
+            episode ends before the horizon.
     """
 
     def __init__(
@@ -78,7 +85,7 @@ class RealSystem(EnvBase):
         self._require_fit()
 
     def _declare_refusals(self) -> None:
-        """Pass on which readings a safety layer has refused, where there is one."""
+        """Declare the entry ``refused`` where a safety layer behind this system has one."""
         declared = self.env.full_observation_spec.get("refused", None)
         self._judged = isinstance(declared, Binary)
         if self._judged:
@@ -87,8 +94,8 @@ class RealSystem(EnvBase):
             self.observation_spec = observed
 
     def _require_fit(self) -> None:
-        """Refuse before the first step what would fail in it; nothing real is moved."""
-        imagined = self.env.fake_tensordict()  # zeros, of which a reading need not be finite
+        """Refuse, before the first step and without moving anything real, an environment that would fail in it."""
+        imagined = self.env.fake_tensordict()  # zeros; a reading of them need not be finite
         self._state.vector(imagined, self.plant.states, "state")
         if isinstance(self._exogenous, Reading):
             self._exogenous.vector(imagined, self.plant.inputs, "exogenous")
@@ -98,8 +105,8 @@ class RealSystem(EnvBase):
             self._applied.vector(imagined["next"], self.plant.actions, "applied")
         elif "applied" in self.env.full_observation_spec:
             raise ValueError(
-                "the environment reports what it has applied, as a safety layer does, and nobody would read it: give "
-                'applied=Reading(keys=("applied",)), in the plant\'s units.'
+                "the environment reports the action that it has applied, as a safety layer does, but no reading reads "
+                'it: give applied=Reading(keys=("applied",)), in the plant\'s units.'
             )
         self._require_time()
         key, names = self._actuation.key, [action.name for action in self.plant.actions]
@@ -114,7 +121,7 @@ class RealSystem(EnvBase):
             self._require_range(spec)
 
     def _require_time(self) -> None:
-        """Refuse Gymnasium's time limit where it is below the horizon; other ends show when they come."""
+        """Refuse a time limit of Gymnasium below the horizon; other early ends are found only when they happen."""
         limit = getattr(getattr(self.env, "spec", None), "max_episode_steps", None)
         if limit is not None and limit < self.plant.n_steps:
             raise ValueError(
@@ -145,12 +152,12 @@ class RealSystem(EnvBase):
         return torch.tensor([list(self._exogenous)], dtype=torch.float64).reshape(1, len(inputs))
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start the sequence of episodes that belongs to a seed; without effect on a system that takes none."""
+        """Start the sequence of episodes that belongs to a seed; a system that takes no seed ignores it."""
         if self._seed is not None and seed is not None:
             self._seed, self._episodes = seed, 0
 
     def state_dict(self, *args, **kwargs) -> dict:
-        """What can be known of where the real system is: how many episodes it has been through."""
+        """All that can be known of the real system's state: its seed and the number of episodes it has flown."""
         return {"seed": self._seed, "episodes": self._episodes}
 
     def load_state_dict(self, state: dict, *args, **kwargs) -> None:
@@ -158,7 +165,7 @@ class RealSystem(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         if self._seed is not None:
-            # Of the episode, not of the reset: a reset need not be followed by a step.
+            # The seed counts episodes, not resets: a reset need not be followed by a step.
             self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
         self._reported, self._step_count = self.env.reset(), 0
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64)
@@ -187,14 +194,14 @@ class RealSystem(EnvBase):
         return self._entries(applied, ended=last).set("reward", -cost.unsqueeze(-1))
 
     def _require_reported(self, found: TensorDictBase) -> None:
-        """Refuse a step that leaves out what is read: the values of the step before would stand in for it unseen."""
+        """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""
         readings = {"state": self._state, "exogenous": self._exogenous, "applied": self._applied}
         for what, reading in readings.items():
             if isinstance(reading, Reading):
                 reading.require(found, what)
 
     def _entries(self, applied: Tensor | None, *, ended: bool) -> TensorDict:
-        """What is reported now, in the plant's terms."""
+        """The environment's present report in the plant's terms."""
         state = self._state.read(self._reported, self.plant.states, "state").to(self.device)
         exogenous = self._input(self._reported).to(self.device)
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)

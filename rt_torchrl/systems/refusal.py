@@ -1,4 +1,4 @@
-"""Real episodes that are not to be learned from."""
+"""Refusal of real episodes that must not be learned from."""
 
 import torch
 from jaxtyping import Float
@@ -6,23 +6,24 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 FLIGHTS = 3
-"""Real episodes in a row that may be refused; after as many, somebody has to look at the machine."""
+"""Number of refused real episodes in a row after which somebody has to look at the machine."""
 
 GREATEST = torch.finfo(torch.float32).max
-"""Of a number to be learned from: the long-term memory keeps its priorities in single precision."""
+"""Greatest number to be learned from: the long-term memory keeps its priorities in single precision."""
 
 LEARNED = ("state", "exogenous", "observation", *(("next", k) for k in ("state", "observation", "applied", "reward")))
 """Entries of an episode that go into a memory."""
 
 
 def refusal(episode: TensorDictBase) -> str | None:
-    """Why an episode is not to be learned from; None where nothing speaks against it.
+    """The reason why an episode must not be learned from; None if there is none.
 
-    A reading that a safety layer refuses as not finite or out of range is not what the system did. A number that is not
-    finite in single precision would make a memory useless.
+    A reading that a safety layer refuses as not finite or out of range does not show what the system did. A number that
+    is not finite in single precision would make a memory useless.
 
     Args:
-        episode: one real episode, ``n``; ``("next", "refused")``, where it is there, marks the refused readings.
+        episode: one real episode of batch size ``n``; its entry ``("next", "refused")``, if it has one, marks the
+            refused readings.
     """
     if "refused" in episode["next"].keys():  # noqa: SIM118  (a TensorDict iterates over its batch)
         refused = episode["next", "refused"].flatten().nonzero().flatten().tolist()
@@ -38,14 +39,14 @@ def refusal(episode: TensorDictBase) -> str | None:
 
 
 def note_refusal(refused: list[str], episode: TensorDictBase) -> bool:
-    """Note whether an episode is not to be learned from, and so is to be flown again.
+    """Whether an episode must not be learned from, and so must be flown again.
 
     Args:
-        refused: the reasons of the episodes before it in a row; its own is added.
-        episode: see :func:`refusal`.
+        refused: reasons of the refused episodes just before this one; its own reason is added.
+        episode: real episode, see :func:`refusal`.
 
     Raises:
-        ValueError: with the reasons, if there are now :data:`FLIGHTS` of them.
+        ValueError: if :data:`FLIGHTS` episodes in a row are refused; it gives their reasons.
     """
     reason = refusal(episode)
     if reason is None:
@@ -53,17 +54,17 @@ def note_refusal(refused: list[str], episode: TensorDictBase) -> bool:
     refused.append(reason)
     if len(refused) == FLIGHTS:
         raise ValueError(
-            f"{FLIGHTS} real episodes in a row cannot be learned from: {'; '.join(refused)}. Nothing of them was "
-            "stored; mend the sensor, or the ranges of the safety layer, and go on with the next episode."
+            f"{FLIGHTS} real episodes in a row cannot be learned from: {'; '.join(refused)}. None of them was stored; "
+            "mend the sensor, or the ranges of the safety layer, and go on with the next episode."
         )
     return True
 
 
 def finite_errors(td_errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """TD errors as the long-term memory may take them.
+    """The TD errors, which must be finite so that the long-term memory may take them.
 
     Raises:
-        ValueError: if one is not finite in single precision.
+        ValueError: if a TD error is not finite in single precision.
     """
     if not (td_errors.abs() <= GREATEST).all():
         raise ValueError(

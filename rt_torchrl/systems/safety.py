@@ -19,26 +19,29 @@ from rt_torchrl.systems.action_limits import ActionLimits
 from rt_torchrl.systems.watchdog import Range, Watchdog
 
 WRONG = frozenset({"not finite", "out of range"})
-"""Faults by which an observation is not what the system did; a late one is."""
+"""Faults that make an observation wrong; a late observation is right, and so not among them."""
 
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyConfig:
-    """What the layer lets through.
+    """Limits of a safety layer on actions and observations.
 
     Args:
         interval: control interval of the system [s].
-        low: least actions, where they are to be above the system's own.
-        high: greatest actions, where they are to be below the system's own.
-        rates: greatest change of each action [unit/s]; infinity does not limit it.
-        rest: action that the first one of an episode is limited from, within the range; without it the first is free.
-        ranges: admissible values of entries of the observation, by name: (low, high), each a number or one a component.
-        deadline: longest wall-clock time from an action to the observation of what it did [s].
-        hold: time without a fault after which the policy acts again [s]; infinity for never in the same episode.
+        low: least value of each action, where it is to be above the system's own.
+        high: greatest value of each action, where it is to be below the system's own.
+        rates: greatest rate of change of each action [unit/s]; infinity does not limit it.
+        rest: action, within its range, from which the rate limits the first action of an episode; with None the rate
+            of the first action is free.
+        ranges: admissible range (low, high) of entries of the observation, by name; each end is one number for all
+            components or one number for each component.
+        deadline: longest wall-clock time from an action to the observation of its effect [s].
+        hold: time without a fault after which the policy acts again [s]; with infinity it does not act again in the
+            same episode.
         patience: time of uninterrupted fallback after which the episode is truncated [s].
-        log: file to which every event is appended, one JSON object a line.
+        log: file to which every event is appended, as one JSON object per line.
     """
 
     interval: float
@@ -58,22 +61,23 @@ class SafetyConfig:
 
 
 class SafetyEvent(NamedTuple):
-    """One control interval in which the layer did something or saw a fault.
+    """One control interval in which the layer acted or saw a fault.
 
-    ``reasons`` are, with a detail each: ``range`` and ``rate`` for a limited action, ``asked`` for one that was not
-    finite, ``fallback`` where it acted; ``not finite``, ``out of range`` and ``late`` for the observation at the end of
-    the interval; ``truncated`` where that ended the episode.
+    ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
+    policy's action was not finite, and ``fallback`` that the fallback acted. ``not finite``, ``out of range`` and
+    ``late`` are faults of the observation at the end of the interval. ``truncated`` says that the layer ended the
+    episode.
     """
 
     episode: int
     step: int
-    time: float  # start of the interval, from that of the episode [s]
+    time: float  # start of the interval, counted from the start of the episode [s]
     reasons: dict[str, str]
     asked: list[float]
     applied: list[float]
 
     def line(self) -> str:
-        """As JSON; what is no finite number is null."""
+        """The event as one line of JSON, with null for every number that is not finite."""
         entry = self._asdict()
         for key in ("asked", "applied"):
             entry[key] = [value if math.isfinite(value) else None for value in entry[key]]
@@ -82,45 +86,45 @@ class SafetyEvent(NamedTuple):
 
 @dataclass
 class SafetyReport:
-    """Of one episode: its events, and how many intervals each reason was met in."""
+    """Events of one episode, and the number of intervals in which each reason occurred."""
 
     events: list[SafetyEvent] = field(default_factory=list)
     counts: Counter = field(default_factory=Counter)
 
 
 class SafetyLayer(EnvBase):
-    r"""Any environment with one continuous ``action``, with limits in front of it.
+    r"""An environment with one continuous ``action``, and limits in front of it.
 
-    An action goes through range and rate, :math:`|a_k - a_{k-1}| \le r\,\Delta t`, both of which hold for the fallback
-    too, because they are the machine's. While the watchdog is tripped the fallback acts. Observations are passed on as
-    they are, but for values that are not finite: the last finite ones take their place, because a policy makes nothing
-    of NaN; the event says so. The system's reward is passed on as it is and never a fault. Three entries are added:
+    Range and rate, :math:`|a_k - a_{k-1}| \le r\,\Delta t`, limit every action. They limit the fallback too, because
+    they are limits of the machine. The fallback acts while the watchdog is tripped. The layer passes observations on;
+    it replaces only values that are not finite, by the last finite ones, because a policy cannot use NaN, and the event
+    says so. It passes the system's reward on and never takes it for a fault. It adds three entries:
 
     ==================  ======  ======================================================================================
-    ``applied``         n_a     what was sent to the system; where the system has an entry of that name, its own is kept
-    ``tripped``         1       whether the watchdog is tripped by this observation or still holds
+    ``applied``         n_a     the action sent to the system; where the system has an entry of that name, it is kept
+    ``tripped``         1       whether this observation trips the watchdog, or the watchdog is still tripped
     ``refused``         1       whether this observation is not finite or out of range, and so not to be learned from
     ==================  ======  ======================================================================================
 
-    What is to be learned from is ``("next", "applied")``, not the ``action`` that the policy asked for. From an episode
-    with a refused observation ``ReinforcementTwinning`` learns nothing; it flies another one.
+    A learner learns from ``("next", "applied")``, not from the ``action`` that the policy asked for.
+    ``ReinforcementTwinning`` learns nothing from an episode with a refused observation; it flies another one.
 
-    A shutdown truncates the episode, it does not terminate it: where rewards are negative costs, a return that ends
-    with the shutdown would make it the policy's goal. ``ReinforcementTwinning`` needs whole episodes: leave
+    A shutdown truncates the episode and does not terminate it. Where rewards are negative costs, a return that ends
+    with the shutdown would make the shutdown the policy's goal. ``ReinforcementTwinning`` needs whole episodes: leave
     ``patience`` at infinity there, and the fallback acts up to the horizon.
 
-    The layer runs in the process that steps the system: it notices a late observation when that arrives, and cannot end
-    a call that never returns. A machine needs its own protection behind it.
+    The layer runs in the process that steps the system. It notices a late observation only when the observation
+    arrives, and it cannot end a call that never returns. A machine needs its own protection behind it.
 
     Args:
-        env: the real system, one at a time: batch size empty or 1.
-        config: see :class:`SafetyConfig`.
-        fallback: an action within the range, or a controller that makes an action from the TensorDict of the last
+        env: environment of one real system, with batch size () or (1,).
+        config: limits on actions and observations.
+        fallback: action within the range, or controller that makes an action from the TensorDict of the last
             observation.
         clock: wall clock [s].
 
     Raises:
-        ValueError: if there is more than one system or action entry, the action is not continuous, or a number does not
+        ValueError: if there is more than one system or action entry, the action is not continuous, a number does not
             fit the actions, or ``rest`` or a constant ``fallback`` lies outside their range.
     """
 
@@ -171,7 +175,7 @@ class SafetyLayer(EnvBase):
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
 
     def __getattr__(self, name: str):
-        """What the layer does not have itself is the system's, such as ``plant``."""
+        """An attribute of the system, such as ``plant``, where the layer has none of that name."""
         try:
             return super().__getattr__(name)
         except AttributeError:
@@ -181,7 +185,7 @@ class SafetyLayer(EnvBase):
 
     @property
     def report(self) -> SafetyReport:
-        """Of the present episode, or of the last one until the next begins."""
+        """Report of the present episode; between two episodes, that of the last one."""
         return self.reports[-1]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -202,7 +206,7 @@ class SafetyLayer(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._step_count == 0:
-            # Here, because a reset need not be followed by a step.
+            # The report begins with the first step, because a reset need not be followed by a step.
             self.reports.append(SafetyReport())
         t, end = (self.config.interval * k for k in (self._step_count, self._step_count + 1))
         asked = tensordict["action"]
@@ -226,7 +230,7 @@ class SafetyLayer(EnvBase):
         return found
 
     def _chosen(self, t: float, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, str]]:
-        """What is sent to the system, and why it is not what was asked for."""
+        """The action to be sent to the system, and the reasons why it is not the one that was asked for."""
         action, reasons = tensordict["action"].to(self.action_spec.dtype), {}
         if not action.isfinite().all():
             reasons["asked"] = "not finite"
@@ -242,10 +246,10 @@ class SafetyLayer(EnvBase):
         return applied, reasons | held
 
     def _faults(self, found: TensorDictBase, elapsed: float, when: str) -> dict[str, str]:
-        """What is wrong with an observation, by kind.
+        """Faults of an observation by kind, each with a detail.
 
         Raises:
-            ValueError: if entries are missing that the system declares.
+            ValueError: if an entry is missing that the system declares.
         """
         missing = [key for key in self._watched if key not in found]
         if missing:
@@ -256,7 +260,7 @@ class SafetyLayer(EnvBase):
         return self.watchdog.faults({key: found[key] for key in self._watched}, elapsed)
 
     def _remember(self, found: TensorDictBase) -> TensorDictBase:
-        """The last finite values in place of what is not finite."""
+        """Replace values that are not finite by the last finite ones."""
         for key in self._watched:
             value = found[key]
             good = self._good.get(key, torch.zeros_like(value))
@@ -282,7 +286,7 @@ class SafetyLayer(EnvBase):
         self.env.set_seed(seed)
 
     def state_dict(self, *args, **kwargs) -> dict:
-        """The system's; the layer itself has nothing that outlives an episode."""
+        """State of the system; the layer itself has none that outlives an episode."""
         return self.env.state_dict(*args, **kwargs)
 
     def load_state_dict(self, state: dict, *args, **kwargs) -> None:

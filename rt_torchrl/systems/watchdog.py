@@ -1,4 +1,4 @@
-"""Judges the observations of a real system: are they numbers, within their ranges, and in time?"""
+"""The watchdog judges the observations of a real system: are they finite, within their ranges, and in time?"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,22 +7,23 @@ import torch
 from torch import Tensor
 
 ROUNDING = 1e-9
-"""Slack of times that are sums of intervals [s]."""
+"""Slack in comparisons of times that are sums of intervals [s]."""
 
 Range = tuple[float | Sequence[float], float | Sequence[float]]
 
 
 class Watchdog:
-    """Trips at a fault and stays tripped until no fault has been seen for the hold time.
+    """A watchdog that trips at a fault and stays tripped until it has seen no fault for the hold time.
 
     Args:
-        ranges: least and greatest admissible value of entries, for all components or one by one.
-        deadline: longest wall-clock time from an action to the observation of what it did [s].
-        hold: time without a fault after which it is released [s]; infinity for never.
-        patience: time after which :meth:`exhausted` if it has been tripped all along [s].
+        ranges: least and greatest admissible value of each entry, by name; each is one number for all components or
+            one number for each component.
+        deadline: longest wall-clock time from an action to the observation of its effect [s].
+        hold: time without a fault after which the watchdog is released [s]; infinity never releases it.
+        patience: time for which the watchdog may stay tripped without a break; after it :meth:`exhausted` is true [s].
 
     Raises:
-        ValueError: if a time is out of its range, or the ends of a range are the wrong way round.
+        ValueError: if a time is out of its range, or the low end of a range is not below its high end.
     """
 
     def __init__(
@@ -48,11 +49,16 @@ class Watchdog:
         self.begin()
 
     def begin(self) -> None:
-        """A new episode: nothing has been seen."""
+        """Begin a new episode, in which no fault has been seen."""
         self._since, self._until = math.inf, -math.inf
 
     def faults(self, entries: Mapping[str, Tensor], elapsed: float) -> dict[str, str]:
-        """What is wrong with the entries of an observation, by kind; ``elapsed`` is the time it took to come [s]."""
+        """Faults of an observation by kind, each with a detail.
+
+        Args:
+            entries: entries of the observation.
+            elapsed: wall-clock time that the observation took to come [s].
+        """
         found = {}
         broken = [name for name, value in entries.items() if not value.isfinite().all()]
         if broken:
@@ -65,10 +71,10 @@ class Watchdog:
         return found
 
     def note(self, t: float, faulty: bool) -> None:
-        """An observation at the time t [s] of the control intervals."""
+        """Take note of an observation at time t of the episode [s] and whether it was faulty."""
         if faulty:
             self._since = min(self._since, t)
-            # Without a hold time it is tripped for the interval that begins now.
+            # Without a hold time the watchdog is tripped for the interval that begins now.
             self._until = t + max(self.hold, 2.0 * ROUNDING)
         elif not self.tripped(t):
             self._since = math.inf
@@ -78,10 +84,10 @@ class Watchdog:
         return t < self._until - ROUNDING
 
     def exhausted(self, t: float) -> bool:
-        """Whether it has been tripped for as long as its patience, at t [s]."""
+        """Whether the watchdog has been tripped, at t [s], for as long as its patience."""
         return self.tripped(t) and t - self._since >= self.patience - ROUNDING
 
     def _inside(self, name: str, value: Tensor) -> bool:
         low, high = (end.to(value) for end in self._ranges[name])
-        # What is not finite is a fault of its own.
+        # A value that is not finite is a fault of its own.
         return bool(((value >= low) & (value <= high) | ~value.isfinite()).all())

@@ -1,7 +1,7 @@
 r"""Reinforcement Twinning: the six steps of the paper's algorithm, one method each.
 
-Two policies of the same observation live side by side, π_mf (model-free) and π_mb (model-based). One is live: it acts
-on the real system. The other is idle, learns beside it and can take over.
+There are two policies of the same observation, π_mf (model-free) and π_mb (model-based). One is live: it acts on the
+real system. The other is idle: it learns at the same time and can take over.
 """
 
 import copy
@@ -40,17 +40,16 @@ class ReinforcementTwinning:
     Args:
         env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
-        model_free: π_mf, trained in place; starts live.
-        model_based: π_mb, trained in place.
-        config: see :class:`TwinningConfig`.
-        generator: source of everything random except what the real system draws itself.
-        learner: step 2, of the policy ``model_free``; that of ``config.learner`` by default.
-        planner: step 5, of the policy ``model_based``; that of ``config.planner`` by default.
-        referee: step 6; that of ``config.referee`` by default.
+        model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based``.
+        model_based: policy π_mb, trained in place.
+        config: hyper-parameters of the six steps.
+        generator: source of all random numbers that the real system does not draw itself.
+        learner: learner of step 2, which trains ``model_free``; by default ``config.learner`` makes it.
+        planner: planner of step 5, which trains ``model_based``; by default ``config.planner`` makes it.
+        referee: referee of step 6; by default ``config.referee`` makes it.
 
     Raises:
-        ValueError: if the real system is not one of batch size 1, or a learner or planner is given that trains another
-            policy.
+        ValueError: if the real system's batch size is not 1, or the learner or planner trains another policy.
     """
 
     def __init__(
@@ -87,13 +86,13 @@ class ReinforcementTwinning:
         self._earlier_closure: dict[str, Any] | None = None
 
     def episode(self, tell: Callable[[str], None] = lambda step: None) -> TensorDict:
-        """One real episode and all that is learned from it: the six steps of the paper, in order.
+        """Fly one real episode and learn from it: the six steps of the paper, in order.
 
         Args:
-            tell: is called with the name of every step as it begins.
+            tell: function that is called with the name of every step when the step begins.
 
         Returns:
-            ``real_cost``, the reports of the steps that were made, and ``seconds`` of each step.
+            ``real_cost``, the reports of the steps of this arm, and the ``seconds`` of each step.
         """
         arm, report, seconds = self.config.arm, findings(), {}
         steps = [self.interact]
@@ -112,10 +111,11 @@ class ReinforcementTwinning:
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
 
-        An episode with readings that cannot be learned from is flown again, and the report says how many were, and why.
+        An episode that cannot be learned from is flown again; the report gives the number of such episodes and the
+        reasons.
 
         Raises:
-            ValueError: if several episodes in a row cannot be learned from; nothing of them is in a memory.
+            ValueError: if several episodes in a row cannot be learned from; no memory holds anything of them.
         """
         live, strength, refused = self.referee.live, self.config.exploration.strength(self.episodes_done), []
         while True:
@@ -123,7 +123,7 @@ class ReinforcementTwinning:
             episode = self.collector.rollout()[0]
             if not note_refusal(refused, episode):
                 break
-        # What is learned from is the action that was applied.
+        # The learner learns from the action that was applied.
         episode["action"] = episode["next", "applied"]
         self.learner.store(episode)
         states = torch.cat([episode["state"], episode["next", "state"][-1:]])
@@ -142,24 +142,24 @@ class ReinforcementTwinning:
         return self.learner.update()
 
     def fit_exogenous(self) -> TensorDict:
-        """Step 3: a Gaussian process of the exogenous input of this episode."""
+        """Step 3: fit a Gaussian process to the exogenous input of this episode."""
         self.virtual.learn(self.short_term[-1])
         return findings()
 
     def assimilate(self) -> TensorDict:
-        """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories under the stored actions."""
+        """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories with the stored actions."""
         processes = list(self.virtual.processes)[-len(self.short_term) :]
         self._earlier_closure = copy.deepcopy(self.twin.closure.state_dict())
         found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
         return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
 
     def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Step 5 or 6; if the twin diverges under what has just flown, the closure of the episode before takes over.
+        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode.
 
-        The weights that have just flown on the real system did not diverge there, so the closure must be wrong. Any
-        other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure. One that replays the
-        records best may still be one that no other flight can be made with, where noise of the sensors is large beside
-        what the closure does; the real system cannot wait.
+        The weights that have just flown did not diverge on the real system. If the twin diverges with them, the closure
+        must be wrong. Any other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure.
+        Where the sensors' noise is larger than the effect of the closure, even the closure that replays the records
+        best may diverge in other flights, and the real system cannot wait.
 
         Raises:
             DivergenceError: if the twin diverges under these weights with the earlier closure too.
@@ -179,10 +179,10 @@ class ReinforcementTwinning:
         return merged(step(), findings(refused, closure_refused=1.0))
 
     def plan(self) -> TensorDict:
-        """Step 5: π_mb is planned on the twin with w_p*; the referee keeps the plan only if it is no worse.
+        """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse.
 
-        Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the policy before on N others,
-        because the best policy for a few winds can lie just beyond a cliff of another one.
+        Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the previous policy on N other
+        winds, because the best policy for a few winds can lie just beyond a cliff of another wind.
         """
         count = self.config.planner.realisations or self.config.realisations
         planned_on, judged_on = map(self.virtual.draw, (count, self.config.virtual_episodes))
@@ -209,7 +209,7 @@ class ReinforcementTwinning:
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
-        """Step 6: mean J_a of both policies over the same N virtual episodes, then the referee's word."""
+        """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
         judged_on = self.virtual.draw(self.config.virtual_episodes)
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
@@ -229,7 +229,7 @@ class ReinforcementTwinning:
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
     def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
-        """Mean J_a of policies over virtual episodes; infinite for one under which a sound twin diverges.
+        """Mean J_a of policies over virtual episodes; infinite for one with which a sound twin diverges.
 
         Raises:
             DivergenceError: if the twin diverges under the weights that have just flown, too.
@@ -247,12 +247,12 @@ class ReinforcementTwinning:
         """
         if not self.virtual.cost(self.track_record.policy_flown(), episodes).isfinite():
             raise DivergenceError(
-                f"the twin of plant {self.twin.plant.name!r} diverged under the weights that have just flown on the "
-                f"real system; the closure is {type(self.twin.closure).__name__}."
+                f"plant {self.twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "
+                f"system; the closure is {type(self.twin.closure).__name__}."
             )
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """The live policy into the idle one, unless the referee finds the clone worse than the policy it replaces.
+        """Clone the live policy into the idle one, unless the referee finds the clone worse than the policy it replaces.
 
         Args:
             costs: mean J_a of both policies over the virtual episodes ``judged_on``.
@@ -271,7 +271,7 @@ class ReinforcementTwinning:
         return report
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next episode depends on: the state of every component, in tensors and plain containers."""
+        """State of every component, which the next episode depends on, in tensors and plain containers."""
         return {
             "episodes_done": self.episodes_done,
             "generator": self.generator.get_state(),
@@ -281,10 +281,10 @@ class ReinforcementTwinning:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict` of an algorithm that was built with the same arguments.
+        """Go on from the :meth:`state_dict` of an algorithm that was built with the same arguments.
 
         Raises:
-            ValueError: if the state of a component does not fit; names it.
+            ValueError: if the state of a component does not fit; it names the component.
         """
         state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
         parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
@@ -296,5 +296,5 @@ class ReinforcementTwinning:
 
 
 KEPT = ("virtual", "short_term", "track_record")
-"""Components that take the tensors of their state as they are, wherever these lie."""
+"""Components that take the tensors of their state without moving them to another device."""
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)

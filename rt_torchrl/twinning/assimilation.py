@@ -30,24 +30,26 @@ class AssimilationConfig:
     """Parameters of step 4.
 
     Args:
-        iterations: n_G, gradients per episode.
-        stop_ratio: end the loop once J_p is below this share of its value at the start of the episode; 0 never does.
-        inputs: ``realisations`` replays the record under N_z samples of the exogenous process, as in the paper;
-            ``record`` under the exogenous input that was measured. Realisations keep a twin from fitting what is chance
-            in the input, but weights that move the states less than that chance are lost in it.
-        method: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the normal equations from
-            forward sensitivities, for closures of some ten weights, and makes no use of ``descent``.
-        prior: ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in its unit, on the weights w of the closure's perceptrons
-            (:class:`BoundedPerceptron`); 0 for none. It leaves those where they started that no record shows, and so
-            the law what it was where nothing was visited.
-        segment: control intervals after which the replay starts again from the measured state (multiple shooting); 0
-            replays whole records, as in the paper. Over short segments the states are nearly linear in the weights,
-            which takes a closure of many of them to the record in a few steps; J_p of each is that of its mean segment.
-        initial: ``measured`` starts a replay from what the sensors read first, as in the paper; ``estimated`` takes the
-            components of that state that J_p compares as unknowns beside the weights, measured as the first sample
-            says. A plant that forgets slowly carries the error of a first sample through the whole record, and the
-            weights make up for it; needs ``levenberg_marquardt`` and the inputs of the ``record``.
-        descent: how the closure's weights descend J_p.
+        iterations: number n_G of gradients per episode.
+        stop_ratio: share of the J_p at the start of the episode below which the descent ends; with 0 it never ends
+            early.
+        inputs: exogenous input of the replay: ``realisations`` for N_z samples of the exogenous process, as in the
+            paper, or ``record`` for the measured input. With realisations a twin does not fit chance in the input, but
+            it also does not find weights that move the states less than that chance does.
+        method: method of the fit: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the
+            normal equations from forward sensitivities, for closures of some ten weights, and does not use ``descent``.
+        prior: factor ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in the unit of J_p, on the weights w of the closure's
+            perceptrons (:class:`BoundedPerceptron`); 0 leaves it out. Weights of which the records say nothing then
+            keep their initial values, and so the law keeps its initial form where no record has been.
+        segment: number of control intervals after which the replay starts again from the measured state (multiple
+            shooting); 0 replays whole records, as in the paper. Over short segments the states are nearly linear in the
+            weights, so a closure with many weights fits the record in a few steps. The J_p that descends is then the
+            mean over the segments.
+        initial: first state of a replay: ``measured`` for the first reading of the sensors, as in the paper, or
+            else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
+            that forgets slowly carries the error of the first reading through the whole record, and the weights would
+            make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
+        descent: parameters of the closure's descent.
     """
 
     iterations: int = 15
@@ -79,14 +81,14 @@ class AssimilationConfig:
 class Assimilation:
     r"""Minimises :math:`J_p = \mathbb E\int L_p(s, \check s)\,dt` over the closure's weights (paper, eq. J_p).
 
-    The expectation is over the records in D_S and, for each, realisations of its exogenous process; all are driven by
-    the *stored* actions.
+    The expectation is over the records in D_S and, for each record, over realisations of its exogenous process. The
+    *stored* actions drive all of them.
 
-    Note: the paper replays from what the sensors read first; ``initial="estimated"`` finds that state too.
+    Note: the paper replays from the first reading of the sensors; ``initial="estimated"`` also finds the first state.
 
     Args:
-        twin: its closure is updated in place, and holds the best weights seen, w_p*, afterwards.
-        config: see :class:`AssimilationConfig`.
+        twin: twin whose closure is updated in place; afterwards the closure holds the best weights seen, w_p*.
+        config: parameters of step 4.
     """
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
@@ -108,13 +110,16 @@ class Assimilation:
         count: int,
         generator: torch.Generator,
     ) -> Descended:
-        """One episode's gradient steps; reported is J_p of the whole records, without the prior.
+        """Take the gradient steps of one episode.
 
         Args:
-            records: D_S.
+            records: the records in D_S.
             processes: the exogenous process of each record.
-            count: N_z, realisations of each.
+            count: number N_z of realisations of each process.
             generator: source of the realisations.
+
+        Returns:
+            J_p of the whole records before and after, without the prior, and the descent's gradient and iterations.
         """
         if self.config.inputs == "record":
             count, exogenous = 1, torch.stack([record.exogenous for record in records])
@@ -154,7 +159,7 @@ class Assimilation:
 
     @torch.no_grad()
     def _cost_of(self, whole: Trajectory) -> float:
-        """J_p of whole records; infinite where a closure that was found on their segments diverges."""
+        """J_p of whole records; infinite if the closure, which was found on segments of them, diverges."""
         try:
             if self.config.initial == "measured":
                 return self._identification_cost(whole).item()
@@ -165,7 +170,7 @@ class Assimilation:
             return float("inf")
 
     def _output_error(self, replayed: Trajectory, *, weights: bool = True) -> OutputError:
-        """J_p with unknown first states."""
+        """The output error J_p with the first states among its unknowns."""
         segments, measured, twin = replayed.each(), replayed.states, self.twin
         free = compared(discrepancy_derivatives(twin.plant, measured, measured)[1]).nonzero().flatten().tolist()
         initial = InitialStates.estimated(twin, segments, free, twin.sensitivities)
@@ -183,7 +188,7 @@ class Assimilation:
         return 0.5 * (self._stiffness * (self._weights() - self._start).square()).sum()
 
     def _prior_stiffness(self) -> Tensor:
-        """ρ of every trained weight, in the order of :meth:`_weights`."""
+        """The factor ρ of every trained weight, in the order of :meth:`_weights`."""
         closure, rho = self.twin.closure, self.config.prior
         held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
         trained = [w for w in closure.parameters() if w.requires_grad]
@@ -191,26 +196,26 @@ class Assimilation:
         return torch.cat(each) if each else self._nothing()
 
     def _nothing(self) -> Tensor:
-        """The weights of a closure without any."""
+        """The empty weight vector of a closure without trained weights."""
         device = next((x.device for x in self.twin.plant.buffers()), "cpu")
         return torch.empty(0, dtype=torch.float64, device=device)
 
     def _with_prior(self, found: NormalEquations) -> NormalEquations:
         if not self.config.prior:
             return found
-        n = len(found.gradient) - len(self._start)  # further unknowns, the last ones: initial states
+        n = len(found.gradient) - len(self._start)  # number of initial states, which are the last unknowns
         pull = pad(self._stiffness * (self._weights() - self._start), (0, n))
         matrix = found.matrix + torch.diag(pad(self._stiffness, (0, n)))
         return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
 
     def normal_equations(self, replayed: Trajectory) -> NormalEquations:
-        """J_p, its gradient and its Gauss-Newton matrix with respect to the closure's weights."""
+        """J_p, its gradient and its Gauss-Newton matrix by the closure's weights."""
         measured, actions, exogenous, start = replayed
         states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions, start=start)
         plant, target = self.twin.plant, measured[:, 1:]
         share = plant.dt / len(measured)
         g, H = discrepancy_derivatives(plant, states, target)
-        # The products below are most of the work for a closure of many weights.
+        # For a closure of many weights the products below are most of the work; they skip states that L_p ignores.
         seen = compared(H)
         H, S_seen = H[..., seen, :][..., seen], S[:, :, seen]
         return NormalEquations(
@@ -220,7 +225,7 @@ class Assimilation:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next update depends on, the closure apart."""
+        """Everything that the next update depends on, except the closure."""
         return {"descent": self.descent.state_dict(), "damping": self.second_order.damping}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

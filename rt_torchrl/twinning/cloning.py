@@ -61,14 +61,14 @@ class Cloning:
         if not worse(cost, replaced):
             return findings(**found)
         idle.load_state_dict(before)
-        reason = f"clone refused: J_a {cost:.4g} of it, {replaced:.4g} of what it replaces"
+        reason = f"clone refused: its J_a is {cost:.4g}, that of the policy it replaces {replaced:.4g}"
         return findings(reason, **found).set_non_tensor("event", "keep")
 
 
 def same_architecture(first: nn.Module, second: nn.Module) -> bool:
-    """Whether a copy of its weights makes one module the other: same modules, same settings, same shapes of weights.
+    """Whether two modules with the same weights are the same function: same submodules, settings and weight shapes.
 
-    Shapes alone do not tell: two perceptrons of other activations have the same.
+    Shapes alone do not tell: perceptrons with different activations have weights of the same shapes.
     """
     return _structure(first) == _structure(second)
 

@@ -20,17 +20,19 @@ class TwinningConfig:
     """Hyper-parameters of the algorithm, by step.
 
     Args:
-        arm: ``twinning``, or one of its halves alone: ``model_free`` makes steps 1 and 2, ``model_based`` 1 and 3 to 5.
-        realisations: N_z, samples of the exogenous process per record in steps 4 and 5.
-        records: n_S, real episodes that steps 3 to 5 look back on.
-        virtual_episodes: N, over which step 5 judges a plan and step 6 compares the policies.
-        exploration: step 1.
-        learner: step 2.
-        exogenous: step 3.
-        assimilation: step 4.
-        planner: step 5.
-        referee: step 6.
-        distillation: how step 6 clones between policies of different architectures.
+        arm: part of the algorithm that runs: ``twinning`` for all six steps, ``model_free`` for steps 1 and 2 alone, or
+            else ``model_based`` for steps 1, 3, 4 and 5 alone.
+        realisations: number N_z of samples of the exogenous process, for each record in step 4 and in all in step 5.
+        records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
+            from at least as many.
+        virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
+        exploration: parameters of step 1.
+        learner: parameters of step 2.
+        exogenous: parameters of step 3.
+        assimilation: parameters of step 4.
+        planner: parameters of step 5.
+        referee: parameters of step 6.
+        distillation: parameters of step 6 for a clone between policies of different architectures.
     """
 
     arm: Arm = "twinning"

@@ -1,7 +1,7 @@
-r"""A clone of another architecture: the live policy is imitated by the idle one, whose weights it cannot be given.
+r"""Distillation: the idle policy imitates the live one where it cannot take its weights, because architectures differ.
 
-The imitation is behaviour cloning of the actions, as shares of their ranges, on the observations that the real system
-and the twin have shown:
+The imitation is behaviour cloning. It compares actions, as shares of their ranges, on observations from the real system
+and from the twin:
 
 .. math:: \min_w \mathbb E_e\,\Big\|\frac{\pi(e; w) - \pi_{live}(e)}{a_{hi} - a_{lo}}\Big\|^2
 """
@@ -27,14 +27,14 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 @dataclass(frozen=True, kw_only=True)
 class DistillationConfig:
-    """Parameters of a clone between two architectures; between policies of the same one, weights are copied.
+    """Parameters of a clone between two architectures; policies of the same architecture copy weights instead.
 
     Args:
         iterations: gradients of the imitation loss in each round (L-BFGS on all observations at once).
-        rounds: number of rounds; from the second on, the observations of virtual episodes that the clone itself flies
-            are added, so that it also learns what to do where its own errors lead (DAgger, Ross et al. 2011).
-        samples: greatest number of observations of each source (real system, and every set of virtual episodes);
-            of more, every so many-th is taken.
+        rounds: number of rounds. Each round after the first adds observations of virtual episodes that the clone itself
+            flies, so that it also learns what to do where its own errors lead (DAgger, Ross et al. 2011).
+        samples: greatest number of observations from each source (the real system, and every set of virtual episodes).
+            A source with more observations is thinned evenly.
     """
 
     iterations: int = 200
@@ -52,8 +52,8 @@ class Distillation:
     """Makes the idle policy imitate the live one.
 
     Args:
-        twin: on which the policies are flown.
-        config: see :class:`DistillationConfig`.
+        twin: twin on which the policies are flown.
+        config: parameters of the imitation.
     """
 
     def __init__(self, twin: DigitalTwin, config: DistillationConfig):
@@ -70,13 +70,13 @@ class Distillation:
         """Train ``idle`` in place.
 
         Args:
-            live: the teacher, not changed.
-            idle: the student; it starts from the weights it has.
+            live: the teacher, which is not changed.
+            idle: the student, which starts from its present weights.
             seen: observations of the real system.
-            draw: initial states and disturbances of virtual episodes, other ones at each call.
+            draw: function that draws new initial states and disturbances of virtual episodes at each call.
 
         Returns:
-            RMS difference of the actions on all observations, as a share of their ranges.
+            RMS difference between the two policies' actions on all observations, as a share of the actions' ranges.
         """
         observations = [self._thinned(seen), self._thinned(self._observed(live, draw()))]
         for number in range(self.config.rounds):
@@ -102,14 +102,14 @@ def match_actions(
     """Fit the student's actions to the teacher's in place, by TorchRL's behaviour-cloning loss.
 
     Args:
-        plant: gives the ranges of the actions.
-        teacher: not changed.
-        student: its weights are trained from where they are.
-        observations: on which they are to agree.
-        iterations: gradients, of the loss on all observations.
+        plant: plant that gives the ranges of the actions.
+        teacher: policy that is imitated; it is not changed.
+        student: policy whose weights are trained, from their present values.
+        observations: observations on which the two policies are to agree.
+        iterations: gradients of the loss on all observations.
 
     Returns:
-        RMS difference of the actions as a share of their ranges.
+        RMS difference between the actions as a share of their ranges.
     """
     with torch.no_grad():
         wanted = ShareOfRange(plant, teacher)(observations)
@@ -127,8 +127,8 @@ class ShareOfRange(nn.Module):
     """A policy whose actions are shares of their ranges, 0 at the low and 1 at the high end.
 
     Args:
-        plant: gives the ranges.
-        policy: in physical units.
+        plant: plant that gives the ranges of the actions.
+        policy: policy whose actions are in physical units.
     """
 
     def __init__(self, plant: Plant, policy: nn.Module):

@@ -1,4 +1,4 @@
-"""Step 3: what else the exogenous input could have been, as a Gaussian process around its large scale."""
+"""Step 3: a Gaussian process around the large scale of a recorded exogenous input gives other possible inputs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +17,11 @@ class ExogenousConfig:
     """Parameters of step 3.
 
     Args:
-        knots: points of the decimated record that the regression sees; its cost grows with their square.
-        kernel_width: standard deviation of the Gaussian kernel κ, in knot spacings; sets what counts as large scale.
-        penalty: C of the support vector regression, for a record scaled to unit standard deviation.
-        tube: ε of the regression, in standard deviations of the record.
+        knots: number of points of the decimated record in the regression, whose cost grows with its square.
+        kernel_width: standard deviation of the Gaussian kernel κ, in knot spacings; wider changes of the input count as
+            large scale.
+        penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
+        tube: half-width ε of the regression's tube, in standard deviations of the record.
     """
 
     knots: int = 300
@@ -41,24 +42,24 @@ class ExogenousProcess:
     r"""Gaussian process of one recorded episode, :math:`\mathcal N_z(\tilde d(t), \Sigma_\varepsilon)`.
 
     The large scale d̃ of each component is a support vector regression with a Gaussian kernel (paper, eq. svr), fitted
-    to block means of the record. The residuals z − d̃ are taken as jointly stationary: components that moved together in
-    the record, at once or one after the other, do so in every realisation. Their covariances
+    to block means of the record. The residuals z − d̃ are taken to be jointly stationary: components that moved
+    together in the record, at once or one after the other, do so in every realisation too. Their covariances,
 
     .. math:: \Gamma_{kl}(h) = \mathrm E\,\varepsilon_k(t + h)\,\varepsilon_l(t)
 
-    are the sample covariances under a Parzen window, which keeps them positive semi-definite, and are sampled exactly
-    by circulant embedding. The large scales themselves do not vary between realisations.
+    are the sample covariances times a Parzen window, which keeps them positive semi-definite. Circulant embedding
+    samples them exactly. The large scales themselves do not vary between realisations.
 
     Args:
-        record: z at every control interval.
+        record: exogenous input z at every control interval.
         dt: control interval [s].
-        signals: the inputs, which may be none; samples are held within their physical ranges.
-        config: see :class:`ExogenousConfig`.
+        signals: signals of the inputs, of which there may be none; samples stay within their physical ranges.
+        config: parameters of step 3.
 
     Raises:
         ValueError: if the record holds NaN, or fewer samples than a regression needs.
 
-    Source: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088, for the sampling.
+    Source of the sampling: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class ExogenousProcess:
         config = config or ExogenousConfig()
         like = {"dtype": record.dtype, "device": record.device}
         self._low, self._high = bounds(signals, **like)
-        # Columns are written in place: a plant without inputs has none to stack.
+        # Columns are written in place, because a plant without inputs has no columns to stack.
         values = record.cpu().numpy()
         large = np.empty_like(values)
         for k, column in enumerate(values.T):
@@ -85,16 +86,16 @@ class ExogenousProcess:
         self.mean: Float[Tensor, "n n_z"] = torch.as_tensor(large, **like)
         covariance = torch.as_tensor(_windowed_covariance(values - large), **like)
         self.covariance: Float[Tensor, "n n_z n_z"] = covariance
-        """Γ at lags 0 to n − 1; at negative ones it is its transpose."""
+        """Covariances Γ at the lags 0 to n − 1; Γ at a negative lag is the transpose of Γ at the positive lag."""
         self._root = _spectral_root(covariance)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What :meth:`from_state` rebuilds it from."""
+        """The mean and the covariance, from which :meth:`from_state` rebuilds the process."""
         return {"mean": self.mean, "covariance": self.covariance}
 
     @classmethod
     def from_state(cls, state: dict[str, Tensor], signals: Sequence[Signal]) -> "ExogenousProcess":
-        """A process from its :meth:`state_dict` and the inputs that it was fitted to."""
+        """The process of a :meth:`state_dict`, for the inputs that it was fitted to."""
         process = cls.__new__(cls)
         process.mean, process.covariance = state["mean"], state["covariance"]
         process._root = _spectral_root(process.covariance)
@@ -116,7 +117,7 @@ class ExogenousProcess:
 def sample_experience(
     processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
 ) -> Float[Tensor, "{count} n n_z"]:
-    """Realisations drawn from the processes of several episodes: each episode once, at random, before any again."""
+    """Realisations from the processes of several episodes, in random order; each is drawn once before any is again."""
     rounds = -(-count // len(processes))
     order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
     chosen = torch.cat(order)[:count].tolist()
@@ -124,7 +125,7 @@ def sample_experience(
 
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
-    """d̃ at every sample, from a regression on block means; time is counted in knot spacings."""
+    """The large scale d̃ at every sample, from a regression on block means; its time is in knot spacings."""
     from sklearn.svm import SVR  # here, because it takes a second to load and only step 3 needs it
 
     spread = values.std()
@@ -143,7 +144,7 @@ def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Fl
 
 
 def _windowed_covariance(residuals: Float[np.ndarray, "n n_z"]) -> Float[np.ndarray, "n n_z n_z"]:
-    """Biased sample covariances Γ times Parzen's window over a quarter of the record."""
+    """Biased sample covariances Γ, times Parzen's window over a quarter of the record."""
     n = len(residuals)
     spectra = [np.fft.rfft(residual - residual.mean(), 2 * n) for residual in residuals.T]
     u = np.arange(n) / max(1, n // 4)
@@ -157,12 +158,13 @@ def _windowed_covariance(residuals: Float[np.ndarray, "n n_z"]) -> Float[np.ndar
 
 
 def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "samples n_z n_z"]:
-    """Hermitian roots of the spectrum of the circulant that holds the covariances, each over the number of lags.
+    """Hermitian roots of the spectrum of the circulant that holds the covariances, divided by the number of lags.
 
-    A covariance of finite support embeds exactly in a circulant twice as long, whose eigenvalues are its FFT.
+    A covariance of finite support fits exactly into a circulant twice as long; the FFT of the circulant gives its
+    eigenvalues.
     """
     circulant = torch.cat([covariance, torch.zeros_like(covariance[:1]), covariance[1:].flip(0).mT])
-    # The FFT that makes samples of it runs backwards in time: conjugate, or a component that follows would lead.
+    # The FFT that makes samples runs backwards in time; without the conjugate, a component that follows would lead.
     values, vectors = torch.linalg.eigh(torch.fft.fft(circulant, dim=0).conj())
-    scale = (values.clamp_min(0.0) / len(circulant)).sqrt()  # rounding only: see the Parzen window
+    scale = (values.clamp_min(0.0) / len(circulant)).sqrt()  # with a Parzen window only rounding makes them negative
     return (vectors * scale.unsqueeze(-2)) @ vectors.mH

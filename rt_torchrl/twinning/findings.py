@@ -1,4 +1,4 @@
-"""The report of an episode: scalars by name, the event, and the reasons for what was refused."""
+"""The report of an episode: scalars by name, the event, and the reasons for refusals."""
 
 import torch
 from tensordict import TensorDict
@@ -6,25 +6,25 @@ from torch import Tensor, nn
 
 
 def findings(*reasons: str, **values: float | Tensor) -> TensorDict:
-    """Scalars in double precision, with the entry ``reason`` if there are any.
+    """A report with scalars in double precision and, if there are reasons, the entry ``reason``.
 
     Args:
-        reasons: why something was refused, a sentence each.
-        values: the scalars.
+        reasons: reasons for refusals, one sentence each.
+        values: the scalars, by name.
     """
-    # On the CPU, because a report is read there and its numbers come from anywhere.
+    # A report is on the CPU, because it is read there and its numbers come from any device.
     like = {"dtype": torch.float64, "device": "cpu"}
     report = TensorDict({key: torch.as_tensor(value, **like).detach() for key, value in values.items()})
     return report.set_non_tensor("reason", "; ".join(reasons)) if reasons else report
 
 
 def merged(report: TensorDict, other: TensorDict) -> TensorDict:
-    """``report`` with the entries of ``other``; reasons of both stay."""
+    """The report with the entries of ``other`` added; the reasons of both stay."""
     reasons = [part["reason"] for part in (report, other) if "reason" in part]
     report.update(other)
     return report.set_non_tensor("reason", "; ".join(reasons)) if reasons else report
 
 
 def weight_vector(module: nn.Module) -> Tensor:
-    """All weights of a module, detached, in one vector."""
+    """All weights of a module in one vector, detached."""
     return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()

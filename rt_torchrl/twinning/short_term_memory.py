@@ -1,4 +1,4 @@
-"""D_S: the real episodes that the twin is trained on."""
+"""The short-term memory D_S: the real episodes that the twin is trained on."""
 
 from collections import deque
 from typing import Any

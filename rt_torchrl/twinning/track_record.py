@@ -1,4 +1,4 @@
-"""What the latest real episodes cost, and what the twin says of them."""
+"""Costs of the latest real episodes, as measured and as the twin predicts them."""
 
 import copy
 from collections import deque
@@ -14,11 +14,11 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.referees import Role
 
 COMPARED = 2
-"""Episodes that are kept: a change takes two."""
+"""Number of episodes that are kept; a change of the cost takes two."""
 
 
 class Flown(NamedTuple):
-    """A real episode: what the system did, the weights of the policy that flew it, and J_a."""
+    """A real episode: its trajectory, the role and the weights of the policy that flew it, and its J_a."""
 
     trajectory: Trajectory
     role: Role
@@ -30,7 +30,7 @@ class TrackRecord:
     """The latest real episodes, oldest first, with the weights that flew them.
 
     Args:
-        policies: both policies; the weights of an episode are put into a copy of the one that flew it.
+        policies: both policies, by role; a copy of the one that flew an episode takes the weights of that episode.
     """
 
     def __init__(self, policies: Mapping[Role, nn.Module]):
@@ -38,19 +38,19 @@ class TrackRecord:
         self._flown: deque[Flown] = deque(maxlen=COMPARED)
 
     def append(self, trajectory: Trajectory, role: Role, cost: float) -> None:
-        """Add an episode that the policy of this role has just flown."""
+        """Add an episode that the policy with this role has just flown."""
         weights = {name: weight.detach().clone() for name, weight in self._policies[role].state_dict().items()}
         self._flown.append(Flown(trajectory, role, weights, cost))
 
     @property
     def real_costs(self) -> tuple[float, ...]:
-        """J_a of the episodes."""
+        """J_a of the episodes, as measured."""
         return tuple(flown.cost for flown in self._flown)
 
     def predicted_costs(self, twin: DigitalTwin) -> tuple[float, ...]:
-        """J_a of the same episodes on the twin: the same weights, from the same state, under the same inputs.
+        """J_a of the same episodes on the twin, flown with the same weights from the same state under the same inputs.
 
-        It is infinite where the twin diverges.
+        It is infinite for an episode in which the twin diverges.
         """
         return tuple(self._predicted(twin, flown) for flown in self._flown)
 

@@ -1,4 +1,4 @@
-"""Virtual episodes: what they are drawn from, and what a policy costs in them."""
+"""Virtual episodes: their draws, and the cost of a policy in them."""
 
 from collections import deque
 from typing import Any
@@ -16,8 +16,8 @@ class VirtualEpisodes:
     """Episodes on the twin with the disturbances that the real system has met.
 
     Args:
-        twin: flies them.
-        config: how the process of a real episode's exogenous input is fitted.
+        twin: twin on which the episodes are flown.
+        config: parameters of the fit of a process to a real episode's exogenous input.
         experience: number of latest real episodes whose processes are kept.
         generator: source of every draw.
     """
@@ -27,16 +27,17 @@ class VirtualEpisodes:
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
 
     def learn(self, record: Trajectory) -> None:
-        """Fit the process of a real episode's exogenous input."""
+        """Fit a process to the exogenous input of a real episode, and keep it."""
         plant = self.twin.plant
         self.processes.append(ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=self.config))
 
     def draw(self, count: int) -> Scenario:
-        """Random initial states, and exogenous inputs from the processes of the episodes so far.
+        """Draw random initial states, and exogenous inputs from the processes that are kept.
 
-        Note: the paper plans from the initial state and with the disturbances of the last episode alone; here from
-        random ones and with those of all episodes (``experience``), because a policy that is optimal for one wind can
-        lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in one wind of twenty.
+        Note: the paper plans with the initial state and the disturbances of the last episode alone. Here the initial
+        states are random and the disturbances are those of the last ``experience`` episodes, because a policy that is
+        optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
+        one wind of twenty.
         """
         initial_state = self.twin.plant.draw_initial_state(count, self.generator)
         return Scenario(initial_state, sample_experience(self.processes, count, self.generator))

@@ -13,7 +13,7 @@ LEARNERS: dict[LearnerName, type[DDPG] | type[TD3]] = {"ddpg": DDPG, "td3": TD3}
 
 
 def make_learner(plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator) -> Learner:
-    """The learner that a configuration names; see :class:`ActorCritic` for the arguments."""
+    """The learner that a configuration names; :class:`ActorCritic` describes the arguments."""
     return LEARNERS[config.algorithm](plant, policy, config, generator=generator)
 
 

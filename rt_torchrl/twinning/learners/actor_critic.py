@@ -1,4 +1,4 @@
-"""What learners with a critic share: transitions with sums of rewards, prioritised memory, optimisers."""
+"""The common part of learners with a critic: transitions with sums of rewards, prioritised memory, optimisers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ TRANSITION = ("observation", "action", *(("next", key) for key in ("observation"
 
 
 class Critic(nn.Module):
-    """q(e, a): a perceptron of the observation and of the action scaled from its range to [−1, 1].
+    """The value q(e, a): a perceptron of the observation and of the action scaled from its range to [−1, 1].
 
     Args:
-        plant: gives the number of observations and the ranges of the actions.
+        plant: plant that gives the number of observations and the ranges of the actions.
         hidden: widths of the hidden layers.
         generator: source of the initial weights.
     """
@@ -54,12 +54,12 @@ class ActorCritic(ABC):
     .. math::
         y_k = \sum_{j<m}\gamma^jr_{k+j} + \gamma^m\,q'(e_{k+m}, \pi(e_{k+m})), \qquad \delta_k = y_k - q(e_k, a_k)
 
-    A subclass makes the loss, one of TorchRL's, and says in which order its parts descend.
+    A subclass makes the loss, which is one of TorchRL's, and the order in which critics and policy are updated.
 
     Args:
-        plant: see :class:`Critic`.
-        policy: π_mf, updated in place.
-        config: see :class:`LearnerConfig`.
+        plant: plant that gives the number of observations and the ranges of the actions.
+        policy: policy π_mf, updated in place.
+        config: parameters of step 2.
         generator: source of the critics' initial weights and of the samples.
 
     Raises:
@@ -93,11 +93,11 @@ class ActorCritic(ABC):
 
     @abstractmethod
     def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, Float[Tensor, " n"]]:
-        """Loss of the critics, and |δ| of each transition."""
+        """Loss of the critics and |δ| of each transition."""
 
     @abstractmethod
     def actor_loss(self, batch: TensorDictBase) -> Tensor:
-        """−E[q(e, π(e))], with the critics' weights detached."""
+        """Loss of the policy, −E[q(e, π(e))], with the critics' weights detached."""
 
     @abstractmethod
     def update(self) -> TensorDict:
@@ -108,15 +108,15 @@ class ActorCritic(ABC):
         """The weights that the critics' optimiser trains."""
 
     def actor_module(self) -> TensorDictModule:
-        """The policy as TorchRL's losses take it."""
+        """The policy in the form that TorchRL's losses take."""
         return TensorDictModule(self.policy, in_keys=["observation"], out_keys=["action"])
 
     def critic_modules(self) -> list[ValueOperator]:
-        """The critics as TorchRL's losses take them."""
+        """The critics in the form that TorchRL's losses take."""
         return [ValueOperator(critic, in_keys=["observation", "action"]) for critic in self.critics]
 
     def store(self, episode: TensorDictBase) -> None:
-        """Keep the transitions of a real episode, by their TD errors.
+        """Keep the transitions of a real episode, with their TD errors as priorities.
 
         Raises:
             ValueError: if a TD error is not finite, because the critic has diverged.
@@ -125,10 +125,11 @@ class ActorCritic(ABC):
         self.memory.store(transitions, finite_errors(self.td_errors(transitions)))
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
-        """What D_L keeps of an episode, a TensorDict: (e_k, a_k, return, e_{k+m}) of the intervals with m after them.
+        """The transitions of an episode that D_L keeps: (e_k, a_k, sum of m rewards, e_{k+m}) of each interval k.
 
-        The last m − 1 are left out: with shorter sums, the values of where episodes end, such as a target that is
-        reached, would rest on hardly anything but themselves, and drift without bound.
+        The last m − 1 intervals are left out. With shorter sums there, the values of the observations at the end of
+        episodes, such as a target that is reached, would depend on hardly anything but themselves and drift without
+        bound.
         """
         whole = len(episode) - self.config.return_steps + 1
         transitions = episode.select(*TRANSITION)
@@ -138,7 +139,7 @@ class ActorCritic(ABC):
 
     @torch.no_grad()
     def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
-        """|δ| of transitions under the critics and target critics as they are."""
+        """TD errors |δ| of transitions with the present critics and target critics."""
         return self.critic_loss(transitions.copy())[1]
 
     def observations(self) -> Float[Tensor, "n n_o"]:
@@ -150,7 +151,7 @@ class ActorCritic(ABC):
         self.actor_optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.config.actor_rate)
 
     def critic_step(self) -> tuple[Tensor, Tensor, Tensor]:
-        """One iteration of the critics; loss and mean |δ| for the rewards as they are, and the gradient's norm."""
+        """Take one iteration of the critics; return loss and mean |δ| for unscaled rewards, and the gradient norm."""
         safe_point()
         scale = self.config.reward_scale
         batch = self.memory.sample(self.batch_size)
@@ -163,7 +164,7 @@ class ActorCritic(ABC):
         return loss.detach() / scale**2, td_error.mean() / scale, norm
 
     def actor_step(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """One iteration of the policy; the mean value for the rewards as they are, and the gradient's norm."""
+        """Take one iteration of the policy; return the mean value for unscaled rewards and the gradient norm."""
         safe_point()
         loss = self.actor_loss(batch)
         self.actor_optimiser.zero_grad(set_to_none=True)
@@ -189,7 +190,7 @@ COMPONENTS = ("loss", "critic_optimiser", "actor_optimiser", "memory")
 
 
 def means(critic: list[tuple[Tensor, ...]], actor: list[tuple[Tensor, ...]]) -> TensorDict:
-    """Means over the iterations of what :meth:`ActorCritic.critic_step` and :meth:`ActorCritic.actor_step` return."""
+    """Means of the results of :meth:`ActorCritic.critic_step` and :meth:`ActorCritic.actor_step` over iterations."""
     names = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")
     found = {}
     for keys, iterations in zip(names, (critic, actor), strict=True):

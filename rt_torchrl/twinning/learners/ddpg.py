@@ -16,8 +16,8 @@ class DDPG(ActorCritic):
         J_q = \mathbb E[w_k\delta_k^2], \qquad
         \frac{dR}{dw_a} = \mathbb E\Big[\frac{dq}{da}\frac{d\pi}{dw_a}\Big]
 
-    with one critic q, its target q′, and the importance weights w of the sampling. First come n_Q iterations of the
-    critic, then n_A of the policy. See :class:`ActorCritic` for the arguments and δ.
+    It has one critic q with its target q′; w are the importance weights of the sampling. An update makes n_Q iterations
+    of the critic, then n_A iterations of the policy. :class:`ActorCritic` describes the arguments and δ.
     """
 
     def make_critics(self, plant: Plant) -> list[Critic]:
@@ -32,7 +32,7 @@ class DDPG(ActorCritic):
 
     @property
     def critic(self) -> nn.Module:
-        """q."""
+        """The critic q."""
         return self.critics[0]
 
     def critic_weights(self) -> list[nn.Parameter]:
@@ -46,11 +46,11 @@ class DDPG(ActorCritic):
         return self.loss.loss_actor(batch)[0]
 
     def update(self) -> TensorDict:
-        """n_Q critic iterations, then n_A policy iterations.
+        """Make n_Q iterations of the critic, then n_A iterations of the policy.
 
         Returns:
-            Means over the iterations of ``critic_loss``, ``td_error``, ``value`` and both gradient norms; the first
-            three for the rewards as they are, without ``reward_scale``.
+            Means of ``critic_loss``, ``td_error``, ``value`` and both gradient norms over the iterations; the first
+            three are for the rewards without ``reward_scale``.
         """
         critic = []
         for _ in range(self.config.critic_iterations):

@@ -1,4 +1,4 @@
-"""What step 2 asks of a model-free method, and its parameters."""
+"""The protocol of a learner, the model-free method of step 2, and its parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,16 +16,16 @@ LearnerName = Literal["ddpg", "td3"]
 
 @runtime_checkable
 class Learner(Protocol):
-    """A model-free method: it sees every real episode and improves π_mf from what it has kept.
+    """A model-free method, which keeps parts of every real episode and improves π_mf from them.
 
-    See ``docs/learner.md`` for how to write one.
+    ``docs/learner.md`` shows how to write one.
     """
 
     policy: nn.Module
-    """π_mf, updated in place."""
+    """Policy π_mf, updated in place."""
 
     def store(self, episode: TensorDictBase) -> None:
-        """Keep what it needs of a real episode, whichever policy flew it (step 1).
+        """Keep the parts of a real episode that the learner needs, whichever policy flew the episode (step 1).
 
         Args:
             episode: ``observation``, ``action`` (as applied) and ``("next", ...)`` of n_t control intervals.
@@ -35,28 +35,28 @@ class Learner(Protocol):
         """Improve the policy (step 2).
 
         Returns:
-            Scalars for the report of the episode, by name; none is required.
+            Scalars for the report of the episode, by name; there may be none.
         """
 
     def restart(self) -> None:
-        """Forget what belongs to the weights that the policy had, because they have jumped: it became a clone."""
+        """Forget everything that belongs to the policy's earlier weights, because the policy has become a clone."""
 
     def observations(self) -> Float[Tensor, "n n_o"]:
-        """What the policies have seen on the real system, for a clone of another architecture."""
+        """Observations on the real system, from which a clone of another architecture learns."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next update depends on, the policy's weights apart: tensors in plain containers."""
+        """Everything that the next update depends on, except the policy's weights: tensors in plain containers."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict` of a learner of the same configuration."""
+        """Go on from the :meth:`state_dict` of a learner with the same configuration."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TD3Config:
-    """What TD3 has beside the parameters that it shares with DDPG.
+    """Parameters of TD3 that DDPG does not have.
 
     Args:
-        delay: critic iterations for one of the policy and of the targets.
+        delay: number of critic iterations for each iteration of the policy and of the targets.
         smoothing: standard deviation of the noise on the target's actions, as a share of half their range.
         smoothing_limit: greatest noise on the target's actions, as a share of half their range.
     """
@@ -79,23 +79,25 @@ class LearnerConfig:
     """Parameters of step 2.
 
     Args:
-        algorithm: ``ddpg`` as in the paper, or ``td3``: two critics, of which the lower value counts, a delayed policy
-            and smoothed targets.
-        critic_iterations: n_Q.
-        actor_iterations: n_A of DDPG. TD3 takes one for every ``td3.delay`` critic iterations instead.
-        batch_size: n_b; at most n_t transitions are sampled.
-        discount: γ per control interval.
-        return_steps: control intervals whose rewards a target sums before it bootstraps; 1 as in the paper. A control
-            interval that is short beside the dynamics makes one action matter little, and less than the critic's error.
-        reward_scale: factor on the rewards the critic learns from, so that its values are of the order of ten, which
-            a perceptron reaches within an episode; a value is the mean reward over 1 − γ. What is reported is unscaled.
-        target_rate: τ of the target critic, and of TD3's target policy.
+        algorithm: model-free method: ``ddpg``, as in the paper, or ``td3``, which takes the lower value of two critics,
+            delays the policy and smooths the targets.
+        critic_iterations: number n_Q of critic iterations per episode.
+        actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every ``td3.delay``
+            critic iterations instead.
+        batch_size: number n_b of transitions in a batch; it is at most the number n_t of control intervals.
+        discount: discount factor γ per control interval.
+        return_steps: number of control intervals whose rewards a target sums before it bootstraps; 1 as in the paper.
+            Where a control interval is short beside the dynamics, one action matters less than the critic's error; a
+            sum over more intervals mends that.
+        reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
+            scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
+        target_rate: rate τ at which the target critic, and TD3's target policy, follow.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
-        gradient_limit: greatest norm of the policy's gradient, infinite for none.
+        gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
         critic_hidden: widths of the critic's hidden layers.
-        memory: D_L.
-        td3: what TD3 has beside these.
+        memory: parameters of the long-term memory D_L.
+        td3: parameters of TD3 that DDPG does not have.
     """
 
     algorithm: LearnerName = "ddpg"

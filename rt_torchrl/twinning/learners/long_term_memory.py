@@ -1,4 +1,4 @@
-"""D_L: the transitions that critics learn from, by priority."""
+"""The long-term memory D_L: the transitions that critics learn from, sampled by priority."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplay
 from rt_torchrl.options import check_options
 
 AT_ONCE = 100
-"""Batches drawn in one call: enough for its overhead not to matter, and few enough for their copies to be small."""
+"""Number of batches drawn in one call: with as many its overhead does not matter, and their copies are still small."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +21,10 @@ class LongTermMemoryConfig:
     """Parameters of D_L.
 
     Args:
-        capacity: transitions kept, n_L.
+        capacity: number n_L of transitions that the memory keeps.
         prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
         correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
-        offset: tol, added to every |δ|.
+        offset: number tol that is added to every |δ|.
     """
 
     capacity: int = 100_000
@@ -44,12 +44,14 @@ class LongTermMemoryConfig:
 
 
 class LongTermMemory:
-    r"""D_L, sampled by priority: :math:`P(i) = (|\delta_i| + tol)^{\alpha^*} / \sum_k(|\delta_k| + tol)^{\alpha^*}`.
+    r"""The memory D_L, which samples transitions by priority.
+
+    .. math:: P(i) = (|\delta_i| + tol)^{\alpha^*} / \sum_k(|\delta_k| + tol)^{\alpha^*}
 
     When it is full, new transitions replace those with the least probability of being sampled (paper, section 4.3).
 
     Args:
-        config: see :class:`LongTermMemoryConfig`.
+        config: parameters of D_L.
         generator: source of the samples.
     """
 
@@ -78,30 +80,30 @@ class LongTermMemory:
         self.refresh(index, td_errors)
 
     def sample(self, batch_size: int) -> TensorDict:
-        """Transitions with ``index`` (for :meth:`refresh`) and the importance weight ``priority_weight``."""
+        """Draw transitions, with their ``index`` (for :meth:`refresh`) and importance weight ``priority_weight``."""
         return self._buffer.sample(batch_size)
 
     def samples(self, batch_size: int, count: int) -> Iterator[TensorDict]:
-        """The same as ``count`` calls of :meth:`sample` while no priority changes.
+        """Draw ``count`` batches, as the same number of calls of :meth:`sample` would while no priority changes.
 
-        Many are drawn in one call, because a single one takes half as long as a gradient of the policy.
+        One call draws many batches, because drawing a single batch takes half as long as a gradient of the policy.
         """
         for left in range(count, 0, -AT_ONCE):
             yield from self.sample(min(left, AT_ONCE) * batch_size).split(batch_size)
 
     def observations(self) -> Float[Tensor, "n n_o"]:
-        """Those of all transitions, in no particular order."""
+        """Observations of all transitions, in no particular order."""
         return self._buffer[:]["observation"]
 
     def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
         """Give sampled transitions their new TD errors δ."""
-        # Single precision, because the sampler draws in it when it is given a generator.
+        # A sampler with a generator draws in single precision.
         self.sampler.update_priority(index.cpu(), td_errors.detach().abs().float().cpu())
 
     def state_dict(self) -> dict[str, Any]:
-        """The transitions in their places, and the leaves of the trees that they are sampled by.
+        """The transitions in their places, and the leaves of the trees that sample them.
 
-        The trees themselves are objects of TorchRL; every other node of them is a sum or a minimum of its leaves.
+        The trees themselves are objects of TorchRL; all their other nodes are sums or minima of the leaves.
         """
         count = len(self)
         if not count:
@@ -130,26 +132,26 @@ TREES = ("_sum_tree", "_min_tree")
 
 
 class PriorityReader(PrioritizedSampler):
-    """A prioritised sampler that tells the priorities it samples by."""
+    """A prioritised sampler whose priorities can be read."""
 
     def priorities(self, count: int) -> Float[Tensor, " {count}"]:
-        """(|δ_i| + tol)^α* of the first ``count`` transitions."""
+        """Priorities (|δ_i| + tol)^α* of the first ``count`` transitions."""
         return self.leaves("_sum_tree", count)
 
     def leaves(self, tree: str, count: int) -> Float[Tensor, " {count}"]:
-        """What a tree holds of the first ``count`` transitions."""
-        # The tree answers for a single one with a scalar.
+        """Leaves of a tree for the first ``count`` transitions."""
+        # For a single transition the tree returns a scalar.
         return torch.as_tensor(getattr(self, tree)[torch.arange(count, device="cpu")], device="cpu").reshape(count)
 
 
 class LeastPriorityWriter(Writer):
-    """Fills the storage in order, then overwrites the transitions of least current priority.
+    """A writer that fills the storage in order, and then overwrites the transitions with the least current priority.
 
-    TorchRL's ``TensorDictMaxValueWriter`` ranks by the value at writing time; the paper ranks by the sampling
-    probability, which changes with every critic update.
+    TorchRL's ``TensorDictMaxValueWriter`` ranks transitions by their value when they are written. The paper ranks them
+    by the sampling probability, which changes with every update of the critic.
 
     Args:
-        sampler: holds the current priorities.
+        sampler: sampler that holds the current priorities.
     """
 
     def __init__(self, sampler: PriorityReader):
@@ -174,23 +176,23 @@ class LeastPriorityWriter(Writer):
         return index
 
     def _empty(self, empty_write_count: bool = True) -> None:
-        """Nothing to forget: the storage knows its length, the sampler its priorities."""
+        """Forget nothing, because the storage knows its length and the sampler its priorities."""
 
     def state_dict(self) -> dict[str, Any]:
         return {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Nothing to restore, as in :meth:`_empty`."""
+        """Restore nothing, because the writer has no state; see :meth:`_empty`."""
 
     def dumps(self, path) -> None:
-        """Nothing to write, as in :meth:`_empty`."""
+        """Write nothing, because the writer has no state; see :meth:`_empty`."""
 
     def loads(self, path) -> None:
-        """Nothing to read, as in :meth:`_empty`."""
+        """Read nothing, because the writer has no state; see :meth:`_empty`."""
 
 
 def on_cpu(generator: torch.Generator) -> torch.Generator:
-    """A generator for the sampler, whose tree of priorities is on the CPU: the same one, or one that it seeds."""
+    """A generator for the sampler, whose tree is on the CPU: the given one if it is there, else one that it seeds."""
     if generator.device.type == "cpu":
         return generator
     seed = torch.randint(2**62, (), generator=generator, device=generator.device)

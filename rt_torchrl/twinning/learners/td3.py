@@ -20,9 +20,9 @@ class TD3(ActorCritic):
         y_k = \sum_{j<m}\gamma^jr_{k+j} + \gamma^m\min_i q_i'(e_{k+m}, \pi'(e_{k+m}) + \epsilon), \qquad
         \epsilon \sim \mathrm{clip}(\mathcal N(0, \sigma^2), -c, c)
 
-    DDPG believes its one critic where it errs upwards, and its policy goes there. TD3 takes the lower of two critics,
-    averages a target over neighbouring actions, and lets policy and targets follow the critics with a delay. The
-    priority of a transition is the greater |δ| of the two. See :class:`ActorCritic` for the arguments.
+    DDPG's policy goes where its one critic errs upwards. TD3 takes the lower value of two critics, averages a target
+    over neighbouring actions, and lets policy and targets follow the critics with a delay. The priority of a transition
+    is the greater |δ| of the two critics. :class:`ActorCritic` describes the arguments.
 
     Source: Fujimoto, van Hoof, Meger, *Addressing function approximation error in actor-critic methods*, ICML 2018.
     """
@@ -50,7 +50,7 @@ class TD3(ActorCritic):
         return [w for w in self.loss.qvalue_network_params.parameters() if w.requires_grad]
 
     def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, Float[Tensor, " n"]]:
-        # TorchRL draws the smoothing from the global generator; its seed comes from this learner's own.
+        # TorchRL draws the smoothing from the global generator, which this learner's own generator seeds here.
         device = self.generator.device
         seed = torch.randint(2**31, (), generator=self.generator, device=device)
         with torch.random.fork_rng(devices=[device] if device.type != "cpu" else []):
@@ -62,10 +62,10 @@ class TD3(ActorCritic):
         return self.loss.actor_loss(batch)[0]
 
     def update(self) -> TensorDict:
-        """n_Q critic iterations; after every ``delay`` of them one of the policy, and the targets follow.
+        """Make n_Q iterations of the critics; every ``delay`` of them, update the policy once and move the targets.
 
         Returns:
-            As of :meth:`DDPG.update <rt_torchrl.twinning.learners.ddpg.DDPG.update>`.
+            The same means as :meth:`DDPG.update <rt_torchrl.twinning.learners.ddpg.DDPG.update>`.
         """
         critic, actor = [], []
         for iteration in range(1, self.config.critic_iterations + 1):

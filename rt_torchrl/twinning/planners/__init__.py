@@ -10,12 +10,12 @@ from rt_torchrl.twinning.planners.whole_episodes import WholeEpisodes
 
 
 def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator) -> Planner:
-    """The planner of a configuration: over short windows if they have a length, else over whole episodes.
+    """The planner of a configuration: over short windows if ``short_horizon.window`` is positive, else whole episodes.
 
     Args:
-        twin: on which the policy is planned.
-        policy: π_mb.
-        config: see :class:`PlannerConfig`.
+        twin: twin on which the policy is planned.
+        policy: policy π_mb, updated in place.
+        config: parameters of step 5.
         generator: source of the initial weights of a short horizon's critic.
     """
     if config.short_horizon.window:

@@ -1,4 +1,4 @@
-"""What step 5 asks of a planner, and its parameters."""
+"""The protocol of a planner, which improves π_mb in step 5, and its parameters."""
 
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -12,35 +12,35 @@ from rt_torchrl.trajectories.trajectory import Scenario
 
 @runtime_checkable
 class Planner(Protocol):
-    """Improves π_mb on the twin.
+    """A planner, which improves π_mb on the twin.
 
-    See ``docs/planner.md`` for how to write one.
+    ``docs/planner.md`` shows how to write one.
     """
 
     policy: nn.Module
-    """π_mb, updated in place."""
+    """Policy π_mb, updated in place."""
 
     def plan(self, episodes: Scenario) -> Descended:
         """Improve the policy on these virtual episodes; the algorithm then judges it on others.
 
         Returns:
-            Mean J_a on ``episodes`` before and after, the first gradient's norm, and the iterations made.
+            Mean J_a on ``episodes`` before and after, the norm of the first gradient, and the number of iterations.
 
         Raises:
-            DivergenceError: if the twin diverges under the policy as it is.
+            DivergenceError: if the twin diverges with the present policy.
         """
 
     def refuse(self) -> None:
-        """The plan was not better on other episodes: the policy has the weights back that it had before."""
+        """React to a plan that was worse on other episodes; the policy has its earlier weights again."""
 
     def restart(self) -> None:
-        """Forget what belongs to the weights that the policy had, because they have jumped: it became a clone."""
+        """Forget everything that belongs to the policy's earlier weights, because the policy has become a clone."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next plan depends on, the policy's weights apart: tensors in plain containers."""
+        """Everything that the next plan depends on, except the policy's weights: tensors in plain containers."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict` of a planner of the same configuration."""
+        """Go on from the :meth:`state_dict` of a planner with the same configuration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +48,12 @@ class ShortHorizonConfig:
     """Parameters of the planning over short windows.
 
     Args:
-        window: control intervals of a window; 0 plans over whole episodes instead, as in the paper.
-        discount: γ per control interval.
-        mixing: λ, how much the critic's targets trust the rest of the window over the critic itself.
+        window: number of control intervals in a window; 0 plans over whole episodes instead, as in the paper.
+        discount: discount factor γ per control interval.
+        mixing: weight λ of the rest of the window in the critic's targets; the critic itself has the weight 1 − λ.
         critic_iterations: gradients of the critic for each window.
         critic_hidden: widths of the critic's hidden layers.
-        target_rate: share by which the target critic moves towards the critic after each window.
+        target_rate: share of the distance to the critic that the target critic moves after each window.
         policy_rate: learning rate of the policy (Adam).
         critic_rate: learning rate of the critic (Adam).
     """
@@ -88,12 +88,15 @@ class PlannerConfig:
     """Parameters of step 5.
 
     Args:
-        iterations: n_mb, gradients per episode; sweeps through whole virtual episodes with a short horizon.
-        realisations: N_z of this step; None for that of the others. One virtual episode costs about as much as twenty,
-            and where the initial states differ much, a plan made on one of them says little of the others.
+        iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
+            episodes.
+        realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
+            algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
+            plan made on one of them says little about the others.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
-        descent: how the policy's weights descend J_a.
-        short_horizon: planning over short windows, where the gradients of whole episodes say nothing.
+        descent: parameters of the policy's descent over whole episodes.
+        short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
+            use.
     """
 
     iterations: int = 10

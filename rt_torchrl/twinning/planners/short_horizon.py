@@ -1,16 +1,17 @@
-r"""Planning over short windows with a learned tail cost, for tasks whose long gradients say nothing.
+r"""Planning over short windows with a learned tail cost, for tasks where gradients of whole episodes are of no use.
 
 Where small changes of a policy decide whether an episode succeeds, the gradient of a whole episode's cost explodes with
-its length, and its descent stops at the next of many local minima: a pendulum then never learns to swing up. Here an
-episode is cut into windows of n intervals, and what comes after a window is estimated by a critic v of the observation,
+the episode's length, and a descent stops at the next of many local minima: a pendulum then never learns to swing up.
+Here an episode is cut into windows of n intervals, and a critic v of the observation estimates the cost after a window,
 
 .. math::
     J_w = (1 - \gamma)\sum_{k<n}\gamma^kL_k + \gamma^n\,v(e_n), \qquad
     v(e_k) \approx (1 - \gamma)\sum_{j\ge0}\gamma^jL_{k+j}
 
-whose targets are mixed over the window's lengths by λ. The policy takes one step for each window, on the exact
-gradient of J_w through the twin; the critic's smoothness hides the cliffs beyond. It is no guarantee: of seven
-trainings on the pendulum one stayed in a minimum where the rod is held upright but not swung up.
+The factor λ mixes the critic's targets over the rest of the window. The policy takes one step for each window, along
+the exact gradient of J_w through the twin; the smooth critic hides the cliffs beyond the window. This is no guarantee:
+one of seven trainings on the pendulum stayed in a minimum where the policy holds the rod upright but does not swing it
+up.
 
 Source: Xu et al., *Accelerated policy learning with parallel differentiable simulation*, ICLR 2022 (SHAC).
 """
@@ -35,13 +36,13 @@ MODULES = ("learner", "critic", "target")
 class ShortHorizon:
     """Descends J_w of one window after the other, along virtual episodes.
 
-    What descends is a copy of the policy, because it gets worse before it gets better while the critic is still wrong:
-    it goes on from episode to episode, whether or not it is good enough yet to take the policy's place.
+    A copy of the policy descends, because a policy gets worse before it gets better while the critic is still wrong.
+    The copy goes on from episode to episode, whether or not it is good enough yet to take the policy's place.
 
     Args:
-        twin: flies the windows.
-        policy: π_mb, not changed here; ``learner`` is the copy.
-        config: see :class:`PlannerConfig`; its iterations are sweeps through the episodes.
+        twin: twin on which the windows are flown.
+        policy: policy π_mb; a plan gives it the weights of the copy, ``learner``.
+        config: parameters of step 5; ``iterations`` is the number of sweeps through the episodes.
         generator: source of the critic's initial weights.
 
     Raises:
@@ -49,7 +50,7 @@ class ShortHorizon:
     """
 
     gradient_limit = 1.0
-    moments = (0.7, 0.95)  # of Adam: the cost is another one in every window
+    moments = (0.7, 0.95)  # Adam's decay rates, which are short because the cost changes with every window
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator):
         self.iterations, config = config.iterations, config.short_horizon
@@ -70,12 +71,12 @@ class ShortHorizon:
         self.restart()
 
     def restart(self) -> None:
-        """Go on from the policy as it is now, because its weights have jumped."""
+        """Copy the policy anew, because its weights have jumped."""
         self.learner = copy.deepcopy(self.policy)
         self._optimiser = torch.optim.Adam(self.learner.parameters(), lr=self.config.policy_rate, betas=self.moments)
 
     def plan(self, episodes: Scenario) -> Descended:
-        """See :meth:`Planner.plan`; the policy takes the weights of the copy that descends."""
+        """Give the policy the weights of the copy after its descent; see :meth:`Planner.plan`."""
         with torch.no_grad():
             start = self.twin.cost(self.policy, *episodes).item()
         gradients = [self.sweep(*episodes) for _ in range(self.iterations)]
@@ -85,13 +86,13 @@ class ShortHorizon:
         return Descended(start, end, gradients[0] if gradients else float("nan"), len(gradients))
 
     def refuse(self) -> None:
-        """Nothing: the copy goes on from where it is, because it gets worse before it gets better."""
+        """Do nothing: the copy goes on from its present weights, because it gets worse before it gets better."""
 
     def sweep(self, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]) -> float:
         """Fly the episodes once, then take a step of the policy for each of their whole windows.
 
-        Every step is on windows of all phases of the episode, one of each realisation: with those of one phase alone
-        the critic forgets the others.
+        Every step takes one window from each realisation, and the windows are spread over all phases of the episode.
+        With windows of one phase alone the critic would forget the other phases.
 
         Returns:
             Mean norm of the gradients of J_w, relative to the mean cost of the first sweep.
@@ -116,13 +117,13 @@ class ShortHorizon:
         inputs: Float[Tensor, "batch n n_z"],
         start: Float[Tensor, " batch"],
     ) -> float:
-        """One step of the policy, then the critic's; the norm of the policy's gradient."""
+        """Take one step of the policy, then the critic's steps; return the norm of the policy's gradient."""
         plant = self.twin.plant
         flown = self.twin.control(self.learner, state, inputs, start=start)
         clock = plant.dt * torch.arange(inputs.shape[1] + 1, dtype=torch.float64, device=inputs.device)
         t = start.unsqueeze(-1) + clock
         costs = plant.running_cost(t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
-        # There is no input after the last interval.
+        # There is no input after the last interval; the last input takes its place.
         seen = plant.observe(t, flown.states, torch.cat([inputs, inputs[:, -1:]], 1))
         norm = self._improve_policy(costs, seen)
         self._improve_critic(costs.detach(), seen.detach())
@@ -151,7 +152,7 @@ class ShortHorizon:
 
     @torch.no_grad()
     def _targets(self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"]) -> Float[Tensor, "batch n"]:
-        """(1 − γ)L_k + γ((1 − λ)v(e_{k+1}) + λ·target_{k+1}), from the last interval back."""
+        """The critic's targets (1 − γ)L_k + γ((1 − λ)v(e_{k+1}) + λ·target_{k+1}), computed from the last interval."""
         gamma, mixing = self.config.discount, self.config.mixing
         values = self.target(seen).squeeze(-1)
         following, found = values[:, -1], []

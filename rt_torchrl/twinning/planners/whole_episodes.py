@@ -14,9 +14,9 @@ class WholeEpisodes:
     r"""Descends :math:`J_a = \mathbb E\frac1{T_o}\int L_a\,dt` over the weights of π_mb, on the twin (paper, eq. J_a).
 
     Args:
-        twin: with the best closure so far, w_p*.
-        policy: π_mb, updated in place.
-        config: see :class:`PlannerConfig`.
+        twin: twin with the best closure so far, w_p*.
+        policy: policy π_mb, updated in place.
+        config: parameters of step 5.
     """
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
@@ -24,11 +24,11 @@ class WholeEpisodes:
         self.descent = Descent(policy, config.descent)
 
     def plan(self, episodes: Scenario) -> Descended:
-        """n_mb gradient steps; the policy keeps the best weights seen in them."""
+        """Take n_mb gradient steps; the policy keeps the best weights seen in them."""
         return self.descent.run(lambda: self.twin.cost(self.policy, *episodes), self.config.iterations)
 
     def refuse(self) -> None:
-        """Start the optimiser afresh: its state led to the plan that was refused."""
+        """Forget the state of the optimiser, because it led to the plan that was refused."""
         self.restart()
 
     def restart(self) -> None:

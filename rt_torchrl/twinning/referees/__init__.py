@@ -11,7 +11,7 @@ REFEREES: dict[RefereeName, type[DecisionTree] | type[TrustRatio]] = {
 
 
 def make_referee(config: RefereeConfig, live: Role) -> Referee:
-    """The referee that a configuration names, with this role live at the start."""
+    """The referee that a configuration names; the role ``live`` starts live."""
     return REFEREES[config.rule](config, live)
 
 

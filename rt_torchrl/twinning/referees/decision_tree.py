@@ -7,14 +7,14 @@ class DecisionTree(TwoPolicies):
     """The paper's decision tree (figure decisionTree).
 
     The roles swap when the live policy has been worse on the twin for more than P_π episodes in a row. Otherwise the
-    idle policy becomes a clone when it has stalled for more than P_w in a row. Each counter restarts when its condition
-    fails, and the second one also while the live policy is worse.
+    idle policy becomes a clone when it has stalled for more than P_w episodes in a row. Each counter restarts when its
+    condition fails; the second counter also restarts while the live policy is worse.
 
-    Note: the paper prints J_live/J_idle < T_J for "the live policy performs worse"; here >, because costs are better
-    when they are smaller.
+    Note: the paper prints J_live/J_idle < T_J for "the live policy performs worse". Here the condition is >, because a
+    smaller cost is better.
 
     Args:
-        config: see :class:`RefereeConfig`.
+        config: parameters of step 6.
         live: role that starts live.
     """
 

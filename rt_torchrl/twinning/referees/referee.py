@@ -1,4 +1,4 @@
-"""What step 6 asks of a referee: one question, whether a policy is worse, and who acts next."""
+"""The protocol of a referee, which says in step 6 whether a policy is worse and who acts next, and its parameters."""
 
 import math
 from collections.abc import Callable
@@ -18,13 +18,14 @@ class RefereeConfig:
     """Parameters of step 6.
 
     Args:
-        rule: ``decision_tree`` as in the paper, or ``trust_ratio``: the twin's word counts only while the real cost
-            follows it.
-        patience: P_π; episodes in a row that a reason to swap must outlast.
-        clone_patience: P_w; the idle policy becomes a clone when it has stalled more often than this, in a row.
-        tolerance: T_J; the live policy is worse if its mean cost exceeds this times that of the idle one.
-        stall: T_w; the idle policy has stalled if its relative weight change is below this.
-        band: least and greatest ratio of the real cost's change to the predicted one at which the twin is trusted.
+        rule: rule of the referee: ``decision_tree``, as in the paper, or ``trust_ratio``, which believes the twin only
+            while the real cost follows the twin's predictions.
+        patience: number P_π of episodes in a row that a reason to swap must outlast.
+        clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
+            a clone.
+        tolerance: ratio T_J of the live policy's mean cost to the idle policy's above which the live policy is worse.
+        stall: relative weight change T_w below which the idle policy has stalled.
+        band: least and greatest ratio of the real cost's change to the predicted change at which the twin is trusted.
     """
 
     rule: RefereeName = "decision_tree"
@@ -48,15 +49,15 @@ class RefereeConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What an episode has shown of the two policies.
+    """Evidence about the two policies after an episode.
 
     Args:
         live_cost: mean J_a of the live policy over the virtual episodes.
-        idle_cost: the same of the idle policy, on the same draws; infinite if the twin diverges under it.
-        idle_weight_change: ‖w^i − w^{i−1}‖/‖w^i‖ of the idle policy over this episode.
+        idle_cost: mean J_a of the idle policy over the same virtual episodes; infinite if the twin diverges with it.
+        idle_weight_change: relative change ‖w^i − w^{i−1}‖/‖w^i‖ of the idle policy's weights over this episode.
         real_costs: J_a of the latest real episodes, oldest first.
-        predicted_costs: gives what the twin, as it is now, says that the same episodes cost: flown by the same weights
-            from the same states under the same inputs. It costs a flight for each, and is asked for only where needed.
+        predicted_costs: function that returns the costs of the same episodes on the present twin, flown with the same
+            weights from the same states under the same inputs. It flies each episode, so it is called only if needed.
 
     Raises:
         ValueError: if a cost or the weight change is not a number.
@@ -76,45 +77,46 @@ class Evidence:
 
 @runtime_checkable
 class Referee(Protocol):
-    """Compares policies and names who acts on the real system.
+    """A referee, which compares policies and names the one that acts on the real system.
 
-    See ``docs/referee.md`` for how to write one.
+    ``docs/referee.md`` shows how to write one.
     """
 
     live: Role
-    """Who acts in the next real episode."""
+    """Role that acts in the next real episode."""
 
     @property
     def idle(self) -> Role:
-        """The other one."""
+        """Role that does not act."""
 
     def worse(self, cost: float, than: float) -> bool:
-        """Whether a policy is worse than the one it would replace: the one question about plans, clones and swaps.
+        """Whether a policy is worse than another one; plans, clones and swaps are all decided by this question.
 
         Args:
-            cost: mean J_a of the newcomer over virtual episodes; infinite or NaN if the twin diverges under it.
-            than: the same of the policy that it would replace, on the same draws.
+            cost: mean J_a of the policy over virtual episodes; infinite or NaN if the twin diverges with it.
+            than: mean J_a of the other policy over the same virtual episodes.
         """
 
     def decide(self, evidence: Evidence) -> Event:
-        """Judge an episode.
+        """Judge the policies after an episode, and swap their roles if that is the decision.
 
         Returns:
-            ``swap`` if the roles have swapped, ``clone`` if the live policy is to be cloned into the idle one.
+            ``swap`` if the roles have swapped, ``clone`` if the live policy is to be cloned into the idle one, ``keep``
+            otherwise.
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Who is live, and all that the next decision depends on: plain values."""
+        """The live role and everything else that the next decision depends on, as plain values."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Go on from a :meth:`state_dict`."""
 
 
 class TwoPolicies:
-    """What referees share: who is live, the question, and when a stalled idle policy becomes a clone.
+    """The common part of referees: the roles, the comparison of costs, and the clone of an idle policy that stalls.
 
     Args:
-        config: see :class:`RefereeConfig`.
+        config: parameters of step 6.
         live: role that starts live; the paper starts with the model-free policy.
     """
 
@@ -133,7 +135,7 @@ class TwoPolicies:
         return not math.isfinite(cost) or cost > than
 
     def stalled(self, idle_weight_change: float) -> Event:
-        """``clone`` once the idle policy has changed too little for longer than the patience, and ``keep`` before."""
+        """Count stalled episodes: ``clone`` if there are more in a row than ``clone_patience``, else ``keep``."""
         self.stall_count = self.stall_count + 1 if idle_weight_change < self.config.stall else 0
         if self.stall_count > self.config.clone_patience:
             self.stall_count = 0

@@ -9,20 +9,20 @@ ROUNDING = 1e-9
 
 
 class TrustRatio(TwoPolicies):
-    r"""Trust in the twin, measured by how the real cost follows it from one real episode to the next.
+    r"""A referee that trusts the twin while the real cost follows the twin's predictions from episode to episode.
 
     .. math:: \rho_i = \frac{J_i - J_{i-1}}{\hat J_i - \hat J_{i-1}}
 
-    J are the real costs of the last two episodes. Ĵ are what the twin says of the same two: flown by the weights that
-    flew them, from the same states, under the same inputs, so that luck cancels and an exact twin has ρ = 1. A ratio
+    J are the real costs of the last two episodes. Ĵ are the costs of the same two episodes on the twin, flown with the
+    same weights from the same states under the same inputs; luck then cancels, and an exact twin has ρ = 1. A ratio
     within the band says that the twin predicts at least the direction of a change. After more than ``patience``
-    episodes in a row outside the band the model-free policy acts, whatever the twin says. One episode within the band
-    restores the trust, and then the policy that is better on the twin acts at once. While it stays, the idle policy
-    becomes a clone when it has stalled, as in the decision tree. Where the predicted cost does not change, an episode
-    says nothing of the twin and the count stays.
+    episodes in a row outside the band the model-free policy acts, whatever the twin predicts. One episode within the
+    band restores the trust, and then the policy that is better on the twin acts at once. While that policy stays live,
+    the idle policy becomes a clone when it has stalled, as in the decision tree. If the predicted cost does not change,
+    an episode says nothing about the twin and the count stays.
 
     Args:
-        config: see :class:`RefereeConfig`.
+        config: parameters of step 6.
         live: role that starts live.
 
     Source: the consistency ratio of Poletti et al., *Reinforcement twinning for hybrid control of flapping-wing drones*
@@ -37,7 +37,7 @@ class TrustRatio(TwoPolicies):
 
     @property
     def trusted(self) -> bool:
-        """Whether the twin's word counts."""
+        """Whether the twin is trusted."""
         return self.doubt_count <= self.config.patience
 
     def decide(self, evidence: Evidence) -> Event:
@@ -58,6 +58,6 @@ class TrustRatio(TwoPolicies):
         if abs(predicted) <= ROUNDING * abs(predicted_before) < math.inf:
             return
         low, high = self.config.band
-        # A twin that diverges under a policy that has flown predicts an infinite change.
+        # A twin that diverges with a policy that has flown predicts an infinite change, and so is not credible.
         credible = math.isfinite(predicted) and low <= (now - before) / predicted <= high
         self.doubt_count = 0 if credible else self.doubt_count + 1
