@@ -247,12 +247,12 @@ class ReinforcementTwinning:
         """
         if not self.virtual.cost(self.track_record.policy_flown(), episodes).isfinite():
             raise DivergenceError(
-                f"plant {self.twin.plant.name!r} diverged on its twin with the weights that have just flown on the real "
-                f"system; the closure is {type(self.twin.closure).__name__}."
+                f"plant {self.twin.plant.name!r} diverged on its twin with the weights that have just flown on the "
+                f"real system; the closure is {type(self.twin.closure).__name__}."
             )
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """Clone the live policy into the idle one, unless the referee finds the clone worse than the policy it replaces.
+        """Clone the live policy into the idle one, unless the referee finds the clone worse than what it replaces.
 
         Args:
             costs: mean J_a of both policies over the virtual episodes ``judged_on``.
