@@ -1,1 +1,1 @@
-"""Descents that steps 4 and 5 share."""
+"""Descents that step 4, the assimilation, and step 5, the planning, share."""
