@@ -1,4 +1,4 @@
-"""Time of one gradient by each engine, measured in turn in one process."""
+"""Measure the time of one gradient by each engine; the engines take turns in one process."""
 
 import json
 import statistics

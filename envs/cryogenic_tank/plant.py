@@ -223,7 +223,7 @@ class CryogenicTank(Plant):
         """The pressure p_1 = p − Δp_V [Pa] behind the valve, not below the back pressure of the vent line."""
         return torch.where(p - drop < self.back_pressure, self.back_pressure, p - drop)
 
-    # What figures show
+    # Quantities for figures
 
     def vent(self, state: Float[Tensor, "*batch 3"], action: Float[Tensor, "*batch 1"], closure: nn.Module) -> Vent:
         """Vented flow, heat taken and pump flow in a state, for a pressure drop Δp_V [Pa]."""

@@ -180,5 +180,5 @@ class Pendulum(Plant):
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """The same angle within [−π, π), as Gymnasium's ``angle_normalize``."""
+    """The angle, moved into [−π, π) by whole turns as by Gymnasium's ``angle_normalize``."""
     return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

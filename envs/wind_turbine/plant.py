@@ -49,7 +49,7 @@ class WindTurbine(Plant):
     Note: the paper prints J = 115 926 kg m²; here J is that of rotor and generator, because 115 926 is the hub alone,
     with which the rotor would follow the wind within 44 ms. ``inertia=HUB_INERTIA`` with a step below 0.12 s shows it.
     Note: the paper prints τ_a with C_p/ω_r; here it has C_p/λ, which is equal where both exist, because a braked rotor
-    reaches λ = 0. Note: the paper lets the pitch reach 90 deg; here up to 30 deg, where the closure is still valid.
+    reaches λ = 0. Note: the paper lets the pitch reach 90 deg; here it reaches 30 deg, the limit of the closure.
 
     Args:
         dt: control interval [s], 0.5 or 0.25; the paper prints both 0.5 s and 4 Hz.

@@ -14,7 +14,7 @@ Axis = Sequence[float] | np.ndarray
 Rows = Sequence[Sequence[float]] | np.ndarray
 DATA = Path(__file__).parent / "data"
 STALL_KNOT = 0.5
-"""Where the two pieces of the stall element meet, as a fraction of the table's least λ."""
+"""Knot between the two pieces of the stall element, as a fraction of the table's least λ."""
 STALL_SHARE = 0.2
 """C_p at that knot, as a fraction of C_p at the table's least λ; it keeps C_p positive on the rotors of this folder."""
 

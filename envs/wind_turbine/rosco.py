@@ -1,6 +1,6 @@
 """NREL's ROSCO simulator of the 5-MW turbine as a real system, and ROSCO's own controller for comparison.
 
-The simulator owns its loop and calls a controller; here a policy answers that call. Source:
+The simulator owns its loop and calls a controller; here a policy answers the call. Source:
 https://github.com/NREL/ROSCO, Apache License 2.0.
 """
 

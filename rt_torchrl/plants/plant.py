@@ -105,13 +105,13 @@ class Plant(nn.Module, ABC):
     def actuate(
         self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch n_a"]
     ) -> Float[Tensor, "*batch n_a"]:
-        """The action that the actuators make of a command, for example under a rate limit; here the command itself."""
+        """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
     def latch(
         self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch n_a"]
     ) -> Float[Tensor, "*batch n_s"]:
-        """The end state with what sampled-data parts remember of the interval; here they remember nothing."""
+        """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
 
     def step(
@@ -168,11 +168,11 @@ class Plant(nn.Module, ABC):
         applied: Float[Tensor, "batch n n_a"],
         exogenous: Float[Tensor, "batch n n_z"],
     ) -> dict[str, Float[Tensor, " batch"]]:
-        """Physical quantities by which an engineer judges whole episodes, named with their units; here none."""
+        """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""
         return {}
 
     def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
-        """Kinds of episodes, by name, for which results are also shown separately; here none."""
+        """Kinds of episodes, by name, for which results are also shown separately; by default none."""
         return {}
 
     def complete_states(
@@ -181,7 +181,7 @@ class Plant(nn.Module, ABC):
         exogenous: Float[Tensor, "n n_z"],
         actions: Float[Tensor, "n n_a"],
     ) -> Float[Tensor, "samples n_s"]:
-        """All states at n + 1 samples, completed from the states in a log; here the log must hold all states.
+        """All states at n + 1 samples, completed from the states in a log; by default the log must hold all states.
 
         A plant overrides this method if some states have no sensor but follow from the others, such as filters.
 
@@ -216,7 +216,7 @@ class Plant(nn.Module, ABC):
         """The closure that a twin of this plant starts from, with the weights w_p⁰."""
 
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
-        """A closure with a perceptron that starts with the values of :meth:`make_closure`; here there is none.
+        """A closure with a perceptron that starts with the values of :meth:`make_closure`; by default there is none.
 
         Raises:
             ValueError: if the plant has no such closure.
@@ -240,8 +240,8 @@ def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy
         plant: name of the plant, for the message.
         dt: step [s].
         rate: fastest decay rate |Re μ| of the linearised plant [1/s].
-        mode: what decays at that rate, for the message.
-        remedy: what else the user can do, for the message.
+        mode: name of the state that decays at that rate, for the message.
+        remedy: another remedy than a smaller step, for the message.
 
     Raises:
         ValueError: if dt·rate exceeds the stability limit of RK4 on the negative real axis, 2.785.

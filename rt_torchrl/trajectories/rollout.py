@@ -157,7 +157,7 @@ def require_finite(
         initial_state: initial states s_0.
         modules: closure and policy of the trajectory, for the message.
         start: time of s_0 [s], one for all realisations or one for each.
-        remedy: what the user can do, for the message.
+        remedy: advice to the user, for the message.
 
     Raises:
         DivergenceError: if a state is not finite; the message names plant, realisation, time and the last finite state.

@@ -61,7 +61,7 @@ def plain(tensor: Tensor) -> Tensor:
 
 
 def missing_for_compilation() -> str | None:
-    """What torch.compile lacks on this machine's CPU, in words; None if nothing."""
+    """The name of what torch.compile lacks on this machine's CPU; None if it lacks nothing."""
     candidates = [c for c in inductor_config.cpp.cxx if c] if isinstance(inductor_config.cpp.cxx, tuple) else ["g++"]
     if not any(shutil.which(str(candidate)) for candidate in candidates):
         return "a C++ compiler"
