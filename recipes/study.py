@@ -147,7 +147,7 @@ class Config:
         return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
 
     def line(self, plant: str) -> Yardstick | None:
-        """Costs of a plant along one quantity, where they explain what a table cannot."""
+        """Costs of a plant along one quantity; None for a plant whose tables say enough."""
         counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
         lines = {
             "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=PIValve, multiples=MULTIPLES)),
@@ -224,7 +224,7 @@ def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
 
 
 def gather(config: Config) -> Results:
-    """Everything that the report needs."""
+    """Gather the results that the report needs."""
     results = Results({}, {}, {})
     for plant in config.chosen():
         nominal = config.trainings(plant)["nominal", "twinning"]

@@ -161,7 +161,7 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
 
 
 def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-    """p − p_1 [Pa], less than the action where the back pressure stops it."""
+    """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
     return p - plant.valve_outlet(p, actions[:, 0])
 

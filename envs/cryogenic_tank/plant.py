@@ -130,7 +130,7 @@ class CryogenicTank(Plant):
 
     @torch.no_grad()
     def wall_rate(self, closure: nn.Module) -> float:
-        """U_s A_s/(m_s c_s) [1/s] of a closure at the set point, with the wall at the fluid's temperature."""
+        """Decay rate U_s A_s/(m_s c_s) [1/s] of a closure's wall at the set point and at the fluid's temperature."""
         state = self.state_at(self.error_sizes.new_tensor(self.set_point))
         now = self._conditions(state, torch.zeros_like(state[:1]), closure)
         return now.wall_conductance.item() / self.wall_heat_capacity

@@ -9,7 +9,7 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
 
 class OnOffValve(ClassicalController):
-    r"""A valve with hysteresis; it opens to one drop above :math:`\tilde p + h` and shuts below :math:`\tilde p - h`.
+    r"""A hysteresis valve that opens to a fixed drop above :math:`\tilde p + h` and shuts below :math:`\tilde p - h`.
 
     The valve starts shut. h = 1 kPa is not tuned: a narrower band always lowers J_a a little, but wears the valve out.
     The drop is tuned: :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads leaves it where it starts, at the end

@@ -264,7 +264,7 @@ class FlappingWing(Plant):
     def observe(
         self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 4"], exogenous: Float[Tensor, "*#batch 1"]
     ) -> Float[Tensor, "*batch 4"]:
-        """Errors to the target and their rates, over ``observation_scale``; the wind is not seen."""
+        """Errors to the target and their rates, over ``observation_scale``; the wind is not observed."""
         return torch.cat([self.target - state[..., :2], -state[..., 2:]], -1) / self.error_scale
 
     def running_cost(

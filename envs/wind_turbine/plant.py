@@ -194,14 +194,14 @@ class WindTurbine(Plant):
         return 0.5 * self.air_density * math.pi * self.radius**3 * fade * C_p / lam * u**2
 
     def cut_in(self, omega_g: Tensor) -> Tensor:
-        """Share of the torque that the generator delivers; it sets in over 10 ... 30 rad/s, because it only brakes."""
+        """Share of the torque that the generator delivers; it rises over 10 ... 30 rad/s: a generator only brakes."""
         start = self.cut_in_generator_speed - self.cut_in_band
         return smoothstep((omega_g - start) / (2.0 * self.cut_in_band))
 
     def actuate(
         self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch 2"]:
-        """The command under rate limits: torque and pitch leave the last action by at most their limits times dt."""
+        """The command under rate limits: torque and pitch change from the last action by at most limit times dt."""
         last = state[..., 4:6]
         change = torch.maximum(torch.minimum(command - last, self.greatest_increment), -self.greatest_increment)
         return last + change

@@ -105,7 +105,7 @@ class ControlledInterval(Interval):
         return command.clamp(self.policy.low_action, self.policy.high_action), memory
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
-        """(state, memory) at the end of the interval."""
+        """State and memory, (s, m), at the end of the interval."""
         command, memory = self.commanded(state)
         s = state[..., : len(self.plant.states)]
         end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state

@@ -41,7 +41,7 @@ def stability(calls: Calls) -> Iterator[str]:
 
 
 def steps_by_runge_kutta(plant: Plant, arguments: Arguments) -> bool:
-    """Whether the plant's step gives what that of :class:`Plant` gives, even if it wraps it."""
+    """Whether the plant's step has the results of :meth:`Plant.step`, which it may wrap."""
     t, state, command, exogenous = (arguments[name] for name in ("t", "state", "command", "exogenous"))
     steps = (plant.step, partial(Plant.step, plant))
     own, library = (step(t, state, command, exogenous, plant.closure).state for step in steps)

@@ -42,7 +42,7 @@ def forward_mode(calls: Calls) -> Iterator[str]:
 
 
 def tracing(calls: Calls) -> Iterator[str]:
-    """Methods that are not one graph; they are traced without a compiler, so that no machine lacks what it needs."""
+    """Methods that are not one graph; they are traced without a compiler, so that only the plant can fail."""
     arguments = calls.some(MANY)
     for method in calls.methods():
 

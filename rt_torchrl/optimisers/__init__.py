@@ -1,1 +1,1 @@
-"""Descents that step 4, the assimilation, and step 5, the planning, share."""
+"""Descents of the assimilation (step 4) and the planning (step 5)."""

@@ -178,7 +178,7 @@ def require_finite(
 def drive_of(
     plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Float[Tensor, " batch"] = 0.0
 ) -> Drive:
-    """The drive, which has the time first, from inputs and commands that have the batch first; see :class:`Rollout`."""
+    """The drive, time first, of inputs and commands with the batch first; :class:`Rollout` explains ``start``."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
     commands = exogenous.new_empty(n, batch, 0) if command is None else plain(command.transpose(0, 1))
