@@ -1,1 +1,1 @@
-"""The plants that ship with the library, a folder each."""
+"""The plants that ship with the library; each has a folder."""

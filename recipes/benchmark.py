@@ -1,4 +1,4 @@
-"""Time of one gradient by each engine, measured in turn in one process."""
+"""Measure the time of one gradient by each engine; the engines take turns in one process."""
 
 import json
 import statistics
@@ -22,12 +22,13 @@ class Config:
     Args:
         plant: folder of the plant under envs.
         realisations: trajectories N_z.
-        steps: control intervals; 0 takes the plant's whole episode.
-        repeats: gradients of each engine, in turn.
-        engines: the engines; one that cannot roll the plant out is left out, and the ratio is to the last of the rest.
-        compiled: compile each engine.
-        eager: engines that are left uncompiled all the same, such as odeint_adjoint as torchdiffeq has it.
-        threads: number of CPU threads; 0 leaves torch's default.
+        steps: number of control intervals; 0 takes the plant's whole episode.
+        repeats: number of gradients of each engine; the engines take turns.
+        engines: gradient engines; those that cannot roll the plant out are left out, and ratios are to the last of the
+            rest.
+        compiled: compile the engines.
+        eager: engines that are not compiled all the same, such as odeint_adjoint as torchdiffeq ships it.
+        threads: number of CPU threads; 0 keeps torch's default.
         output: JSON file for the result.
     """
 
@@ -49,7 +50,7 @@ class Config:
 
 
 def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
-    """One gradient as a function, always of the same trajectories."""
+    """A function that computes one gradient, always of the same trajectories."""
     generator = torch.Generator().manual_seed(0)
     plant = shipped_plants()[config.plant]()
     closure, policy = plant.make_closure(generator), plant.make_policy(generator)
@@ -66,10 +67,10 @@ def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
 
 
 def sorted_out(config: Config) -> tuple[list[Engine], dict[Engine, str]]:
-    """The engines that can roll the plant out, and why the others cannot.
+    """The engines that can roll the plant out, and the reasons why the others cannot.
 
     Raises:
-        ValueError: if none can.
+        ValueError: if no engine can.
     """
     plant = shipped_plants()[config.plant]()
     reasons = {engine: refusal(engine, plant) for engine in config.engines}

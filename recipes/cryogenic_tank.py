@@ -28,7 +28,7 @@ from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.
-    # The pressure moves over days: noise that lasts a period of the load, returns over 17 h and a discount over 42 h.
+    # The pressure moves over days: the noise lasts a period of the load, returns span 17 h and the discount 42 h.
     realisations=1,
     exploration=ExplorationConfig(correlation_time=5400.0),
     learner=LearnerConfig(
@@ -41,20 +41,20 @@ PAPER = TwinningConfig(
     ),
     # Knots every 300 s and a kernel of 600 s: the peaks of the load are 675 s wide.
     exogenous=ExogenousConfig(knots=1440),
-    # Ten per cent of U_HX move the pressure by 50 Pa, another draw of the load's noise by 200 Pa.
+    # A change of U_HX by 10 % moves the pressure by 50 Pa, another draw of the load's noise moves it by 200 Pa.
     assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
-    # Starting pressures differ by 25 kPa: a plan for one of them is not one for the others.
+    # Starting pressures differ by 25 kPa: a plan for one of them does not suit the others.
     planner=PlannerConfig(iterations=5, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     referee=RefereeConfig(patience=4, clone_patience=20),
 )
 NEURAL = dataclasses.replace(
     PAPER,
-    # Segments of two hours; without the prior the perceptron takes the first steps, which are the constants' to take.
+    # Segments last two hours. Without the prior the perceptron takes the first steps, which the constants should take.
     assimilation=AssimilationConfig(
         iterations=15, method="levenberg_marquardt", inputs="record", segment=240, prior=30.0
     ),
 )
-"""What trains ``--closure mlp``."""
+"""Configuration of the training with ``--closure mlp``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,12 +65,12 @@ class Config(RunConfig):
         policy: paper (a cubic of the pressure error, 3 weights) or mlp.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
-        fluid: pure fluid in the tank, by its name in CoolProp.
-        wall: how the wall temperature is integrated: explicit, or exponential for a light wall.
-        wall_heat_capacity: m_s c_s [J/K].
-        noise: standard deviation of the sensors, as a share of what they read; with it, twinning.assimilation.initial
-            is estimated unless given.
-        model_error: the heat exchanger fouls; its U_HX falls by 2 % from episode to episode.
+        fluid: name in CoolProp of the pure fluid in the tank.
+        wall: scheme for the wall temperature: explicit, or exponential for a light wall.
+        wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
+        noise: standard deviation of the sensors, as a share of what they read; with noise, the default of
+            twinning.assimilation.initial is estimated.
+        model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
     """
 
     policy: Literal["paper", "mlp"] = "paper"
@@ -89,7 +89,7 @@ class Config(RunConfig):
         twinning = NEURAL if self.closure == "mlp" else PAPER
         if not self.noise:
             return Config(twinning=twinning)
-        # Half a per cent in the first reading of the pressure shows for five days, and the closure makes up for it.
+        # An error of 0.5 % in the first reading of the pressure lasts for five days, and the closure makes up for it.
         estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
         return Config(twinning=dataclasses.replace(twinning, assimilation=estimated))
 
@@ -108,7 +108,7 @@ class Config(RunConfig):
         worn = ConstantCoefficients.true()
 
         def fouled(episode: int) -> ConstantCoefficients:
-            # In place: a module of its own for each episode would be compiled anew.
+            # The weights change in place, because a new module for each episode would be compiled anew.
             U_s, U_HX, K_JT = ConstantCoefficients.true_coefficients
             worn.log_coefficients.copy_(torch.tensor([U_s, 0.98**episode * U_HX, K_JT]).log())
             return worn

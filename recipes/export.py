@@ -1,4 +1,4 @@
-"""Takes a trained policy out of a run folder: as C99, as an ONNX model, as a PyTorch program."""
+"""Export a trained policy from a run folder as C99, as an ONNX model or as a PyTorch program."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ class Config:
 
     Args:
         run: run folder of any recipe.
-        role: model_based or model_free.
-        formats: some of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
+        role: role of the policy, model_based or model_free.
+        formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
         output: folder for the files; by default RUN/exported.
-        name: of the files and the C function; by default PLANT_ROLE.
-        recipe: the recipe that made the run, as its file or as package.module:Config; by default the one that the run
-            names, or for a run of version 0.1 the one beside this file that is named as the plant.
+        name: name of the files and of the C function; by default PLANT_ROLE.
+        recipe: recipe that made the run, as its file or as package.module:Config; by default the recipe that the run
+            names or, for a run of version 0.1, the recipe beside this file with the name of the plant.
     """
 
     run: Annotated[Path, Positional]

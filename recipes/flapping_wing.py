@@ -25,8 +25,8 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T2; N_z, T_J and T_w are the library's defaults.
-    # A flight is decided over seconds and moved by whole wing beats: noise that lasts a beat, returns over half a
-    # second and a discount over one. With the paper's 0.998 and targets of one interval the policy flies off.
+    # Seconds decide a flight, and whole wing beats move it: the noise lasts a beat, returns span half a second and the
+    # discount one second. With the paper's 0.998 and targets of one interval the policy flies off.
     exploration=ExplorationConfig(correlation_time=0.05),
     learner=LearnerConfig(
         critic_iterations=1000,
@@ -36,8 +36,8 @@ PAPER = TwinningConfig(
         reward_scale=1e-3,
         actor_rate=1e-4,
     ),
-    # The gust is smooth over its 3 s, and what a regression leaves of it would pass for drag: a kernel of 0.3 s and a
-    # tube of 2e-4 leave 1e-4 m/s.
+    # The gust is smooth over its 3 s, and the residual of a regression would be taken for drag: with a kernel of 0.3 s
+    # and a tube of 2e-4 the residual is 1e-4 m/s.
     exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     planner=PlannerConfig(iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5)),
@@ -45,19 +45,19 @@ PAPER = TwinningConfig(
 )
 NEURAL = dataclasses.replace(
     PAPER,
-    # Segments of five wing beats, 0.25 s, on the measured wind: three hundred weights on every draw of it would take
-    # gigabytes, and over whole flights most steps fail.
+    # Segments last five wing beats, 0.25 s, because over whole flights most steps fail. They use the measured wind,
+    # because three hundred weights on every draw of the wind would take gigabytes.
     assimilation=AssimilationConfig(
         iterations=8, method="levenberg_marquardt", inputs="record", segment=500, prior=1e-6
     ),
 )
-"""What trains ``--closure mlp``."""
+"""Configuration of the training with ``--closure mlp``."""
 
 
 MASS, BELIEVED = 3e-3, 2.25e-3
-"""Of the body [kg], and what the twin believes with ``--model-error``."""
+"""Mass of the body [kg], and the mass that the twin believes with ``--model-error``."""
 STORM = 120.0
-"""Faster wind has not been measured near the ground [m/s]."""
+"""Wind speed above all that has been measured near the ground [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,13 +65,13 @@ class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
     Args:
-        policy: paper (affine in position and speed errors with offset, 10 weights) or mlp.
+        policy: paper (an affine law of position and speed errors with offset, 10 weights) or mlp.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         mean_wind: mean headwind [m/s].
         wind_deviation: standard deviation of the headwind [m/s].
-        peak: height of the window of J_a around the target: unit, or the printed one.
-        model_error: the twin believes in a body of 2.25 g, and the real one is 33 % heavier.
+        peak: height of the window of J_a around the target: unit, or printed as in the paper.
+        model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
     """
 
     policy: Literal["paper", "mlp"] = "paper"
@@ -100,7 +100,7 @@ class Config(RunConfig):
         return FlappingWing(dt=self.dt, horizon=self.horizon, wind=wind, peak=self.peak, mass=mass)
 
     def believed(self) -> FlappingWing | None:
-        """The twin's physics, if it is wrong about them."""
+        """The physics of a twin that is wrong about them; None if it is right."""
         return self.plant(BELIEVED) if self.model_error else None
 
 

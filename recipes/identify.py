@@ -26,21 +26,21 @@ class Config:
     """Train a plant's twin on a recorded log, without control.
 
     Args:
-        log: CSV or Parquet file with a column for the time, each action, each exogenous input and the states that are
-            measured.
-        plant: the physics, by the name of a folder under envs, or as FILE.py:NAME or package.module:NAME of your own.
-        recipe: a recipe whose Config makes the plant instead, with its default options.
-        columns: columns that are not named as their signal or have another unit, as HEADER=SIGNAL[UNIT] or
+        log: CSV or Parquet file with a column for the time, each action, each exogenous input and each measured state.
+        plant: plant of the log, as the name of a folder under envs, or as FILE.py:NAME or package.module:NAME of your
+            own.
+        recipe: recipe whose Config makes the plant instead, with default options.
+        columns: columns with another name than their signal or another unit, as HEADER=SIGNAL[UNIT] or
             HEADER=SIGNAL*FACTOR+OFFSET.
-        drop: leave out rows with a missing value or one out of range; they become gaps.
+        drop: leave out rows with a value that is missing or out of range; they become gaps.
         dt: control interval of the twin [s]; by default the plant's own.
         gap: longest time between two rows that is bridged [s]; by default three sampling intervals.
-        shortest: control intervals below which a part between gaps is left out.
-        held_out: share at the end of the log that the twin is judged on and not trained on.
-        seed: of the closure's first weights, where these are random.
-        compiled: compile with torch.compile; by default for 500 control intervals or more, where this machine can.
+        shortest: least number of control intervals of a part between gaps; shorter parts are left out.
+        held_out: share at the end of the log on which the twin is judged and not trained.
+        seed: seed of the closure's first weights, if these are random.
+        compiled: compile with torch.compile; by default for 500 control intervals or more, if this machine can.
         log_dir: folder of the results; by default runs/identify/PLANT/TIME.
-        identification: how the weights are found.
+        identification: options of the search for the weights.
     """
 
     log: Annotated[Path, tyro.conf.Positional]
@@ -71,7 +71,7 @@ class Config:
             raise ValueError("log_dir='' is the current folder; name a folder of its own for the results.")
 
     def make_plant(self) -> Plant:
-        """The plant, with the control interval that was asked for."""
+        """The plant with the requested control interval."""
         make = plant_class(self.plant) if self.plant else self._plant_of_recipe
         try:
             plant = make()
@@ -92,7 +92,7 @@ class Config:
         return config.plant()
 
     def make_folder(self, plant: str) -> Path:
-        """The folder of the results, created."""
+        """Create the folder of the results and return its path."""
         folder = self.log_dir or Path("runs") / "identify" / plant / time.strftime("%Y%m%d-%H%M%S")
         try:
             (folder / "figures").mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,7 @@ def main(config: Config) -> None:
 
 
 def metrics_of(plant: Plant, measured: list[int], found: Identified, parts: Resampled) -> dict[str, Any]:
-    """The content of ``metrics.json``, with the errors of the measured states; what is not known is null."""
+    """The content of ``metrics.json``, with the errors of the measured states; unknown numbers are null."""
     summary: dict[str, Any] = {"plant": plant.name, "iterations": found.iterations}
     for name in ("training", "held_out"):
         before, after = getattr(found, name)
@@ -159,7 +159,7 @@ def metrics_of(plant: Plant, measured: list[int], found: Identified, parts: Resa
 
 
 def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
-    """What became of the log, for the terminal."""
+    """The parts and gaps of the log, for the terminal."""
     steps = [len(segment.actions) for segment in parts.segments]
     lines = [
         f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%}), resampled to {sum(steps)} intervals of "
@@ -171,7 +171,7 @@ def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
 
 
 def table(metrics: dict[str, Any]) -> str:
-    """The results for the terminal."""
+    """The results, for the terminal."""
     lines = [f"  {'':<32}{'before':>12}{'after':>12}{'ratio':>12}"]
     for name in ("training", "held_out"):
         found, shown = metrics[name], name.replace("_", " ")

@@ -19,13 +19,13 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 
 SWING_UP = TwinningConfig(
-    # Half of the torque's range, for about as long as a swing takes: white noise hardly moves the rod.
+    # The noise has half of the torque's range and lasts about a swing, because white noise hardly moves the rod.
     exploration=ExplorationConfig(spread=0.5, correlation_time=0.3),
-    # Costs are up to 16; values of the order of ten are within a perceptron's reach.
+    # Costs reach 16; the scale keeps values at the order of ten, which a perceptron can reach.
     learner=LearnerConfig(reward_scale=0.1, actor_rate=1e-3),
-    # Ten seconds are some six swings, whose number depends on the length: a whole replay has a minimum for each.
+    # Ten seconds are about six swings, and their number depends on the length: a whole replay has a minimum for each.
     assimilation=AssimilationConfig(iterations=30, inputs="record", method="levenberg_marquardt", segment=10),
-    # Whether a swing reaches the top hangs on a hair: over whole episodes descent stops in the next local minimum.
+    # Tiny changes decide whether a swing reaches the top: over whole episodes, descent stops in a local minimum.
     planner=PlannerConfig(iterations=10, realisations=64, short_horizon=ShortHorizonConfig(window=25)),
 )
 
@@ -35,12 +35,12 @@ class Config(RunConfig):
     """Train twin and controllers on Gymnasium's Pendulum-v1.
 
     Args:
-        policy: plant (its own perceptron of cos θ, sin θ and dθ/dt) or mlp.
+        policy: plant (the plant's own perceptron of cos θ, sin θ and dθ/dt) or mlp.
         horizon: length of an episode T_o [s]; Gymnasium's is 10.
-        gravity: g [m/s²].
+        gravity: gravity g [m/s²].
         guess: share of the true mass and length that the twin starts from.
-        judged_on: real flies the unseen episodes on Gymnasium's pendulum, plant on ours with Gymnasium's mass and
-            length, which is quicker and what --reference needs.
+        judged_on: system of the unseen episodes: real for Gymnasium's pendulum, or plant for this library's pendulum
+            with Gymnasium's mass and length, which is quicker and which --reference needs.
     """
 
     episodes: int = 10

@@ -1,4 +1,4 @@
-"""Write the log of a simulated real system, to try ``identify.py`` on: jittered intervals, noisy sensors, a gap."""
+"""Write the log of a simulated real system for ``identify.py``, with jittered intervals, noisy sensors and a gap."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,21 +24,21 @@ CONTROLLERS: dict[str, type[ClassicalController]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Fly one episode of a plant and write what a data logger would.
+    """Fly one episode of a plant and write the log that a data logger would write.
 
     Args:
-        log: the file to write, CSV or Parquet.
-        plant: name of the folder under envs, or FILE.py:NAME or package.module:NAME of your own.
-        law: what acts: classical for the plant's classical controller, policy for a policy.
-        weights: weights.pt of a training with the paper's policy; by default a policy's first weights, at random.
-        role: which policy of the training.
+        log: log file to write, CSV or Parquet.
+        plant: name of a folder under envs, or FILE.py:NAME or package.module:NAME of your own plant.
+        law: law of the actions: classical for the plant's classical controller, policy for a policy.
+        weights: weights.pt of a training with the paper's policy; by default the policy has random first weights.
+        role: role of the policy in the training.
         states: names of the states that are logged; by default all.
-        seed: of the episode and of a policy's first weights.
+        seed: seed of the episode and of a policy's first weights.
         horizon: length of the episode [s]; by default the plant's.
         jitter: greatest difference of a control interval from dt, as a share of dt; by default 0.4, or 0 for a plant
             with a scheme of its own.
-        noise: standard deviation of the sensors of the states, as a share of what they read.
-        gap: share of the log that is missing from its middle on.
+        noise: standard deviation of the states' sensors, as a share of what they read.
+        gap: share of the log that is missing, from its middle on.
     """
 
     log: Annotated[Path, tyro.conf.Positional]
@@ -62,7 +62,7 @@ class Config:
         if self.seed < 0:
             raise ValueError(f"seed={self.seed} must not be negative.")
         if self.law == "classical" and self.plant not in CONTROLLERS:
-            raise ValueError(f"law='classical': of {self.plant!r} no classical controller is known; use policy.")
+            raise ValueError(f"law='classical': no classical controller of {self.plant!r} is known; use policy.")
         if not 0.0 <= self.gap < 0.5:
             raise ValueError(f"gap={self.gap} must lie in [0, 0.5), a share of the log.")
         known = [state.name for state in logged_states(make_plant(self))]
@@ -83,13 +83,13 @@ def main(config: Config) -> None:
 
 
 def make_plant(config: Config) -> Plant:
-    """The plant, with the horizon that was asked for."""
+    """The plant with the requested horizon."""
     kind = plant_class(config.plant)
     return kind() if config.horizon is None else kind(horizon=config.horizon)
 
 
 def law_of(config: Config, plant: Plant, generator: torch.Generator) -> Law:
-    """What acts on the real system."""
+    """The law that acts on the real system."""
     if config.law == "classical":
         return ClassicalLaw(CONTROLLERS[config.plant](plant))
     policy = plant.make_policy(generator)
@@ -99,7 +99,7 @@ def law_of(config: Config, plant: Plant, generator: torch.Generator) -> Law:
 
 
 def with_gap(log: SensorLog, share: float) -> SensorLog:
-    """Without a share of its rows, from the middle on."""
+    """The log without a share of its rows, from the middle on."""
     middle, end = 0.5 * log.times[-1], (0.5 + share) * log.times[-1]
     return log.chosen((log.times <= middle) | (log.times > end))
 

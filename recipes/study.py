@@ -1,4 +1,4 @@
-"""What reinforcement twinning is worth: every arm on every plant, classical controllers, and the best possible."""
+"""The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
 
 import os
 import shutil
@@ -35,20 +35,20 @@ POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "flapping_wing": {"twinning, perceptron": ("--policy", "mlp")},
 }
-"""Policies beside a plant's own that twinning trains too, as options of its recipe."""
+"""Policies that twinning trains beside a plant's own policy, as options of the plant's recipe."""
 LONG_ONLY = ("twinning, with bias",)
 """Policies that ``quick`` leaves out, because tracing them takes a minute."""
 OTHER_PLANT = ("twinning, gain-scheduled",)
 """Policies that need a plant with more signals."""
 OTHER_CLOSURE = ("wind_turbine",)
-"""Plants whose true closure is of another kind than the twin's; no training uses the graphs of their oracle."""
+"""Plants whose true closure has another type than the twin's; no training uses the graphs of their oracle."""
 
 EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
-"""Real episodes of a training, the same for every arm; more of them do not improve drone and tank."""
+"""Number of real episodes of a training, the same for every arm; more episodes do not improve drone and tank."""
 SHORT = {"wind_turbine": 600.0, "flapping_wing": 0.75, "cryogenic_tank": 7.5e4}
 """Length of an episode with ``quick`` [s]: the whole episode of the turbine, about a sixth of the others."""
 SHORT_EPISODES = 2
-"""Real episodes of a training with ``quick``."""
+"""Number of real episodes of a training with ``quick``."""
 QUICK_VARIANTS = ("noise 5 %", CHANGED)
 """Variants that ``quick`` trains."""
 MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
@@ -61,17 +61,17 @@ COUNTS = (2, 5, 10, 20)
 class Config:
     """Train every arm on every plant, tune the classical controllers, find the oracle, and write a report.
 
-    The folder keeps what is done, so that the same command goes on where it was interrupted.
+    The folder keeps finished results, so that the same command goes on where it was interrupted.
 
     Args:
         plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
-        seeds: trainings of every arm.
-        variant_seeds: trainings of every arm under each kind of sensor noise and model error; 0 leaves them out.
+        seeds: number of trainings of every arm.
+        variant_seeds: number of trainings of every arm under each sensor noise and model error; 0 leaves them out.
         jobs: number of trainings side by side, one thread each; 0 means one for every core.
-        backend: of joblib; ray spreads over a Ray cluster and needs the extra ``ray``.
+        backend: backend of joblib; ray uses a Ray cluster and needs the extra ``ray``.
         unseen: number of unseen episodes that judge everything.
         folder: folder of the report and of all runs.
-        quick: make the same report from one seed of short trainings, and mark it so.
+        quick: make the same report from one seed of short trainings, and mark it as quick.
     """
 
     plants: tuple[str, ...] = ("all",)
@@ -97,7 +97,7 @@ class Config:
 
     @property
     def kept(self) -> Path:
-        """Folder of the results. Short trainings have their own, or the whole study would take them for its results."""
+        """Folder of the results; short trainings have their own, or the whole study would take theirs for its own."""
         return self.folder / "quick" if self.quick else self.folder
 
     def policies(self, plant: str) -> dict[str, tuple[str, ...]]:
@@ -106,7 +106,7 @@ class Config:
         return {name: options for name, options in every if not (self.quick and name in LONG_ONLY)}
 
     def episodes_of(self, plant: str) -> int:
-        """Real episodes of every training of a plant."""
+        """Number of real episodes in every training of a plant."""
         return SHORT_EPISODES if self.quick else EPISODES[plant]
 
     def options_of(self, plant: str) -> tuple[str, ...]:
@@ -147,7 +147,7 @@ class Config:
         return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
 
     def line(self, plant: str) -> Yardstick | None:
-        """Costs of a plant along one quantity, where they explain what a table cannot."""
+        """Costs of a plant along one quantity; None for a plant whose tables say enough."""
         counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
         lines = {
             "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=PIValve, multiples=MULTIPLES)),
@@ -175,7 +175,7 @@ def compute(config: Config) -> None:
 def ordered_tasks(config: Config) -> list[Task]:
     """Yardsticks first, then the nominal trainings, then those of the other variants."""
     tasks = [task for plant in config.chosen() for task in yardstick_tasks(config, plant)]
-    # The plant that takes longest first.
+    # The plant that takes longest comes first.
     groups = [item for plant in reversed(config.chosen()) for item in config.trainings(plant).items()]
     for _, group in sorted(groups, key=lambda item: item[0][0] != "nominal"):
         tasks += group
@@ -224,7 +224,7 @@ def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
 
 
 def gather(config: Config) -> Results:
-    """Everything that the report needs."""
+    """Gather the results that the report needs."""
     results = Results({}, {}, {})
     for plant in config.chosen():
         nominal = config.trainings(plant)["nominal", "twinning"]

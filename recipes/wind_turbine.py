@@ -31,23 +31,24 @@ from rt_torchrl.envs.wind_turbine.wear import worn_table
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.
-    # Targets over 5 s: an action of 0.5 s moves a rotor of 16 s too little to tell from the critic's error.
+    # Targets span 5 s: an action of 0.5 s moves a rotor with a time constant of 16 s by less than the critic's error.
     learner=LearnerConfig(return_steps=10),
     planner=PlannerConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
 )
 NEURAL = dataclasses.replace(
     PAPER,
-    # The measured wind, because a draw of it hides what the perceptron adds; segments of 10 s, less than the rotor's
-    # time constant of 16 s, because over whole records most steps fail; six winds, because one shows a part of (λ, β).
+    # Inputs are the measured wind, because a draw of it hides what the perceptron adds. Segments last 10 s, less than
+    # the rotor's time constant of 16 s, because over whole records most steps fail. One wind shows a part of (λ, β),
+    # so that there are six.
     records=6,
     assimilation=AssimilationConfig(
         iterations=10, method="levenberg_marquardt", inputs="record", segment=20, prior=0.02
     ),
 )
-"""What trains ``--closure mlp``."""
+"""Configuration of the training with ``--closure mlp``."""
 
 STORM = 120.0
-"""Faster wind has not been measured at the height of a rotor [m/s]."""
+"""Wind speed above all that has been measured at the height of a rotor [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,17 +56,17 @@ class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
-        policy: paper (affine in e1 and e2, no bias, 4 weights), bias (the same with bias, 6), mlp, or scheduled:
-            torque by the square of the speed and gain-scheduled PI pitch, observed by speed and pitch too, whose gains
-            start detuned.
-        dt: control interval [s]; 0.5 or 0.25.
+        policy: paper (an affine law of e1 and e2 without bias, 4 weights), bias (that law with bias, 6 weights), mlp,
+            or scheduled (torque by the square of the speed and gain-scheduled PI pitch, which also observes speed and
+            pitch, and whose gains start detuned).
+        dt: control interval [s], 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         mean_wind: mean wind speed U [m/s].
         turbulence: turbulence intensity σ/U [-].
-        wind_files: TurbSim files (.hh or .bts) to draw the wind from instead.
-        model_error: from the middle of the training on the rotor is worn: 10 % less lift, 50 % more drag.
-        real: the real system: the plant in simulation, or rosco for the simulator of NREL's ROSCO toolbox, which is
-            then judged on itself and compared with ROSCO's controller; it needs the extra rosco.
+        wind_files: TurbSim files (.hh or .bts) from which the wind is drawn instead.
+        model_error: wear the rotor from the middle of the training on, with 10 % less lift and 50 % more drag.
+        real: real system: simulation of the plant, or rosco for the simulator of NREL's ROSCO toolbox. With rosco,
+            policies are judged in that simulator and compared with ROSCO's controller; this needs the extra rosco.
     """
 
     policy: Literal["paper", "bias", "mlp", "scheduled"] = "paper"
@@ -104,7 +105,7 @@ class Config(RunConfig):
 
     @staticmethod
     def wind_of(path: Path) -> WindRecord:
-        """The record in one of the ``wind_files``.
+        """The wind record in one of the ``wind_files``.
 
         Raises:
             ValueError: if the file cannot be read, or holds no wind.

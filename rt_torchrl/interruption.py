@@ -1,4 +1,4 @@
-"""Ctrl-C between two iterations: what is under way in one is never left half done."""
+"""Ctrl-C takes effect between two iterations, so that no iteration is left half done."""
 
 import os
 import signal
@@ -9,15 +9,15 @@ NOTICE = b"\ninterrupted: the training stops after the iteration under way (Ctrl
 
 
 class Interruption:
-    """While it is entered, Ctrl-C takes effect at the next :func:`safe_point`, and the second Ctrl-C at once.
+    """A context in which Ctrl-C takes effect at the next :func:`safe_point`, and a second Ctrl-C at once.
 
-    A KeyboardInterrupt that is raised anywhere can hit torch or TorchRL while they have swapped weights, switched
-    gradients off or hold a lock; they then fail in other ways, or stay so.
+    A KeyboardInterrupt at any other place can hit torch or TorchRL while they have swapped weights, switched gradients
+    off or hold a lock. They then fail in other ways, or remain in that state.
 
-    Note: a thread that is not the main one gets no Ctrl-C, and an own handler of SIGINT stays in charge; there it does
-    nothing.
+    Note: only the main thread receives Ctrl-C, and a handler of SIGINT that the user has installed stays in charge.
+    The context does nothing in another thread or beside such a handler.
 
-    ``at_once`` tells whether there was a second one.
+    The attribute ``at_once`` tells whether there was a second Ctrl-C.
     """
 
     _asked = False
@@ -45,7 +45,7 @@ class Interruption:
 
 
 def safe_point() -> None:
-    """To be called between two iterations of whatever takes long.
+    """Stop here if Ctrl-C was pressed; long computations call this function between two iterations.
 
     Raises:
         KeyboardInterrupt: if Ctrl-C was pressed since the :class:`Interruption` was entered.

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 
 def check_options(config: Any, *, infinite: Sequence[str] = ()) -> None:
-    """Refuse options that no option of their type can be, when a configuration is made.
+    """Refuse options whose values do not fit the types that their configuration declares.
 
     A dataclass does not check its types itself. This function checks every field that is declared as a ``Literal``, a
     number, or an optional or a tuple of these. It leaves other fields alone. A configuration calls it first in its
@@ -22,7 +22,7 @@ def check_options(config: Any, *, infinite: Sequence[str] = ()) -> None:
         infinite: names of the fields that may be infinite; all other numbers are finite.
 
     Raises:
-        ValueError: with the option, its value, and what is allowed.
+        ValueError: if a value does not fit; the message names the option, its value, and what is allowed.
     """
     for name, kind in _kinds(type(config)).items():
         _check(name, getattr(config, name), kind, finite=name not in infinite)
@@ -32,8 +32,8 @@ def require_widths(name: str, widths: Sequence[int]) -> None:
     """Refuse a hidden layer without units.
 
     Args:
-        name: of the option, for the message.
-        widths: of the hidden layers.
+        name: name of the option, for the message.
+        widths: widths of the hidden layers.
 
     Raises:
         ValueError: if a width is below 1.
@@ -43,7 +43,7 @@ def require_widths(name: str, widths: Sequence[int]) -> None:
 
 
 def choices(config_class: type, name: str) -> tuple[Any, ...]:
-    """What a field of a configuration can be that is declared as a ``Literal``; nothing for any other field."""
+    """The values that a field declared as a ``Literal`` can have; none for any other field."""
     kind = _kinds(config_class)[name]
     return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
 
@@ -76,7 +76,7 @@ def _check(name: str, value: Any, kind: Any, *, finite: bool) -> None:
 
 
 def _is(value: Any, kind: type) -> bool:
-    """Whether a value is a number of that kind; Python takes True for one."""
+    """Whether a value is a number of that kind; a truth value is none, although Python counts it as one."""
     return isinstance(value, kind) and not isinstance(value, bool)
 
 

@@ -1,4 +1,4 @@
-"""The tank's coefficients as functions of the state, for a closure that lets them be."""
+"""The tank's coefficients over the state, for a closure in which they depend on it."""
 
 from typing import cast
 
@@ -31,9 +31,9 @@ CLOSURE_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 
 @torch.no_grad()
 def coefficients(snapshot: Snapshot) -> Figure:
-    """U_s, U_HX and K_JT over each feature of the closure, the others at their mean in the last episode.
+    """U_s, U_HX and K_JT over each feature of the closure, with the other features at their mean in the last episode.
 
-    Pale is what the episode did not visit; the axes go half as far again on both sides.
+    Curves are pale where the episode did not visit; the axes extend the visited range by half of it on both sides.
     """
     plant = cast(CryogenicTank, snapshot.plant)
     seen = visited_features(plant, snapshot.record)

@@ -32,14 +32,14 @@ class CyclicLoad:
 
     with a_j uniform on 1 ± 0.1 and n uniform on ±√3 σ_n.
 
-    Note: the paper prints no width of the peaks; here T_h/8, which leaves the load near its minimum for almost half of
-    the orbit.
+    Note: the paper prints no width of the peaks; here it is T_h/8, which leaves the load near its minimum for almost
+    half of the orbit.
 
     Args:
-        minimum: Q_min [W], not negative.
-        peak: nominal height Q̂ of a peak above it [W], not negative.
+        minimum: least load Q_min [W], not negative.
+        peak: nominal height Q̂ of a peak above the least load [W], not negative.
         variation: largest relative departure of a peak's height, in [0, 1].
-        period: T_h [s], positive.
+        period: period T_h of the orbit [s], positive.
         width: standard deviation σ of a peak in time [s], positive.
         noise: standard deviation σ_n of the noise [W], not negative; it is white, one value per sample.
 
@@ -78,7 +78,7 @@ class CyclicLoad:
 
         Args:
             batch: number of episodes.
-            n_steps: samples of each.
+            n_steps: number of samples of each episode.
             dt: sampling interval [s].
             generator: source of the peaks' heights and of the noise.
 
@@ -89,7 +89,7 @@ class CyclicLoad:
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         t = dt * torch.arange(n_steps, **like)
         orbit = (t / self.period).floor().long()
-        # Peaks of neighbouring orbits count as far as six standard deviations, e^{−18} = 1.5e-8 of their height.
+        # Peaks of other orbits count up to a distance of six standard deviations, e^{−18} = 1.5e-8 of their height.
         reach = math.ceil(6.0 * self.width / self.period)
         peaks = int(orbit[-1]) + 1 + 2 * reach
         height = 1.0 + self.variation * (2.0 * torch.rand(batch, peaks, generator=generator, **like) - 1.0)

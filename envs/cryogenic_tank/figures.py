@@ -37,12 +37,12 @@ from rt_torchrl.figures.style import (
 )
 
 POINTS = 720
-"""Groups of samples a record is drawn in at most: ten minutes each in five days, a ninth of an orbit."""
+"""Greatest number of groups of samples in a drawn record: in five days, ten minutes each, a ninth of an orbit."""
 DAY = 86_400.0
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
-    """Every figure of the tank, by name; ``closure_weights`` replaces the general one, which knows no units."""
+    """Every figure of the tank, by name; its ``closure_weights`` replaces the general figure, which knows no units."""
     drawn = {figure.__name__: figure(snapshot) for figure in (tank, heat_exchanger, vent_path)}
     if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
         drawn["closure_weights"] = closure_weights(snapshot, LABELS)
@@ -55,8 +55,8 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
 def tank(snapshot: Snapshot) -> Figure:
     """The last episode: pressure around its set point, masses, wall, vent and load (paper, fig. 21a-b).
 
-    A record of more than ``POINTS`` samples is drawn in groups, with the mean of each and the range within it. The
-    axes hold the real tank and no more than as much again above and below it: a twin that is far off leaves them.
+    A record of more than ``POINTS`` samples is drawn in groups, each with its mean and range. The axes hold the real
+    tank and at most its height again above and below it, so that a twin that is far off leaves them.
     """
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     real = _quantities(plant, record.states, record.actions, plant.closure)
@@ -91,7 +91,7 @@ def tank(snapshot: Snapshot) -> Figure:
 def _quantities(
     plant: CryogenicTank, states: Float[Tensor, "n_plus_1 3"], actions: Float[Tensor, "n 1"], closure: nn.Module
 ) -> dict[str, Float[Tensor, " n"]]:
-    """What there is to see of a trajectory at the start of every interval, by label."""
+    """The quantities that are drawn of a trajectory, at the start of every interval, by label."""
     T_s, V_l, p = states[:-1].unbind(-1)
     now = plant.saturation(p)
     return {
@@ -127,13 +127,13 @@ def _means(group: int, *series: Float[np.ndarray, " n"]) -> list[Float[np.ndarra
 
 @torch.no_grad()
 def heat_exchanger(snapshot: Snapshot) -> Figure:
-    """Heat the exchanger takes and load the vent holds over Δp_V at the set point, for each closure.
+    """Heat taken by the exchanger and load held by the vent over Δp_V at the set point, for each closure.
 
-    Below, how often the last episode had each pressure drop: a twin can only know what was visited; drops outside
-    their range are pale.
+    The lowest panel shows how often the last episode had each pressure drop, because a twin can only know what was
+    visited. Curves are pale outside the range of those drops.
     """
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
-    # Denser towards the shut valve, where the flow goes with the root of the drop.
+    # The drops are denser towards the shut valve, where the flow is proportional to their root.
     drop = plant.actions[0].high * torch.linspace(0.0, 1.0, 201, dtype=torch.float64) ** 2
     drop = drop.to(record.states.device)
     state = plant.state_at(torch.full_like(drop, plant.set_point))
@@ -161,7 +161,7 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
 
 
 def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-    """p − p_1 [Pa], less than the action where the back pressure stops it."""
+    """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
     return p - plant.valve_outlet(p, actions[:, 0])
 
@@ -208,8 +208,8 @@ class VentPath(NamedTuple):
 
     @classmethod
     def of(cls, fluid: str, p: float, drop: float, effectiveness: float) -> "VentPath":
-        """From CoolProp."""
-        import CoolProp.CoolProp as CP  # here, because it takes a second to load
+        """The path of a fluid from the tank's pressure p [Pa] over a pressure drop [Pa], computed by CoolProp."""
+        import CoolProp.CoolProp as CP  # imported here, because it takes a second to load
 
         fluid_state = CP.AbstractState("HEOS", fluid)
 
@@ -218,7 +218,7 @@ class VentPath(NamedTuple):
             return fluid_state.smass(), fluid_state.T(), fluid_state.hmass()
 
         def mixed(p: float, h: float) -> tuple[float, float]:
-            """s and T of the mixture of enthalpy h, between its two ends."""
+            """Entropy s and temperature T of the mixture of enthalpy h at the pressure p."""
             (s_l, T, h_l), (s_v, _, h_v) = (at(CP.PQ_INPUTS, p, quality) for quality in (0.0, 1.0))
             return s_l + (h - h_l) / (h_v - h_l) * (s_v - s_l), T
 
@@ -227,7 +227,7 @@ class VentPath(NamedTuple):
         valve = np.array([mixed(between, h_1) for between in np.linspace(p, p - drop, 21)]).T
         latent = h_3 - h_1
         s_out = mixed(p - drop, h_1 + effectiveness * latent)[0]
-        # Up to where CoolProp's saturation solver is sure to succeed.
+        # The heights end where CoolProp's saturation solver is still sure to succeed.
         heights = np.linspace(fluid_state.trivial_keyed_output(CP.iT_triple), fluid_state.T_critical() - 0.01, 300)
         sides = [[at(CP.QT_INPUTS, quality, T)[:2] for T in heights] for quality in (0.0, 1.0)]
         dome = np.array(sides[0] + sides[1][::-1]).T
@@ -248,7 +248,7 @@ def _draw_path(ax: Axes, path: VentPath) -> None:
 
 
 def _zoom(ax: Axes, path: VentPath) -> None:
-    """Span the path, number its points."""
+    """Fit the axes to the path, and number its points."""
     height, (left, right) = max(path.T[0] - path.T[1], 0.02), (1e-3 * path.s[0], 1e-3 * path.s[2])
     ax.set_ylim(path.T[1] - 0.5 * height, path.T[0] + 0.5 * height)
     ax.set_xlim(left - 0.06 * (right - left), right + 0.06 * (right - left))

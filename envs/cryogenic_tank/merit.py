@@ -1,4 +1,4 @@
-"""What the operator of a tank judges an episode by."""
+"""The quantities by which the operator of a tank judges an episode."""
 
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 SETTLED_SHARE = 0.6
 """Share of an episode after which the pressure should be held: three of five days."""
 BAND = 5e3
-"""Half width [Pa] of the band the pressure should be held in."""
+"""Half width [Pa] of the band in which the pressure should be held."""
 
 
 def merit(

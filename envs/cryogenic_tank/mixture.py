@@ -10,10 +10,10 @@ from rt_torchrl.envs.cryogenic_tank.vent import Vent
 
 
 class Conditions(NamedTuple):
-    """What the rates are made of in one state."""
+    """The quantities in one state from which the rates follow."""
 
     tank: Properties
-    slope: Properties  # of the tank's properties, per Pa
+    slope: Properties  # slopes of the tank's properties, per Pa
     wall_conductance: Tensor  # U_s A_s [W/K]
     vent: Vent
 
@@ -40,9 +40,9 @@ def mixture_rates(
         V_l: volume of the liquid [m³].
         volume: V_t [m³].
         tank: properties at the tank's pressure.
-        slope: their derivatives by pressure.
-        flow: ṁ_c that leaves as liquid [kg/s].
-        heating: Q, all that enters the enthalpy balance beside V_t ṗ [W].
+        slope: derivatives of the properties by pressure.
+        flow: flow ṁ_c that leaves as liquid [kg/s].
+        heating: sum Q of all terms of the enthalpy balance beside V_t ṗ [W].
     """
     V_v = volume - V_l
     M_V = tank.rho_l - tank.rho_v
@@ -56,5 +56,5 @@ def mixture_rates(
 
 
 def evaporation_heat(tank: Properties, flow: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    r"""Heat [W] that evaporates what fills the room of the vented liquid, ṁ_c (h_v − h_l) ρ_v/(ρ_l − ρ_v)."""
+    r"""Heat [W] that evaporates the vapour in the place of the vented liquid, ṁ_c (h_v − h_l) ρ_v/(ρ_l − ρ_v)."""
     return flow * (tank.h_v - tank.h_l) * tank.rho_v / (tank.rho_l - tank.rho_v)

@@ -1,4 +1,4 @@
-r"""Closure of the tank, its three heat-transfer and valve constants, and the paper's policy for the vent."""
+r"""Closure of the tank with three constants, of heat transfer and valve, and the paper's policy for the vent."""
 
 import torch
 from jaxtyping import Float
@@ -12,10 +12,10 @@ from rt_torchrl.plants.signal import Signal
 class ConstantCoefficients(PositiveCoefficients):
     r"""Wall-to-fluid and heat-exchanger coefficients and the valve's constant, the same in every state.
 
-    In their logarithms, because they differ by a factor of 10¹⁰ and have to travel a factor of 50.
+    The weights are logarithms, because the coefficients differ by a factor of 10¹⁰ and have to change by one of 50.
 
     Any module that maps the four features of :meth:`CryogenicTank.features` to three positive coefficients, such as a
-    perceptron with exponentials at its end, can stand in.
+    perceptron with exponentials at its end, can replace this closure.
 
     Args:
         coefficients: U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²], all positive.
@@ -30,11 +30,11 @@ class ConstantCoefficients(PositiveCoefficients):
 
     @classmethod
     def first_guess(cls, device: torch.device | str = "cpu") -> "ConstantCoefficients":
-        """Those the paper's twin starts from."""
+        """A closure with the coefficients that the paper's twin starts from."""
         return cls(torch.tensor(cls.guessed_coefficients, dtype=torch.float64, device=device))
 
     def forward(self, features: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
-        """U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²]; the features do not matter here."""
+        """U_s, U_HX [W/(m² K)] and K_JT [Pa s²/kg²]; they do not depend on the features."""
         return self.coefficients.expand(*features.shape[:-1], 3)
 
 
@@ -43,8 +43,8 @@ class CubicVentLaw(nn.Module):
 
     .. math:: \Delta p_V = \tfrac12\Delta p_{max}\big(\tanh(w_1e + w_2e^3 + w_3) + 1\big)
 
-    The trained weights are what each term contributes at the error ℓ = 3 (30 kPa), w_1ℓ, w_2ℓ³ and w_3: of the same
-    size for a good vent, where the gradient with respect to w_2 itself would be some ten times the others.
+    The trained weights are the contributions of the terms at the error ℓ = 3 (30 kPa), w_1ℓ, w_2ℓ³ and w_3. For a good
+    vent these have the same size, while the gradient with respect to w_2 itself would be some ten times the others.
 
     Args:
         action: the pressure drop and its range.

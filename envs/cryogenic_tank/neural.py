@@ -1,4 +1,4 @@
-r"""Closure of the tank with a perceptron in it."""
+r"""Closure of the tank with a perceptron."""
 
 from collections.abc import Sequence
 
@@ -16,11 +16,11 @@ class NeuralCoefficients(nn.Module):
 
     .. math:: (U_s, U_{HX}, K_{JT})_i = C_i\,2^{\tanh N_i(x)}
 
-    with the features x of :meth:`CryogenicTank.features`. Both the constants, in their logarithms, and the perceptron
-    are trained: the first guess is wrong by factors of fifty, the dependence on the state is far less.
+    with the features x of :meth:`CryogenicTank.features`. Both the logarithms of the constants and the perceptron are
+    trained: the first guess is wrong by factors of fifty, and the dependence on the state is far weaker.
 
     Args:
-        constants: where it starts from.
+        constants: constants C that the closure starts from.
         hidden: width of each hidden layer.
         generator: source of the perceptron's initial weights.
     """
@@ -38,6 +38,6 @@ class NeuralCoefficients(nn.Module):
 
 
 def first_neural_guess(plant: Plant, generator: torch.Generator, hidden: Sequence[int]) -> NeuralCoefficients:
-    """From the paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²."""
+    """A neural closure that starts at the paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²."""
     constants = ConstantCoefficients.first_guess(generator.device)
     return NeuralCoefficients(constants, hidden=hidden, generator=generator)

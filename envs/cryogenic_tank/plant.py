@@ -25,7 +25,7 @@ Wall = Literal["explicit", "exponential"]
 class CryogenicTank(Plant):
     r"""A tank of liquid hydrogen in orbit, held at pressure by venting as little of it as possible.
 
-    Wall, mass and enthalpy of the saturated mixture, with H = ρh, all properties functions of p alone:
+    The wall and the saturated mixture have these balances; H = ρh, and all properties are functions of p alone:
 
     .. math::
         m_sc_s\dot T_s = Q_h - Q_{sf}, \qquad Q_{sf} = U_sA_s\,(T_s - T),
@@ -46,21 +46,21 @@ class CryogenicTank(Plant):
 
     A pressure outside the range makes the rates NaN, which the library reports as a ``DivergenceError``.
 
-    Note: the paper prints no mass of the wall; here m_s c_s = 500 kJ/K, because a bare shell of aluminium at 27 K
+    Note: the paper prints no mass of the wall; here m_s c_s is 500 kJ/K, because a bare shell of aluminium at 27 K
     (20 kJ/K) follows the load within 5 s: too fast for an explicit step of 30 s, but not for ``wall="exponential"``.
-    Note: the paper prints U_s per area but no area; here A_s = 74.1 m², a sphere of 60 m³.
+    Note: the paper prints U_s per area but no area; here A_s is 74.1 m², that of a sphere of 60 m³.
 
-    With the explicit wall U_s must stay below 2.785 m_s c_s/(A_s dt) = 626 W/(m² K): checked for the true closure,
-    the twin starts far below it, and one that is trained beyond it diverges with an error; see :meth:`wall_rate`.
+    With the explicit wall U_s must stay below 2.785 m_s c_s/(A_s dt) = 626 W/(m² K), see :meth:`wall_rate`. The plant
+    checks the true closure; the twin starts far below the limit and diverges with an error if training exceeds it.
 
     Args:
         dt: control interval [s].
         horizon: length of an episode T_o [s].
-        closure: U_s, U_HX, K_JT of the real tank from :meth:`features`; None for the paper's constants.
+        closure: closure of the real tank, from :meth:`features` to U_s, U_HX, K_JT; None for the paper's constants.
         load: source of the heat load.
         fluid: pure fluid in the tank, by its name in CoolProp; ``ParaHydrogen`` is what hydrogen becomes when stored.
-        wall: ``explicit`` integrates the wall with the rest; ``exponential`` by its own solution, see :meth:`step`.
-        wall_heat_capacity: m_s c_s [J/K].
+        wall: ``explicit`` integrates the wall with the rest, ``exponential`` by its own solution, see :meth:`step`.
+        wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         cost_weights: α1 [-] and α2 [s/kg] of J_a. With 5000 s/kg the vented mass weighs a tenth of the tracking error
             under the random policies that a training starts from.
         error_sizes: errors of T_s [K], V_l [m³] and p [Pa] that weigh the same in J_p, α_3 = 0.05⁻² K⁻² and so on.
@@ -130,13 +130,13 @@ class CryogenicTank(Plant):
 
     @torch.no_grad()
     def wall_rate(self, closure: nn.Module) -> float:
-        """U_s A_s/(m_s c_s) [1/s] of a closure at the set point, with the wall at the fluid's temperature."""
+        """Decay rate U_s A_s/(m_s c_s) [1/s] of a closure's wall at the set point and at the fluid's temperature."""
         state = self.state_at(self.error_sizes.new_tensor(self.set_point))
         now = self._conditions(state, torch.zeros_like(state[:1]), closure)
         return now.wall_conductance.item() / self.wall_heat_capacity
 
     def state_at(self, p: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
-        """Filled as at the start, the wall as cold as the fluid; a ValueError if p [Pa] is outside the table."""
+        """The state at p [Pa] with the first fill and a wall as cold as the fluid; p must be within the table."""
         self.saturation.check(p)
         return torch.stack([self.saturation(p).T, torch.full_like(p, self.first_fill * self.volume), p], -1)
 
@@ -153,11 +153,11 @@ class CryogenicTank(Plant):
         r"""Rates of T_s, V_l and p, the differentiated balances of the class (paper, section 5.3).
 
         Args:
-            t: time [s]; unused, the load enters through ``exogenous``.
-            state: see the class.
+            t: time [s], unused; the load enters through ``exogenous``.
+            state: states in the order of the class.
             action: pressure drop Δp_V [Pa].
             exogenous: heat load Q_h [W].
-            closure: U_s, U_HX, K_JT from :meth:`features`.
+            closure: closure from :meth:`features` to U_s, U_HX, K_JT.
         """
         now = self._conditions(state, action, closure)
         Q_sf = now.wall_conductance * (state[..., 0] - now.tank.T)
@@ -174,10 +174,10 @@ class CryogenicTank(Plant):
     ) -> Transition:
         r"""One control interval; with ``wall="exponential"`` the wall follows :func:`wall_rise`.
 
-        T and U_s are held at what they are at the start, and the mixture receives the mean of Q_sf that closes the
-        wall's balance, :math:`Q_h - m_sc_s\Delta T_s/\Delta t`: no energy is lost, and a wall of any heat capacity is
-        stable. T_s then lags behind T by up to one interval, about 1e-4 K. The engine ``odeint_adjoint`` integrates
-        the vector field itself, wall included, and so still needs a wall that is stable.
+        T and U_s keep their values at the start, and the mixture receives the mean of Q_sf that closes the wall's
+        balance, :math:`Q_h - m_sc_s\Delta T_s/\Delta t`. No energy is lost, and a wall of any heat capacity is stable.
+        T_s then lags behind T by up to one interval, about 1e-4 K. The engine ``odeint_adjoint`` integrates the vector
+        field itself with the wall, and therefore still needs a wall that is stable.
         """
         if self.wall == "explicit":
             return super().step(t, state, command, exogenous, closure)
@@ -198,7 +198,7 @@ class CryogenicTank(Plant):
     def features(
         self, state: Float[Tensor, "*batch 3"], action: Float[Tensor, "*batch 1"], T: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch 4"]:
-        """What a closure sees, all of order one: p/p̃, V_l/V_t, (T_s − T)/0.05 K and Δp_V/Δp_max."""
+        """The features of a closure, all of order one: p/p̃, V_l/V_t, (T_s − T)/0.05 K and Δp_V/Δp_max."""
         T_s, V_l, p = state.unbind(-1)
         superheat, opening = (T_s - T) / self.superheat_unit, action[..., 0] / self.actions[0].high
         return torch.stack([p / self.set_point, V_l / self.volume, superheat, opening], -1)
@@ -206,7 +206,7 @@ class CryogenicTank(Plant):
     def _conditions(self, state: Tensor, action: Tensor, closure: nn.Module) -> Conditions:
         p = state[..., 2]
         p_1 = self.valve_outlet(p, action[..., 0])
-        # Both pressures side by side: one gather in the table.
+        # Both pressures stand side by side, so that one gather in the table serves both.
         values, slopes = self.saturation.with_slopes(torch.stack([p, p_1], -1))
         tank, line = (Properties(*(x[..., k] for x in values)) for k in (0, 1))
         slope = Properties(*(x[..., 0] for x in slopes))
@@ -215,15 +215,15 @@ class CryogenicTank(Plant):
         return Conditions(tank, slope, U_s * self.wall_area, vented)
 
     def _mixture_rates(self, V_l: Tensor, now: Conditions, Q_sf: Tensor) -> tuple[Tensor, Tensor]:
-        """V̇_l, ṗ. Note: the paper adds ṁ_hΔh_h; here −Q_HX, because the injected liquid comes back colder."""
+        """V̇_l and ṗ. Note: the paper adds ṁ_hΔh_h; here −Q_HX is added, because injected liquid comes back colder."""
         heating = Q_sf - now.vent.flow * now.tank.h_l - now.vent.heat
         return mixture_rates(V_l, self.volume, now.tank, now.slope, now.vent.flow, heating)
 
     def valve_outlet(self, p: Float[Tensor, "*batch"], drop: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """p_1 = p − Δp_V [Pa], not below the back pressure of the vent line."""
+        """The pressure p_1 = p − Δp_V [Pa] behind the valve, not below the back pressure of the vent line."""
         return torch.where(p - drop < self.back_pressure, self.back_pressure, p - drop)
 
-    # What figures show
+    # Quantities for figures
 
     def vent(self, state: Float[Tensor, "*batch 3"], action: Float[Tensor, "*batch 1"], closure: nn.Module) -> Vent:
         """Vented flow, heat taken and pump flow in a state, for a pressure drop Δp_V [Pa]."""
@@ -232,7 +232,7 @@ class CryogenicTank(Plant):
     def held_load(
         self, state: Float[Tensor, "*batch 3"], action: Float[Tensor, "*batch 1"], closure: nn.Module
     ) -> Float[Tensor, "*batch"]:
-        """Load [W] at which the pressure stands still: Q_HX and the heat of evaporation of the refilling vapour."""
+        """Load [W] at which the pressure stands still: Q_HX plus the heat that evaporates the refilling vapour."""
         now = self._conditions(state, action, closure)
         return now.vent.heat + evaporation_heat(now.tank, now.vent.flow)
 
@@ -248,7 +248,7 @@ class CryogenicTank(Plant):
     def observe(
         self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 3"], exogenous: Float[Tensor, "*#batch 1"]
     ) -> Float[Tensor, "*batch 1"]:
-        """e = (p − p̃)/10 kPa; the load is not seen."""
+        """The error e = (p − p̃)/10 kPa; the load is not observed."""
         return (state[..., 2:] - self.set_point) / self.error_unit
 
     def running_cost(
@@ -258,10 +258,10 @@ class CryogenicTank(Plant):
         applied: Float[Tensor, "*batch 1"],
         exogenous: Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch"]:
-        r"""α_1 e² + α_2 ṁ_c (paper, eq. cryo_J_a).
+        r"""The cost α_1 e² + α_2 ṁ_c (paper, eq. cryo_J_a).
 
-        Note: the paper lets the twin's own valve give ṁ_c; here a valve of the rated K_JT gives it, in the real plant
-        and in the twin, because a cost is a function of state and action alone.
+        Note: in the paper ṁ_c is that of the twin's own valve; here it is that of a valve with the rated K_JT, in the
+        real plant and in the twin, because a cost is a function of state and action alone.
         """
         p = state[..., 2]
         drop = p - self.valve_outlet(p, applied[..., 0])
@@ -272,7 +272,7 @@ class CryogenicTank(Plant):
     def discrepancy(
         self, state: Float[Tensor, "*#batch 3"], measured: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch"]:
-        r"""Squared errors of T_s, V_l and p over their natural sizes, summed, over T_o (paper, eq. of J_p)."""
+        r"""The sum of the squared errors of T_s, V_l and p over their natural sizes, over T_o (paper, eq. of J_p)."""
         return (((state - measured) / self.error_sizes) ** 2).sum(-1) / self.horizon
 
     def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
@@ -281,7 +281,7 @@ class CryogenicTank(Plant):
     # Randomness
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 3"]:
-        """p ~ N(500, 25²) kPa, 70 % full, the wall at the temperature of saturation."""
+        """Initial states with p ~ N(500, 25²) kPa, 70 % full, and the wall at the temperature of saturation."""
         spread = torch.randn(batch, generator=generator, dtype=torch.float64, device=generator.device)
         return self.state_at(self.set_point + self.first_pressure_spread * spread)
 
@@ -290,11 +290,11 @@ class CryogenicTank(Plant):
         return self.load.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1)
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        """The paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²; draws nothing."""
+        """The paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²; nothing is drawn."""
         return ConstantCoefficients.first_guess(generator.device)
 
     make_neural_closure = first_neural_guess
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """The paper's policy, three weights."""
+        """The paper's policy with three weights."""
         return CubicVentLaw(self.actions[0], generator=generator)

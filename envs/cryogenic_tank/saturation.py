@@ -17,14 +17,14 @@ from scipy.interpolate import make_interp_spline
 from torch import Tensor, nn
 
 CELLS = 128
-"""Pieces of the spline: values to 1e-7 of their maximum over 80 … 900 kPa of hydrogen, slopes to 2e-6."""
+"""Number of pieces of the spline: over 80 … 900 kPa of hydrogen values err by 1e-7 of their maximum, slopes by 2e-6."""
 DEGREE = 5
 LAYOUT = 1
 """Version of the cached array; a file of another version is fitted again."""
 TOLERANCE = 1e-6
-"""Greatest error of a value between the nodes, over its maximum, with which a fit is accepted."""
+"""Greatest error of a value between the nodes, over its maximum, at which a fit is accepted."""
 CRITICAL_SHARE = 0.95
-"""Share of the critical pressure up to which a fit is tried: above, slopes grow without bound."""
+"""Share of the critical pressure up to which a fit is tried: above it, slopes grow without bound."""
 
 
 class Properties(NamedTuple):
@@ -35,31 +35,31 @@ class Properties(NamedTuple):
     rho_v: Tensor  # [kg/m³]
     h_l: Tensor  # [J/kg]
     h_v: Tensor  # [J/kg]
-    c_p: Tensor  # of the liquid [J/(kg K)]
+    c_p: Tensor  # heat capacity of the liquid [J/(kg K)]
 
 
 class Saturation(nn.Module):
     r"""T, ρ_l, ρ_v, h_l, h_v and c_p,l of a pure fluid over its saturation pressure.
 
-    Quintic splines in ln p through the values of CoolProp, on an even grid: the cell of a pressure is a floor, all
-    properties come with one gather, and Horner's rule gives values and slopes,
+    The functions are quintic splines in ln p through the values of CoolProp on an even grid. A floor gives the cell of
+    a pressure, one gather the coefficients of all properties, and Horner's rule their values and slopes,
 
     .. math:: f(p) = \sum_{m=0}^5 c_{im} u^m, \quad u = \frac{\ln(p/p_{lo})}{h} - i, \qquad
         \frac{df}{dp} = \frac{1}{hp}\sum_{m=1}^5 m\,c_{im} u^{m-1}.
 
-    Four continuous derivatives: the plant needs one, its adjoint a second. The fit is made from CoolProp when it is
-    first needed, takes about a second, most of it to load CoolProp, and is kept in the user's cache.
+    Four derivatives are continuous; the plant needs one, and its adjoint a second. The fit to CoolProp is made when it
+    is first needed, and is kept in the user's cache. It takes about a second, most of it to load CoolProp.
 
-    Outside its range a property is NaN, never that of the nearest end: a trajectory that leaves the range stops with
-    the library's ``DivergenceError``. Where a pressure is at hand as a number, :meth:`check` says so at once.
+    Outside the range of pressure a property is NaN, never its value at the nearest end. A trajectory that leaves the
+    range therefore stops with the library's ``DivergenceError``. :meth:`check` refuses such pressures at once.
 
     Args:
-        fluid: a pure fluid by its name in CoolProp, such as ``Hydrogen`` (normal) or ``ParaHydrogen``.
+        fluid: name of a pure fluid in CoolProp, such as ``Hydrogen`` (normal) or ``ParaHydrogen``.
         low: least pressure [Pa].
         high: greatest pressure [Pa].
 
     Raises:
-        ValueError: if CoolProp does not know the fluid, it is a mixture, or the range is not one of its saturation.
+        ValueError: if CoolProp does not know the fluid, it is a mixture, or it does not boil over the whole range.
 
     Source: C. de Boor, *A Practical Guide to Splines*, chapter IX; I. H. Bell et al., *Ind. Eng. Chem. Res.* 53 (2014)
     2498 (CoolProp).
@@ -83,7 +83,7 @@ class Saturation(nn.Module):
         """Properties at the pressure p [Pa] and their derivatives along the saturation line [unit/Pa]."""
         x = torch.log(p / self.low) / self._width
         x = torch.where(self._within(p), x, math.nan)
-        # Clamped as an integer, where no derivative is lost: what a NaN becomes as an index is undefined.
+        # The integer is clamped, which loses no derivative, because a NaN has no defined value as an index.
         cell = x.floor().long().clamp(0, CELLS - 1)
         u = (x - cell).unsqueeze(-1)
         c = self.table[cell]
@@ -98,7 +98,7 @@ class Saturation(nn.Module):
         """Refuse pressures outside the range.
 
         Raises:
-            ValueError: with the worst of them and the range.
+            ValueError: if there is one; the message holds the worst of them and the range.
         """
         outside = ~self._within(p)
         if outside.any():
@@ -119,7 +119,7 @@ class Saturation(nn.Module):
 @cache
 def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
     """Spline coefficients [cell, power, property], from memory, from the user's cache, or fitted."""
-    # Another CoolProp may have other equations of state.
+    # Another version of CoolProp may have other equations of state.
     path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
     table = _load(path, low, high)
     if table is None:
@@ -130,12 +130,12 @@ def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cell
 
 
 def cache_folder() -> Path:
-    """Where fits are kept: the user's cache folder."""
+    """The folder where fits are kept, in the user's cache."""
     return user_cache_path("rt_torchrl")
 
 
 def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 6"] | None:
-    """The cached table; None if there is none, or it cannot be read or is not what its name says."""
+    """The cached table; None if there is no table, or it cannot be read or does not agree with its name."""
     try:
         with np.load(path, allow_pickle=False) as file:
             table, limits = file["table"], file["range"]
@@ -154,14 +154,14 @@ def _save(path: Path, table: Float[np.ndarray, "cells 6 6"], low: float, high: f
             np.savez(file, table=table, range=np.array([low, high]))
         os.replace(file.name, path)
     except OSError:
-        return  # A folder that cannot be written costs the next process a second, not this one its fit.
+        return  # Without the file the next process needs a second more; this one has its fit.
 
 
 def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
     """Fit the spline coefficients to CoolProp and compare them with it between the nodes.
 
     Raises:
-        ValueError: as :class:`Saturation`, or if the fit misses ``TOLERANCE``.
+        ValueError: as in :class:`Saturation`, or if the fit misses ``TOLERANCE``.
     """
     fluid_state = _open_fluid(fluid, low, high)
     nodes = np.linspace(math.log(low), math.log(high), CELLS + 1)
@@ -182,8 +182,8 @@ def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
 
 
 def _open_fluid(fluid: str, low: float, high: float):
-    """CoolProp's state of a pure fluid, after a check that the range lies between triple and critical point."""
-    import CoolProp.CoolProp as CP  # here, because it takes a second to load and a cached fit does without
+    """CoolProp's state of a pure fluid, after a check that the range lies between its triple and critical points."""
+    import CoolProp.CoolProp as CP  # imported here: loading takes a second, and a cached fit does not need it
 
     try:
         fluid_state = CP.AbstractState("HEOS", fluid)

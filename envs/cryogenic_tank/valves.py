@@ -1,4 +1,4 @@
-"""Classical controllers of the tank's vent, to compare learned policies with."""
+"""Classical controllers of the tank's vent, which learned policies are compared with."""
 
 import torch
 from jaxtyping import Float
@@ -9,11 +9,11 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
 
 class OnOffValve(ClassicalController):
-    r"""A valve with hysteresis: opens to one fixed drop above :math:`\tilde p + h`, shuts below :math:`\tilde p - h`.
+    r"""A hysteresis valve that opens to a fixed drop above :math:`\tilde p + h` and shuts below :math:`\tilde p - h`.
 
-    It starts shut. h = 1 kPa is not tuned: a narrower band is always a little better for J_a, and wears the valve out.
-    The drop is: :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads leaves it where it starts, at the end of
-    the range.
+    The valve starts shut. h = 1 kPa is not tuned: a narrower band always lowers J_a a little, but wears the valve out.
+    The drop is tuned: :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads leaves it where it starts, at the end
+    of the range.
     """
 
     plant: CryogenicTank
@@ -35,10 +35,10 @@ class PIValve(ClassicalController):
 
     .. math:: \Delta p_V = K_P\,(p - \tilde p) + K_I\int(p - \tilde p)\,dt
 
-    Started from ``placed_gains``, a time constant of τ = 12 h and K_I = K_P/(4τ) (an open valve takes up 1.3 W per kPa
-    of drop, and 1 W raises the pressure of the tank at the start by 8.3 Pa/h),
-    :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads goes for a tenfold gain and gives the integral up: a load
-    of 129 W is then held 1 kPa above the target, and an integral would only overshoot after starts that are 25 kPa off.
+    The ``placed_gains`` give a time constant of τ = 12 h and K_I = K_P/(4τ): an open valve takes up 1.3 W per kPa of
+    drop, and 1 W raises the pressure of the tank at the start by 8.3 Pa/h. From there
+    :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads finds a tenfold gain and almost no integral. A load of
+    129 W is then held 1 kPa above the target, and an integral would only overshoot after starts that are 25 kPa off.
     """
 
     plant: CryogenicTank
@@ -52,6 +52,6 @@ class PIValve(ClassicalController):
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
         K_P, K_I = self.log_gains.exp().unbind()
         error = state[..., 2:] - self.plant.set_point
-        # What the integral contributes to the drop stays within the range of the valve.
+        # The contribution of the integral to the drop stays within the range of the valve.
         integral = (memory + K_I * error * self.plant.dt).clamp(self.low_action, self.high_action)
         return K_P * error + integral, integral

@@ -14,11 +14,11 @@ EXCHANGER_AREA = 200 * math.pi * 0.005 * 2.0
 LAMINAR_DROP = 100.0
 """δ [Pa]: pressure drop below which the flow through the valve is laminar."""
 ROUNDING_DROP = 1.0
-"""Pressure drop [Pa] below which a difference of two temperatures is no better than their slope."""
+"""Pressure drop [Pa] below which a difference of two temperatures is no more accurate than their slope."""
 
 
 class Vent(NamedTuple):
-    """What the vent takes from the tank."""
+    """The flows and the heat that the vent takes from the tank."""
 
     flow: Tensor  # ṁ_c [kg/s]
     heat: Tensor  # Q_HX [W], positive: it cools the liquid
@@ -44,14 +44,14 @@ def vent(
     with :math:`\Delta h_c = h_v(p_1) - h_l(p)` and :math:`\Delta T = T(p) - T(p_1)`. The ratio ΔT/ṁ_c is taken as
     (ΔT/Δp_V)/(ṁ_c/Δp_V), both of which have a limit when the valve shuts.
 
-    Note: the paper prints the exchanged heat as ε c_p ΔT; here ε ṁ_c Δh_c, which is its ε ṁ_h c_p ΔT with the missing
-    ṁ_h, because this form stays finite when the valve shuts.
+    Note: the paper prints the exchanged heat as ε c_p ΔT; here it is ε ṁ_c Δh_c, which equals ε ṁ_h c_p ΔT with the
+    missing ṁ_h, because this form stays finite when the valve shuts.
 
     Args:
-        drop: p − p_1 [Pa], not negative.
+        drop: pressure drop p − p_1 [Pa], not negative.
         tank: properties at the tank's pressure p.
         line: properties behind the valve, at p_1.
-        T_slope: dT/dp at p [K/Pa], the limit of ΔT/Δp_V.
+        T_slope: slope dT/dp at p [K/Pa], the limit of ΔT/Δp_V.
         U_HX: heat transfer coefficient of the exchanger [W/(m² K)].
         K_JT: constant of the valve [Pa s²/kg²].
     """
@@ -65,9 +65,10 @@ def vent(
 
 
 def valve_conductance(drop: Float[Tensor, "*batch"], K_JT: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
-    r"""ṁ_c/Δp_V [kg/(s Pa)] of the valve, :math:`\big(K_{JT}\sqrt{\Delta p_V^2 + \delta^2}\big)^{-1/2}`.
+    r"""Conductance ṁ_c/Δp_V [kg/(s Pa)] of the valve, :math:`\big(K_{JT}\sqrt{\Delta p_V^2 + \delta^2}\big)^{-1/2}`.
 
-    Note: the paper prints ṁ_c = √(Δp_V/K_JT); here with δ = 100 Pa, because the root has an infinite slope at zero. The
-    flow is then proportional to the drop far below δ, as laminar flow is, and 8e-6 less than the root at 18 kPa.
+    Note: the paper prints ṁ_c = √(Δp_V/K_JT), the case δ = 0; here δ is 100 Pa, because the root has an infinite slope
+    at zero. The flow is then proportional to the drop far below δ, as laminar flow is, and 8e-6 less than the root at
+    18 kPa.
     """
     return (K_JT * (drop**2 + LAMINAR_DROP**2) ** 0.5) ** -0.5

@@ -1,4 +1,4 @@
-r"""The wall's own equation, solved exactly over a control interval."""
+r"""The exact solution of the wall's own equation over a control interval."""
 
 import torch
 from jaxtyping import Float
@@ -12,15 +12,15 @@ def wall_rise(
     heat_capacity: float,
     dt: float,
 ) -> Float[Tensor, "*batch"]:
-    r"""T_s(t + Δt) − T_s(t) [K] of :math:`C\dot T_s = Q_h - G\,(T_s - T)` with T and G held,
+    r"""Rise T_s(t + Δt) − T_s(t) [K] of :math:`C\dot T_s = Q_h - G\,(T_s - T)` with T and G held,
 
     .. math:: \big(Q_h/G - (T_s - T)\big)\,\big(1 - e^{-G\Delta t/C}\big).
 
     Args:
-        superheat: T_s − T at the start [K].
-        load: Q_h [W].
-        conductance: G = U_s A_s [W/K].
-        heat_capacity: C = m_s c_s [J/K].
-        dt: Δt [s].
+        superheat: superheat T_s − T at the start [K].
+        load: heat load Q_h [W].
+        conductance: conductance G = U_s A_s [W/K].
+        heat_capacity: heat capacity C = m_s c_s [J/K].
+        dt: length Δt of the interval [s].
     """
     return -torch.expm1(-conductance * dt / heat_capacity) * (load / conductance - superheat)

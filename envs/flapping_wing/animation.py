@@ -1,4 +1,4 @@
-"""The last flight as a moving picture."""
+"""The last flight as an animation."""
 
 from pathlib import Path
 from typing import cast
@@ -13,7 +13,7 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array, caption, last_episode, legend_below, panels
 
 FRAMES = 125
-"""Frames at most: the paper's five seconds in real time."""
+"""Greatest number of frames, for the paper's five seconds in real time."""
 RATE = 25
 """Frames per second."""
 
@@ -21,16 +21,16 @@ RATE = 25
 def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     """Write the last real flight as a GIF, in real time if it lasts five seconds.
 
-    The drone is drawn enlarged: its body, its stroke plane pitched by β_w and as long as A_φ allows with the normal
-    that it is pushed along, and the wing at its phase in the stroke. At 25 frames per second a beat of 20 Hz looks like
-    one of 5 Hz.
+    The drone is drawn enlarged: its body, its stroke plane with the pitch β_w and a length proportional to A_φ, the
+    normal along which it is pushed, and the wing at its phase in the stroke. At 25 frames per second a beat of 20 Hz
+    looks like a beat of 5 Hz.
 
     Args:
-        snapshot: has the flight.
-        path: of the file, which ends in ``.gif``.
+        snapshot: snapshot with the flight.
+        path: path of the file, which ends in ``.gif``.
 
     Returns:
-        The path.
+        The path of the file.
 
     Raises:
         ValueError: if the file has another suffix.
@@ -55,7 +55,7 @@ class _Scene:
     def __init__(self, snapshot: Snapshot):
         self.plant = cast(FlappingWing, snapshot.plant)
         self.place = array(snapshot.record.states)[:, :2]
-        # The sample at the end has no interval of its own; it shows the last one.
+        # The sample at the end has no interval of its own; it shows the last interval.
         last = len(snapshot.record.actions) - 1
         held = np.minimum(np.arange(len(self.place)), last)
         self.actions, self.wind = array(snapshot.record.actions)[held], array(snapshot.record.exogenous)[held, 0]
@@ -64,7 +64,7 @@ class _Scene:
         FigureCanvasAgg(self.figure)
         self._draw_still()
         self._prepare_moving()
-        # The layout is that of the first frame: nothing may jump, and it takes longer than the drawing.
+        # The layout of the first frame is kept, because nothing may jump and a layout takes longer than the drawing.
         self.show(0)
         self.figure.draw_without_rendering()
         self.figure.set_layout_engine("none")

@@ -37,17 +37,17 @@ class GaussianGust:
         \omega_k = \frac{2\pi k}{P}, \quad
         c_k = (2 - \delta_{k0})\,\frac{\sqrt{2\pi}\,\sigma_f}{P}\,e^{-\omega_k^2\sigma_f^2/2},
 
-    with a_k, b_k standard normal: circulant embedding, with the eigenvalues of the circulant in closed form. By
-    Poisson's sum the covariance of the series is Σ_m κ(τ + mP), which over the record is κ(τ) to e^{−40}, below
-    rounding, and so is what the series loses by its end at ω_K σ_f = 9. Five seconds of the paper's wind need 17
-    harmonics, where a Cholesky factor would have 10⁸ entries. A refined dt samples the same function of time.
+    with a_k, b_k standard normal. This is circulant embedding, with the eigenvalues of the circulant in closed form. By
+    Poisson's sum the covariance of the series is Σ_m κ(τ + mP). Over the record it differs from κ(τ) by e^{−40}, which
+    is below rounding; the end of the series at ω_K σ_f = 9 costs no more. Five seconds of the paper's wind need 17
+    harmonics, while a Cholesky factor would have 10⁸ entries. A smaller dt samples the same function of time.
 
-    Note: the paper prints no variance; here 1 (m/s)², the kernel as it stands.
+    Note: the paper prints no variance; here it is 1 (m/s)², that of the kernel as printed.
 
     Args:
         mean: mean headwind ū [m/s]; positive blows towards −x.
         std: standard deviation σ_u [m/s], not negative.
-        time_scale: σ_f [s], positive.
+        time_scale: time scale σ_f of the kernel [s], positive.
 
     Raises:
         ValueError: if an argument is out of its range.
@@ -78,7 +78,7 @@ class GaussianGust:
 
         Args:
             batch: number of episodes.
-            n_steps: samples of each.
+            n_steps: number of samples of each episode.
             dt: sampling interval [s].
             generator: source of the coefficients a_k and b_k.
 
@@ -87,7 +87,7 @@ class GaussianGust:
         """
         require_request(batch, n_steps, dt)
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
-        reach = 9.0  # e^{−9²/2} = e^{−40}: where kernel and spectrum are below rounding
+        reach = 9.0  # kernel and spectrum are below rounding there: e^{−9²/2} = e^{−40}
         period = n_steps * dt + reach * self.time_scale
         k = torch.arange(math.ceil(reach * period / (2.0 * math.pi * self.time_scale)) + 1, **like)
         omega = 2.0 * math.pi * k / period

@@ -39,7 +39,7 @@ from rt_torchrl.figures.style import (
 
 POLAR_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 SPAN_SHARE = 0.7
-"""Where along the wing, from root 0 to tip 1, the angle of attack is looked at: the outer wing makes the force."""
+"""Place of the angle of attack along the wing, from root 0 to tip 1; the outer wing makes most of the force."""
 BIN = 5.0
 """Width of the histogram of visited angles [deg]."""
 
@@ -50,7 +50,7 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
 
 
 def flight_path(snapshot: Snapshot) -> Figure:
-    """The last flight in the vertical plane with the wind at each second; wind and distance to the target in time.
+    """The last flight in the vertical plane with the wind at each second; wind and distance to the target over time.
 
     The axes span the real flight and the target; a twin that flies elsewhere leaves them.
     """
@@ -74,7 +74,7 @@ def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label="real")
     ax.plot(*real[0, :2], "s", color=REAL, markersize=7, label="start")
     ax.plot(*array(plant.target), "*", color=REFERENCE, markersize=15, label="target")
-    # Not plotted but added, so that the axes do not grow to hold it.
+    # The line is added instead of plotted, so that the axes do not grow to hold it.
     ax.add_artist(Line2D(*twin[:, :2].T, color=TWIN, linewidth=1.0, label=twin_label(snapshot)))
     ax.margins(0.09)
     second = np.arange(round(1.0 / plant.dt), len(real), round(1.0 / plant.dt))
@@ -114,7 +114,7 @@ def _draw_wind(ax: Axes, snapshot: Snapshot) -> None:
     if snapshot.large_scale is not None:
         ax.plot(time, array(snapshot.large_scale)[:, 0], color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
     ax.axhline(strongest, **LIMIT_LINE)
-    # On the line itself, because the legend has no room for it.
+    # The text stands on the line itself, because the legend has no room for it.
     text: dict[str, Any] = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "center"}
     text["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
     ax.annotate("strongest that can be held", (0.99, strongest), xycoords=("axes fraction", "data"), **text)
@@ -145,8 +145,8 @@ def _draw_distance(ax: Axes, snapshot: Snapshot) -> None:
 def flight(snapshot: Snapshot) -> Figure:
     """Positions, speeds and actions over time (paper, fig. 17): along x on the left, along z on the right.
 
-    The stroke plane angle is under the horizontal motion that it drives, the amplitude under the vertical one. Speeds
-    shake with the wing beat and actions answer them: drawn are their mean over each beat and the band they keep within.
+    The stroke plane angle stands under the horizontal motion that it drives, the amplitude under the vertical motion.
+    Speeds shake with the wing beat, and actions answer them; the figure shows their mean and their range in each beat.
     """
     plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
     applied = array(snapshot.record.actions)
@@ -190,10 +190,10 @@ def _mean_over_beats(beat: int, *series: Float[np.ndarray, " n"]) -> list[Float[
 
 @torch.no_grad()
 def polars(snapshot: Snapshot) -> Figure:
-    """C_L and C_D over the effective angle of attack: of the true wing, the twin and the initial twin.
+    """C_L and C_D of the true wing, the twin and the initial twin over the effective angle of attack.
 
-    Below, how often the last flight had each angle at 70 % of the span: a twin can only know what was visited. Angles
-    that no blade element had are pale.
+    The lowest panel shows how often the last flight had each angle at 70 % of the span, because a twin can only know
+    what was visited. Angles that no blade element had are pale.
     """
     visited = visited_features(snapshot)
     C = {name: closure(visited) for name, closure in closures(snapshot).items()}
@@ -228,7 +228,7 @@ def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
 
 
 def _touched(values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m"]) -> np.ndarray:
-    """Which edges border on a bin that holds a value."""
+    """Whether each edge borders on a bin that holds a value."""
     filled = np.histogram(values, edges)[0] > 0
     return np.append(filled, False) | np.append(False, filled)
 
@@ -244,7 +244,7 @@ def _draw_polars(axes: np.ndarray, snapshot: Snapshot) -> None:
 
 
 def _coefficients(snapshot: Snapshot) -> list[str]:
-    """A line for each law that has its coefficients by name."""
+    """A line for each law that names its coefficients."""
     found = {name: getattr(law, "named_coefficients", None) for name, law in closures(snapshot).items()}
     return [
         f"{name}: " + ", ".join(f"{letter} = {value:.4g}" for letter, value in named().items())
@@ -254,7 +254,7 @@ def _coefficients(snapshot: Snapshot) -> list[str]:
 
 
 def control_surfaces(snapshot: Snapshot) -> Figure:
-    """Both actions over the errors of x and of z with their rates, the other two errors at zero (paper, fig. 18)."""
+    """Both actions over the errors of x and of z and their rates; the other two errors are zero (paper, fig. 18)."""
     actions = snapshot.plant.actions
     figure, axes = panels(
         2,

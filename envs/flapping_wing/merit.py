@@ -1,4 +1,4 @@
-"""What the operator of a drone judges a flight by."""
+"""The quantities by which the operator of a drone judges a flight."""
 
 from typing import TYPE_CHECKING
 
@@ -15,15 +15,15 @@ def merit(
     applied: Float[Tensor, "batch n 2"],
     exogenous: Float[Tensor, "batch n 1"],
 ) -> dict[str, Float[Tensor, " batch"]]:
-    """Distance to the target at the end and at its least."""
+    """Distance to the target at the end of the episode, and its least value."""
     distance = (plant.target - states[..., :2]).norm(dim=-1)
     return {"final distance [m]": distance[:, -1], "least distance [m]": distance.amin(-1)}
 
 
 def categories(plant: "FlappingWing", exogenous: Float[Tensor, "batch n 1"]) -> dict[str, Bool[Tensor, " batch"]]:
-    """Whether the stroke plane turns far enough to hold the wind of the last second, when the drone should hover.
+    """Whether the stroke plane can turn far enough for the wind of the last second, when the drone should hover.
 
-    No policy stays at the target in a gust beyond that; it is blown away, and how far says nothing of the policy.
+    In a stronger gust every policy is blown away from the target, and the distance says nothing of the policy.
     """
     last = round(1.0 / plant.dt)
     held = exogenous[:, -last:, 0].amax(-1) <= plant.strongest_wind

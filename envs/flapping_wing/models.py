@@ -17,13 +17,13 @@ class QuasiSteadyPolar(PositiveCoefficients):
         C_D = b + c\,(1 - \cos2\alpha_e) = b + 2c\sin^2\alpha_e
 
     with the effective angle of attack :math:`\alpha_e` between the chord and the velocity of the element relative to
-    the air. The law takes its sine and cosine, which are the components of the direction of that velocity across and
-    along the chord: no angle is ever formed, and any other polar of the two, such as a perceptron, can stand in.
+    the air. The features are its sine and cosine, the components of the direction of that velocity across and along the
+    chord, so that no angle is computed. Any other polar of the two features, such as a perceptron, can replace the law.
 
-    The true a, b and c are those of a semi-elliptical wing, as the paper takes them from Lee et al. 2016.
+    The true a, b and c are those of a semi-elliptical wing, which the paper takes from Lee et al. 2016.
 
-    Note: the paper takes :math:`\alpha_e` from an arc cosine, which has no sign and no slope at 0 and 180 deg; here its
-    sine keeps the sign of the flow across the chord, so that the lift turns with the side the air comes from.
+    Note: the paper takes :math:`\alpha_e` from an arc cosine, which has no sign, and no slope at 0 and 180 deg; here
+    its sine keeps the sign of the flow across the chord, so that the lift turns with the side that the air comes from.
 
     Args:
         coefficients: a, b, c [-], all positive.

@@ -1,4 +1,4 @@
-r"""Closure of the flapping wing with a perceptron in it."""
+r"""Closure of the flapping wing with a perceptron."""
 
 from collections.abc import Sequence
 
@@ -12,17 +12,17 @@ from rt_torchrl.plants.plant import Plant
 
 
 class NeuralPolar(nn.Module):
-    r"""Lift and drag of a blade element whose two sides are alike, free otherwise.
+    r"""Lift and drag of a blade element with two equal sides, by a perceptron.
 
     .. math::
         C_L = C_L^{QS}(\alpha_e) + 2\sin\alpha_e\,\tanh N_L(\cos\alpha_e), \qquad
         C_D = C_D^{QS}(\alpha_e)\,e^{\tanh N_D(\cos\alpha_e)}
 
-    with the quasi-steady law QS, trained too, as the start. A flow from the other side, α_e → −α_e, turns the lift and
-    leaves the drag; there is no lift along the chord; the drag is positive.
+    with the quasi-steady law QS as the start, which is trained too. A flow from the other side, α_e → −α_e, turns the
+    lift and leaves the drag. A flow along the chord gives no lift. The drag is positive.
 
     Args:
-        law: where it starts from.
+        law: quasi-steady law that the closure starts from.
         hidden: width of each hidden layer.
         generator: source of the perceptron's initial weights.
     """
@@ -44,5 +44,5 @@ class NeuralPolar(nn.Module):
 
 
 def drawn_neural_polar(plant: Plant, generator: torch.Generator, hidden: Sequence[int]) -> NeuralPolar:
-    """From coefficients within ±50 % of the true ones, the draw of the paper's closure."""
+    """A neural closure that starts at a draw of the paper's closure, within ±50 % of the true coefficients."""
     return NeuralPolar(QuasiSteadyPolar.draw(generator), hidden=hidden, generator=generator)

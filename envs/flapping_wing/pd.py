@@ -1,4 +1,4 @@
-"""The classical controller of the drone, to compare learned policies with."""
+"""The classical controller of the drone, which learned policies are compared with."""
 
 import torch
 from jaxtyping import Float
@@ -15,12 +15,12 @@ class TrimmedPD(ClassicalController):
         A_\phi = A_0 + K_{P,z}\,(z_f - z) - K_{D,z}\,\dot z, \qquad
         \beta_w = \beta_0 - K_{P,x}\,(x_f - x) + K_{D,x}\,\dot x
 
-    with A_0 = 76.74 deg and β_0 = −12.50 deg, the trim in 1 m/s headwind. The wind itself is not measured, as for the
-    policies.
+    with A_0 = 76.74 deg and β_0 = −12.50 deg, the trim in 1 m/s headwind. Like the policies, it does not measure the
+    wind.
 
-    Started from ``placed_gains`` (a point mass with two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and
-    g of thrust per radian of β_w), :func:`~rt_torchrl.baselines.tuning.tune` on twenty gusts goes for steeper ones:
-    full stroke until the target is near.
+    The ``placed_gains`` give a point mass two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and g of
+    thrust per radian of β_w. From there :func:`~rt_torchrl.baselines.tuning.tune` on twenty gusts finds steeper gains,
+    with full stroke until the target is near.
     """
 
     plant: FlappingWing

@@ -44,18 +44,18 @@ class FlappingWing(Plant):
     e     error_rate_z         :math:`\dot e_z = -\dot z/v`                       -     about ±5
     ====  ===================  =================================================  ====  =============
 
-    Note: the paper prints no number of wings; here two, because one cannot hover within the range of A_φ: two carry the
-    weight at 77.2 deg.
+    Note: the paper prints no number of wings; here there are two, which carry the weight at 77.2 deg, because a single
+    wing cannot within the range of A_φ.
 
     Args:
         dt: control interval [s].
         horizon: length of an episode T_o [s].
-        closure: C_L and C_D of the real wings; None for the paper's.
+        closure: closure for C_L and C_D of the real wings; None for the paper's polar.
         wind: source of the headwind.
-        target: x_f and z_f [m].
-        velocity_weight: α1 of J_a.
+        target: position x_f and z_f of the target [m].
+        velocity_weight: weight α1 of J_a.
         peak: height of the Gaussian window h of J_a: 1, or the printed x_f²/2.
-        mass: of the body m_b [kg].
+        mass: mass m_b of the body [kg].
 
     Raises:
         ValueError: for a mass that is not positive, a negative weight, an unknown peak, a target that is not finite, or
@@ -69,9 +69,9 @@ class FlappingWing(Plant):
     frequency = 20.0  # f [Hz]
     pitching_amplitude = 45.0  # A_α [deg]
     wing_root = 0.0225  # R_0 [m]
-    wing_length = 0.05  # R [m], so that the tip is at R_0 + R
+    wing_length = 0.05  # R [m]; the tip is at R_0 + R
     mean_chord = 0.01  # c̄ [m]
-    span_nodes = 6  # 2e-6 m of position in 2 s against forty
+    span_nodes = 6  # positions after 2 s differ by 2e-6 m from those with forty nodes
     body_drag_area = 5e-4  # S_b C_D,b [m²]
     smallest_airspeed = 0.01  # ε [m/s], the floor of |U|
     window_width = 0.71  # σ of h [m]
@@ -95,7 +95,7 @@ class FlappingWing(Plant):
         Signal(symbol=r"\dot e_x", name="error_rate_x", unit="-"),
         Signal(symbol=r"\dot e_z", name="error_rate_z", unit="-"),
     )
-    # ℓ [m], ℓ [m], v [m/s], v [m/s]: with these the good policies have weights of 1 to 2, found at one learning rate.
+    # ℓ [m], ℓ [m], v [m/s], v [m/s]: with these, good policies have weights of 1 to 2, which suit one learning rate.
     observation_scale = (2.0, 2.0, 1.0, 1.0)
 
     target: Tensor
@@ -142,13 +142,13 @@ class FlappingWing(Plant):
         r"""Nodes r_j and weights ρ c(r_j) dr_j of both wings.
 
         With r = R_0 + R sin θ the quarter ellipse c(r) = (4c̄/π)√(1 − ((r − R_0)/R)²) is (4c̄/π) cos θ, and c dr is
-        (4c̄R/π) cos²θ dθ, smooth up to the tip: there six Gauss nodes suffice, where c(r) itself has an infinite slope.
+        (4c̄R/π) cos²θ dθ. It is smooth up to the tip, where c(r) itself has an infinite slope: six Gauss nodes suffice.
         """
         nodes, weights = np.polynomial.legendre.leggauss(self.span_nodes)
         theta = torch.from_numpy(0.25 * math.pi * (nodes + 1.0))
         area = 4.0 * self.mean_chord * self.wing_length / math.pi * theta.cos() ** 2
         self.register_buffer("radius", self.wing_root + self.wing_length * theta.sin())  # r_j [m]
-        # Two wings of ½ρ c dr each.
+        # The two wings have ½ρ c dr each.
         self.register_buffer("strip_mass", self.air_density * area * 0.25 * math.pi * torch.from_numpy(weights))
 
     def _require_resolved_step(self) -> None:
@@ -192,11 +192,11 @@ class FlappingWing(Plant):
         r"""Velocity and acceleration of the body, paper eqs. (drone_eq_x) and (drone_eq_y).
 
         Args:
-            t: time [s], the phase of the wing beat.
+            t: time [s], which gives the phase of the wing beat.
             state: position x, z [m] and velocity ẋ, ż [m/s].
             action: flapping amplitude A_φ and stroke plane angle β_w [deg].
             exogenous: headwind u_∞ [m/s].
-            closure: C_L and C_D [-] of a blade element, from (sin α_e, cos α_e).
+            closure: closure from (sin α_e, cos α_e) to C_L and C_D [-] of a blade element.
         """
         velocity = state[..., 2:]
         # The air comes with −u_∞ along x, so the body moves with ẋ + u_∞ relative to it.
@@ -211,12 +211,12 @@ class FlappingWing(Plant):
         action: Float[Tensor, "*batch 2"],
         closure: nn.Module,
     ) -> Float[Tensor, "*batch 2"]:
-        r"""F_x and F_z [N] of wings and body, which moves at ``relative`` [m/s] to the air.
+        r"""Forces F_x and F_z [N] of wings and body, which move at ``relative`` [m/s] to the air.
 
-        The velocity goes into the stroke frame by R_2(β_w) and into the flapping frame by R_3(φ); the force comes back
-        by their transposes. The lateral forces of the two wings cancel.
+        R_2(β_w) turns the velocity into the stroke frame and R_3(φ) into the flapping frame; their transposes turn the
+        force back. The lateral forces of the two wings cancel.
 
-        Note: the paper turns [ẋ, ẏ, 0]; here [ẋ + u_∞, 0, ż], because the motion is in the plane (x, z).
+        Note: the paper turns [ẋ, ẏ, 0]; here it is [ẋ + u_∞, 0, ż], because the motion is in the plane (x, z).
         """
         A_phi, beta_w = torch.deg2rad(action).unbind(-1)
         rate = 2.0 * math.pi * self.frequency
@@ -235,17 +235,17 @@ class FlappingWing(Plant):
     def _wing_force(
         self, v_x: Tensor, v_z: Tensor, phi_dot: Tensor, alpha: Tensor, closure: nn.Module
     ) -> tuple[Tensor, Tensor]:
-        r"""F_x and F_z [N] of both wings in the flapping frame, paper eqs. (drone_eq_lift) to (drone_eq_Cdrag).
+        r"""Forces F_x and F_z [N] of both wings in the flapping frame, paper eqs. (drone_eq_lift) to (drone_eq_Cdrag).
 
         .. math::
             \begin{pmatrix}F_x\\F_z\end{pmatrix} = \int\rho\,c(r)\,|U|\left[-C_D\begin{pmatrix}U_x\\U_z\end{pmatrix}
             + C_L\begin{pmatrix}-U_z\\U_x\end{pmatrix}\right]dr, \quad U_x = v_x - \dot\phi r,\; U_z = v_z
 
-        Only the coefficients need the wing frame, (U_ξ, U_ζ) = R_2(α)(U_x, U_z): drag and lift lie along the velocity
-        and a quarter turn ahead of it in every frame. The flow along the span carries no force and is dropped.
+        Only the coefficients need the wing frame, (U_ξ, U_ζ) = R_2(α)(U_x, U_z): in every frame drag lies along the
+        velocity and lift a quarter turn ahead of it. The flow along the span carries no force and is dropped.
 
-        Note: the paper prints R_2(α) with the sign of R_2(β_w); here with the opposite one, [[cos, −sin], [sin, cos]]
-        in (x, z), because the printed one lifts downwards on both half-strokes.
+        Note: the paper prints R_2(α) with the sign of R_2(β_w); here it has the opposite sign, [[cos, −sin], [sin,
+        cos]] in (x, z), because with the printed sign the lift points downwards on both half-strokes.
         Note: |U| is √(U_x² + U_z² + ε²), which keeps direction and slope finite where the wing meets still air.
         """
         U_x, U_z = v_x.unsqueeze(-1) - phi_dot.unsqueeze(-1) * self.radius, v_z.unsqueeze(-1)
@@ -264,7 +264,7 @@ class FlappingWing(Plant):
     def observe(
         self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 4"], exogenous: Float[Tensor, "*#batch 1"]
     ) -> Float[Tensor, "*batch 4"]:
-        """Errors to the target and their rates, over ``observation_scale``; the wind is not seen."""
+        """Errors to the target and their rates, over ``observation_scale``; the wind is not observed."""
         return torch.cat([self.target - state[..., :2], -state[..., 2:]], -1) / self.error_scale
 
     def running_cost(
@@ -274,12 +274,12 @@ class FlappingWing(Plant):
         applied: Float[Tensor, "*batch 2"],
         exogenous: Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch"]:
-        r"""½(‖e‖² + α_1‖ė∘h‖²), e the error of the position (paper, eq. drone_eq_rewardCont).
+        r"""The cost ½(‖e‖² + α_1‖ė∘h‖²) with the position error e (paper, eq. drone_eq_rewardCont).
 
         .. math:: h_i = \hat h_i\exp\Big[-\frac12\Big(\frac{x_i - x_{f,i}}{\sigma}\Big)^2\Big]
 
-        Note: the paper prints a peak of x_f²/2; here 1, because its text calls the function unitary. ``peak="printed"``
-        gives the printed one.
+        Note: the paper prints a peak of x_f²/2; here it is 1, because its text calls the function unitary.
+        ``peak="printed"`` gives the printed peak.
         """
         e = self.target - state[..., :2]
         h = self.window_peak * torch.exp(-0.5 * (e / self.window_width) ** 2)
@@ -288,7 +288,7 @@ class FlappingWing(Plant):
     def discrepancy(
         self, state: Float[Tensor, "*#batch 4"], measured: Float[Tensor, "*#batch 4"]
     ) -> Float[Tensor, "*batch"]:
-        """½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
+        """The discrepancy ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
     merit, categories, make_neural_closure = judgement.merit, judgement.categories, drawn_neural_polar
@@ -296,7 +296,7 @@ class FlappingWing(Plant):
     # Randomness
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 4"]:
-        """At rest in the origin; draws nothing."""
+        """Initial states at rest in the origin; nothing is drawn."""
         return torch.zeros(batch, 4, dtype=torch.float64, device=generator.device)
 
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 1"]:
@@ -304,7 +304,7 @@ class FlappingWing(Plant):
         return self.wind.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1)
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        """The paper's polar with coefficients within ±50 % of the true ones."""
+        """The paper's polar with random coefficients within ±50 % of the true ones."""
         return QuasiSteadyPolar.draw(generator)
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:

@@ -1,4 +1,4 @@
-"""What the pendulum's episodes are judged by, beside their mean cost."""
+"""The quantities by which the pendulum's episodes are judged, beside their mean cost."""
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,7 @@ def merit(
     applied: Float[Tensor, "batch n 1"],
     exogenous: Float[Tensor, "batch n 0"],
 ) -> dict[str, Float[Tensor, " batch"]]:
-    """Gymnasium's return, and for how much of the last quarter of the episode the rod is upright."""
+    """Gymnasium's return, and the share of the episode's last quarter in which the rod is upright."""
     t = plant.dt * torch.arange(applied.shape[1], dtype=states.dtype, device=states.device)
     cost = plant.running_cost(t, states[:, :-1], applied, exogenous)
     last = states[:, -(applied.shape[1] // 4) :, 0]

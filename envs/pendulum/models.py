@@ -1,4 +1,4 @@
-r"""Closure of the pendulum: what its mass and length do to it."""
+r"""Closure of the pendulum: the effect of its mass and length."""
 
 import torch
 from jaxtyping import Float
@@ -8,14 +8,15 @@ from rt_torchrl.plants.closures import PositiveCoefficients
 
 
 class UniformRod(PositiveCoefficients):
-    r"""Mass and length of a uniform rod that turns about its end, of moment of inertia ml²/3.
+    r"""Mass and length of a uniform rod that turns about its end, with moment of inertia ml²/3.
 
     .. math:: c_g = \frac{mgl/2}{ml^2/3}\,\frac1g = \frac{3}{2l}, \qquad c_u = \frac{1}{ml^2/3} = \frac{3}{ml^2}
 
-    The features do not enter; another law of the two, such as a perceptron with friction in it, can stand in.
+    The coefficients do not depend on the features. Another law for c_g and c_u, such as a perceptron that also learns
+    friction, can replace this closure.
 
     Args:
-        coefficients: m [kg], l [m], both positive.
+        coefficients: mass m [kg] and length l [m], both positive.
 
     Raises:
         ValueError: if there are not two positive, finite coefficients.

@@ -1,4 +1,4 @@
-r"""Gymnasium's ``Pendulum-v1`` as a plant: a rod that a weak motor can only swing up."""
+r"""Gymnasium's ``Pendulum-v1`` as a plant: a rod that its weak motor can only swing up."""
 
 import math
 
@@ -34,12 +34,12 @@ class Pendulum(Plant):
     Args:
         dt: control interval [s]; Gymnasium's is 0.05.
         horizon: length of an episode T_o [s]; Gymnasium's is 200 intervals.
-        closure: c_g and c_u of the real rod; None for Gymnasium's, of 1 kg and 1 m.
+        closure: closure for c_g and c_u of the real rod; None for Gymnasium's rod of 1 kg and 1 m.
         gravity: g [m/s²]; Gymnasium's is 10.
         guess: share of the true mass and length that the twin starts from.
 
     Raises:
-        ValueError: if ``gravity`` or ``guess`` is not positive, or above 1000.
+        ValueError: if ``gravity`` or ``guess`` is not positive, or is above 1000.
 
     Source: gymnasium, ``classic_control/pendulum.py``.
     """
@@ -88,14 +88,14 @@ class Pendulum(Plant):
         exogenous: Float[Tensor, "*#batch 0"],
         closure: nn.Module,
     ) -> Float[Tensor, "*batch 2"]:
-        r"""dθ/dt and d²θ/dt² = c_g g sin θ + c_u u.
+        r"""The rates dθ/dt and d²θ/dt² = c_g g sin θ + c_u u.
 
         Args:
-            t: time [s]; unused.
-            state: θ [rad], dθ/dt [rad/s].
+            t: time [s], unused.
+            state: angle θ [rad] and speed dθ/dt [rad/s].
             action: torque u [N m].
-            exogenous: nothing.
-            closure: c_g [1/m] and c_u [1/(kg m²)] at (cos θ, sin θ, dθ/dt).
+            exogenous: empty tensor.
+            closure: closure from (cos θ, sin θ, dθ/dt) to c_g [1/m] and c_u [1/(kg m²)].
         """
         (theta, rate), (u,) = state.unbind(-1), action.unbind(-1)
         sine = theta.sin()
@@ -105,7 +105,7 @@ class Pendulum(Plant):
     def actuate(
         self, state: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 1"]
     ) -> Float[Tensor, "*batch 1"]:
-        """The motor gives at most ±2 N m."""
+        """The torque of the motor, at most ±2 N m."""
         return command.clamp(-self.greatest_torque, self.greatest_torque)
 
     def step(
@@ -121,7 +121,7 @@ class Pendulum(Plant):
         .. math:: \dot\theta' = \mathrm{stop}(\dot\theta + \ddot\theta\,\Delta t), \qquad
             \theta' = \theta + \dot\theta'\,\Delta t
 
-        The angle is kept within ±π, as it can be told from its sine and cosine.
+        The angle is kept within ±π, which its sine and cosine determine.
         """
         applied = self.actuate(state, command)
         theta, rate = state.unbind(-1)
@@ -134,7 +134,7 @@ class Pendulum(Plant):
     def observe(
         self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 2"], exogenous: Float[Tensor, "*#batch 0"]
     ) -> Float[Tensor, "*batch 3"]:
-        """Gymnasium's observation, with the speed scaled to order one."""
+        """Gymnasium's observation cos θ, sin θ and dθ/dt, with the speed scaled to order one."""
         theta, rate = state.unbind(-1)
         return torch.stack([theta.cos(), theta.sin(), rate / self.greatest_speed], -1)
 
@@ -145,14 +145,14 @@ class Pendulum(Plant):
         applied: Float[Tensor, "*batch 1"],
         exogenous: Float[Tensor, "*#batch 0"],
     ) -> Float[Tensor, "*batch"]:
-        """θ² + 0.1 (dθ/dt)² + 0.001 u² with θ within ±π: minus Gymnasium's reward, so that results compare."""
+        """The cost θ² + 0.1 (dθ/dt)² + 0.001 u² with θ within ±π, the negative of Gymnasium's reward."""
         theta, rate = state.unbind(-1)
         return wrapped(theta) ** 2 + 0.1 * rate**2 + 0.001 * applied[..., 0] ** 2
 
     def discrepancy(
         self, state: Float[Tensor, "*#batch 2"], measured: Float[Tensor, "*#batch 2"]
     ) -> Float[Tensor, "*batch"]:
-        """½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² that of a hanging rod of 1 m."""
+        """The discrepancy ½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² of a hanging rod."""
         turn, rate = (state - measured).unbind(-1)
         return 0.5 * (wrapped(turn) ** 2 + rate**2 / 15.0)
 
@@ -162,23 +162,23 @@ class Pendulum(Plant):
     # Randomness
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 2"]:
-        """Any angle, and a speed of at most 1 rad/s: where Gymnasium's episodes start."""
+        """Initial states as in Gymnasium: any angle, and a speed of at most 1 rad/s."""
         share = 2.0 * torch.rand(batch, 2, generator=generator, dtype=torch.float64, device=generator.device) - 1.0
         return torch.stack([math.pi * share[:, 0], self.greatest_initial_speed * share[:, 1]], -1)
 
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 0"]:
-        """Nothing acts on the pendulum from outside."""
+        """Empty exogenous inputs: nothing acts on the pendulum from outside."""
         return torch.zeros(batch, self.n_steps, 0, dtype=torch.float64, device=generator.device)
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        """A rod whose mass and length are ``guess`` times the true ones; draws nothing."""
+        """A rod whose mass and length are ``guess`` times the true ones; nothing is drawn."""
         return UniformRod.guess(self.guess)
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """A perceptron: no affine law of cos θ, sin θ and dθ/dt both swings the rod up and holds it there."""
+        """A perceptron, because no affine law of cos θ, sin θ and dθ/dt swings the rod up and also holds it there."""
         return SaturatedMLP(len(self.observations), self.actions, hidden=self.hidden, generator=generator)
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """The same angle within [−π, π), as Gymnasium's ``angle_normalize``."""
+    """The angle, moved into [−π, π) by whole turns as by Gymnasium's ``angle_normalize``."""
     return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

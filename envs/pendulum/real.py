@@ -10,7 +10,7 @@ from rt_torchrl.systems.real_system import RealSystem
 
 
 def angle_and_speed(observation: Tensor) -> Tensor:
-    """θ [rad] and dθ/dt [rad/s] of (cos θ, sin θ, dθ/dt)."""
+    """The state θ [rad] and dθ/dt [rad/s] from the observation (cos θ, sin θ, dθ/dt)."""
     cosine, sine, rate = observation.unbind(-1)
     return torch.stack([torch.atan2(sine, cosine), rate], -1)
 
@@ -21,13 +21,13 @@ def gymnasium_pendulum(
     """The real system, which reports in single precision.
 
     Args:
-        plant: with Gymnasium's time step.
-        seed: of the initial states.
-        closure: Gymnasium's own mass and length if they are to be known, for judging on the plant.
-        device: where its entries go.
+        plant: the plant, with Gymnasium's time step.
+        seed: seed of the initial states.
+        closure: closure with Gymnasium's mass and length, if policies are to be judged on the plant; else None.
+        device: device of the reported tensors.
 
     Raises:
-        ValueError: if Gymnasium is not installed, or the plant's gravity, time step or horizon are not to be had of it.
+        ValueError: if Gymnasium is not installed, or cannot have the plant's gravity, time step or horizon.
     """
     try:
         import gymnasium

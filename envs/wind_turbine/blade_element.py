@@ -1,4 +1,4 @@
-r"""Blade-element momentum theory: the map C_p(λ, β) of a rotor from its blade and its aerofoil polars.
+r"""Blade-element momentum theory, which gives the map C_p(λ, β) of a rotor from its blade and its aerofoil polars.
 
 Each blade element sees the wind :math:`V_x` along the rotor axis and :math:`V_y` in the plane of rotation. Its inflow
 angle φ balances the loads of the section against the momentum of the annulus (Ning 2014),
@@ -8,7 +8,7 @@ angle φ balances the loads of the section against the momentum of the annulus (
     \kappa = \frac{\sigma' c_n}{4F\sin^2\phi}, \quad \kappa' = \frac{\sigma' c_t}{4F\sin\phi\cos\phi}
 
 with :math:`a = \kappa/(1+\kappa)` in the momentum region, Buhl's parabola above κ = 2/3, and Prandtl's tip and hub loss
-factor F. One unknown per element, always in a known bracket: bisection cannot fail, and all elements go at once.
+factor F. Each element has one unknown in a known bracket, so that bisection cannot fail; it takes all elements at once.
 
 Sources: S. A. Ning, *A simple solution method for the blade element momentum equations with guaranteed convergence*,
 Wind Energy 17 (2014) 1327-1345; M. L. Buhl, *A new empirical relationship between thrust coefficient and induction
@@ -28,27 +28,27 @@ from rt_torchrl.envs.wind_turbine.power_coefficient import DATA, Axis, PowerCoef
 EDGE = 1e-6
 """Distance of the brackets from φ = 0 and φ = π, where the residual is singular [rad]."""
 BISECTIONS = 48
-"""Halvings of a bracket of at most π/2: φ to 6e-15 rad."""
+"""Number of halvings of a bracket of at most π/2, which give φ to 6e-15 rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rotor:
-    """A rotor in a sheared wind; the defaults are the NREL 5-MW reference turbine's.
+    """A rotor in a sheared wind; the defaults are those of the NREL 5-MW reference turbine.
 
     Args:
-        blade: the elements.
-        polars: section data by the names the blade uses.
+        blade: elements of the blade.
+        polars: polars by the names that the blade uses.
         n_blades: number of blades.
-        hub_radius, tip_radius: where the blade begins and ends, along the blade [m].
+        hub_radius, tip_radius: distances of the blade's ends from the rotor axis, along the blade [m].
         precone: cone angle, tips upwind positive [deg].
         tilt: shaft angle, upwind end up positive [deg].
-        hub_height: [m].
+        hub_height: height of the hub above ground [m].
         shear: exponent of the wind profile, u(h) = U (h/hub_height)^shear [-].
-        n_sectors: azimuth positions averaged over.
+        n_sectors: number of azimuth positions in the average.
 
     Raises:
-        ValueError: if a polar is missing, the elements reach out of hub_radius…tip_radius, the ground is hit, or a
-            number is out of range.
+        ValueError: if a polar is missing, an element lies outside hub_radius…tip_radius, the blades hit the ground, or
+            a number is out of its range.
     """
 
     blade: Blade
@@ -94,18 +94,18 @@ class Rotor:
 
 
 class Inflow(NamedTuple):
-    """Solution per tip-speed ratio, pitch, sector and element, for a unit wind at hub height."""
+    """Solution for each tip-speed ratio, pitch, sector and element, at a unit wind at hub height."""
 
     phi: Float[np.ndarray, "lam beta sector r"]  # inflow angle [rad]
     a: Float[np.ndarray, "lam beta sector r"]  # axial induction [-]
     a_tangential: Float[np.ndarray, "lam beta sector r"]  # tangential induction a' [-]
     loss: Float[np.ndarray, "lam beta sector r"]  # Prandtl's factor F [-]
     normal: Float[np.ndarray, "lam beta sector r"]  # force along the rotor axis, per ½ρ and unit length, one blade
-    tangential: Float[np.ndarray, "lam beta sector r"]  # force in the direction of rotation, likewise
+    tangential: Float[np.ndarray, "lam beta sector r"]  # same unit, in the direction of rotation
 
 
 class _Sections(NamedTuple):
-    """What the residual needs, broadcastable to [lam, beta, sector, r]: a rotor in a given wind and pitch."""
+    """A rotor in a given wind and pitch, with arrays that broadcast to [lam, beta, sector, r]."""
 
     rotor: Rotor
     v_x: Float[np.ndarray, "*axial"]
@@ -141,7 +141,7 @@ class _Sections(NamedTuple):
 
 
 def solve_inflow(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) -> Inflow:
-    """Balance every element of the rotor at every pair of tip-speed ratio [-] and pitch [deg]; see the module.
+    """Balance every element of the rotor at every pair of tip-speed ratio [-] and pitch [deg].
 
     Raises:
         ValueError: if an axis is not one-dimensional and finite, or a tip-speed ratio is not positive.
@@ -168,13 +168,13 @@ def solve_inflow(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) -> Inflow:
 
 
 def power_coefficients(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) -> Float[np.ndarray, "lam beta"]:
-    r"""Map of the rotor, :math:`C_p = \lambda\,Q / (\tfrac12\rho\pi R^3 U^2)` [-], Q the torque averaged over azimuth.
+    r"""Map of the rotor, :math:`C_p = \lambda\,Q / (\tfrac12\rho\pi R^3 U^2)` [-], with the mean torque Q over azimuth.
 
-    R is the radius of the swept disc, tip_radius·cos(precone), in C_p as in λ. The loads of an element hold over its
-    length dr.
+    R is the radius of the swept disc, tip_radius·cos(precone), both in C_p and in λ. The loads of an element are
+    constant over its length dr.
 
     Raises:
-        ValueError: as :func:`solve_inflow`.
+        ValueError: as in :func:`solve_inflow`.
     """
     lam, cone = np.asarray(tip_speed_ratio, dtype=np.float64), np.radians(rotor.precone)
     tangential = solve_inflow(rotor, lam, pitch).tangential.mean(axis=2)
@@ -191,7 +191,7 @@ def power_coefficient_table(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) ->
         pitch: columns β [deg], increasing, at least four.
 
     Raises:
-        ValueError: as :func:`solve_inflow` and :class:`PowerCoefficientTable`.
+        ValueError: as in :func:`solve_inflow` and :class:`PowerCoefficientTable`.
     """
     values = power_coefficients(rotor, np.asarray(tip_speed_ratio), np.asarray(pitch))
     return PowerCoefficientTable(tip_speed_ratio, pitch, values)
@@ -200,9 +200,9 @@ def power_coefficient_table(rotor: Rotor, tip_speed_ratio: Axis, pitch: Axis) ->
 def _wind(
     rotor: Rotor, lam: Float[np.ndarray, " n_lam"]
 ) -> tuple[Float[np.ndarray, "1 1 sector r"], Float[np.ndarray, "lam 1 sector r"]]:
-    """Undisturbed wind along the rotor axis and in the direction of rotation, per wind speed at hub height.
+    """Undisturbed wind along the rotor axis and in the direction of rotation, over the wind speed at hub height.
 
-    The element sits at azimuth ψ (0: blade up) of a rotor that is coned and tilted; Ning's CCBlade, without yaw.
+    The element is at azimuth ψ (0: blade up) of a coned and tilted rotor, as in Ning's CCBlade without yaw.
     """
     cone, tilt = np.radians(rotor.precone), np.radians(rotor.tilt)
     psi = (2 * np.pi / rotor.n_sectors * np.arange(rotor.n_sectors))[:, None]
@@ -217,7 +217,8 @@ def _wind(
 def _bracket(sections: _Sections, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Interval of φ [rad] in which the residual changes sign, per element (Ning 2014, section 3.4).
 
-    The windmill range (0, π/2] if the sign changes there, else the propeller brake [-π/4, 0), else (π/2, π).
+    The bracket is the windmill range (0, π/2] if the sign changes there, else the propeller brake [-π/4, 0) if it
+    changes there, else (π/2, π).
     """
 
     def residual(phi: float) -> Float[np.ndarray, "lam beta sector r"]:
@@ -240,7 +241,7 @@ def _axial_induction(
 ) -> Float[np.ndarray, "*batch"]:
     r"""Axial induction a from κ: momentum theory up to κ = 2/3, Buhl's parabola above, propeller brake for φ < 0.
 
-    Buhl: :math:`C_T = \tfrac89 + (4F - \tfrac{40}9)a + (\tfrac{50}9 - 4F)a^2`, and the blade gives
+    Buhl's parabola is :math:`C_T = \tfrac89 + (4F - \tfrac{40}9)a + (\tfrac{50}9 - 4F)a^2`, and the blade gives
     :math:`C_T = 4F\kappa(1-a)^2`.
     """
     g1, g2, g3 = (
@@ -249,7 +250,7 @@ def _axial_induction(
         2 * loss * kappa - (25 / 9 - 2 * loss),
     )
     root = np.sqrt(np.maximum(g2, 0.0))
-    near = np.abs(g3) < 1e-6  # the quadratic becomes linear: take the limit
+    near = np.abs(g3) < 1e-6  # the quadratic equation becomes linear: its limit is taken
     buhl = np.where(near, 1 - 0.5 / np.where(near, root, 1.0), (g1 - root) / np.where(near, 1.0, g3))
     momentum = kappa / (1 + np.where(kappa == -1, EDGE, kappa))
     brake = np.where(kappa > 1, kappa / np.where(kappa == 1, EDGE, kappa - 1), 0.0)

@@ -1,4 +1,4 @@
-r"""The turbine's filters and last actions, from the signals that a turbine logs: rotor speed, actions and wind.
+r"""The turbine's filters and last actions, computed from the logged signals: rotor speed, actions and wind.
 
 The filters are first-order lags :math:`T\dot{\hat y} = y - \hat y`, settled at the start of the record:
 
@@ -24,7 +24,7 @@ def completed(
     exogenous: Float[Tensor, "n 1"],
     actions: Float[Tensor, "n 2"],
 ) -> Float[Tensor, "samples 6"]:
-    """All six states; a filter that was logged itself is taken as it is."""
+    """All six states; the logged values of a filter are used if the log has them."""
     omega_g = plant.gear_ratio * measured["rotor_speed"]
     wind = exogenous[:, 0]
     constant = 1.0 / (2.0 * math.pi * plant.filter_frequency)
@@ -37,19 +37,19 @@ def completed(
     e1 = plant.speed_error(omega_hat, u_hat)
     window = 2.0 * math.pi / plant.rated_rotor_speed
     e2 = filtered("speed_error_integral", e1[0], between(e1), window)
-    # What was applied before the record is not known; the first action leaves the rate limits free.
+    # The action before the record is not known; the first action of the record never meets a rate limit.
     last = torch.cat([actions[:1], actions])
     return torch.cat([torch.stack([measured["rotor_speed"], omega_hat, u_hat, e2], -1), last], -1)
 
 
 def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:
-    """Mean of both ends of every interval."""
+    """The mean of the values at both ends of every interval."""
     return 0.5 * (values[1:] + values[:-1])
 
 
 def lag(start: Tensor, driving: Float[Tensor, " n"], steps: float) -> Float[Tensor, " samples"]:
-    """First-order lag from ``start``, with dt ``steps`` of its time constant."""
-    from scipy.signal import lfilter  # here, because it takes a second to load and only logs need it
+    """A first-order lag from ``start``; ``steps`` is dt over its time constant."""
+    from scipy.signal import lfilter  # imported here: loading takes a second, and only logs need it
 
     decay = math.exp(-steps)
     ends, _ = lfilter([1.0 - decay], [1.0, -decay], driving.numpy(), zi=[decay * start.item()])

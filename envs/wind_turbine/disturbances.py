@@ -48,11 +48,12 @@ class KaimalWind:
         mean: mean speed U [m/s], positive.
         intensity: turbulence intensity I = σ/U [-], not negative; 0.16 is the reference value of class A.
         length_scale: integral scale L [m], positive; 340.2 m = 8.1·42 m, IEC 61400-1 for hubs above 60 m.
-        floor: the wind is cut off below this speed [m/s]; the turbine's cut-in, below which it does not run.
-            ``-math.inf`` switches it off. At 11 m/s and 16 % it lies 4.5 σ under the mean and is hardly ever reached.
-        scale_to_target: rescale every sample, before the floor, so that its own standard deviation (divisor n) is σ:
-            TurbSim's ``ScaleIEC``. Without it a sample holds only the variance inside its band, (0.935 σ)² for 600 s at
-            0.5 s; with it the spectrum lies above S by the reciprocal, 14 % there.
+        floor: least wind speed [m/s], to which slower wind is raised; by default the turbine's cut-in, below which it
+            does not run. ``-math.inf`` means no floor. At 11 m/s and 16 % the default lies 4.5 σ below the mean, and
+            the wind hardly ever reaches it.
+        scale_to_target: whether every sample is scaled, before the floor, to have the standard deviation σ (divisor n),
+            as by TurbSim's ``ScaleIEC``. An unscaled sample holds only the variance inside its band, (0.935 σ)² for
+            600 s at 0.5 s; the spectrum of a scaled sample exceeds S by the reciprocal, here by 14 %.
 
     Raises:
         ValueError: if an argument is out of its range.
@@ -100,7 +101,7 @@ class KaimalWind:
 
         Args:
             batch: number of episodes.
-            n_steps: samples of each, at least 2: a single one has no frequency to draw.
+            n_steps: number of samples of each episode, at least 2: a single sample has no frequency.
             dt: sampling interval [s].
             generator: source of the phases.
 
@@ -108,7 +109,7 @@ class KaimalWind:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
         require_request(batch, n_steps, dt, least_steps=2)
-        # Drawn with unit variance, so that a wind without turbulence is not scaled by 0/0.
+        # The fluctuation has unit variance, so that a wind without turbulence is not scaled by 0/0.
         fluctuation = self._draw_unit_fluctuation(batch, n_steps, dt, generator)
         if self.scale_to_target:
             fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
@@ -124,8 +125,8 @@ class KaimalWind:
         amplitude = torch.sqrt(2.0 * self._unit_spectrum(f) / (n_steps * dt))
         coefficients = torch.polar((0.5 * n_steps * amplitude).expand_as(phase), phase)
         if n_steps % 2 == 0:
-            # irfft counts a pair ±f for every bin but the Nyquist bin, which stands alone and whose imaginary part it
-            # drops: there the samples of a·cos(πk + φ) = a·cos φ·(−1)^k need n·a·cos φ. Left as it is, the bin would
+            # irfft counts a pair ±f for every bin but the Nyquist bin, which stands alone; there it drops the imaginary
+            # part. The samples of a·cos(πk + φ) = a·cos φ·(−1)^k need n·a·cos φ in that bin. Without this line it would
             # carry a quarter of its power.
             coefficients[:, -1] = 2.0 * coefficients[:, -1].real
         return torch.fft.irfft(torch.nn.functional.pad(coefficients, (1, 0)), n=n_steps)
@@ -135,13 +136,13 @@ class KaimalWind:
 class RecordedWind:
     """Wind cut at random from records, such as TurbSim's files.
 
-    Every episode takes one record, all equally likely, and a start in it, uniform over those that leave enough wind;
-    the record is interpolated linearly to the times of the episode. That samples the wind at the start of each control
-    interval, over which it is then held; content above the new Nyquist frequency is folded, not filtered out.
+    Every episode takes one of the records, which are equally likely, and a start in it, uniform over the starts that
+    leave enough wind. The record is interpolated linearly to the start of each control interval, over which the wind is
+    then held. Content above the new Nyquist frequency is folded, not filtered out.
 
     Args:
         records: at least one :class:`~rt_torchrl.envs.wind_turbine.wind_record.WindRecord`.
-        floor: the wind is cut off below this speed [m/s], the turbine's cut-in; ``-math.inf`` switches it off.
+        floor: least wind speed [m/s], to which slower wind is raised; ``-math.inf`` means no floor.
 
     Raises:
         ValueError: if there is no record, or ``floor`` is not a number or is infinitely high.
@@ -168,9 +169,9 @@ class RecordedWind:
 
         Args:
             batch: number of episodes.
-            n_steps: samples of each, at least 1.
+            n_steps: number of samples of each episode, at least 1.
             dt: sampling interval [s].
-            generator: source of the choice of record and start.
+            generator: source of the choices of record and start.
 
         Raises:
             ValueError: if an argument is out of its range, or a record is shorter than (n_steps − 1)·dt.
@@ -178,7 +179,7 @@ class RecordedWind:
         require_request(batch, n_steps, dt)
         needed = (n_steps - 1) * dt
         for record in self.records:
-            # Rounding of k·dt must not reject a record of exactly the length needed.
+            # Rounding of k·dt must not reject a record that has exactly the needed length.
             if record.duration < needed * (1.0 - 1e-9):
                 raise ValueError(
                     f"wind record {record.source} is {record.duration:g} s long, but n_steps={n_steps} of dt={dt} s "
@@ -192,6 +193,6 @@ class RecordedWind:
         for row, index, part in zip(wind, choice, share, strict=True):
             record = self.records[index]
             start = part * max(0.0, record.duration - needed)
-            # The even grid, not the printed times, which a text file rounds to a millisecond.
+            # The record's times are an even grid, because a text file rounds the printed times to a millisecond.
             row[:] = np.interp(start + elapsed, record.step * np.arange(len(record.speed)), record.speed)
         return torch.from_numpy(wind).to(device).clamp_min(self.floor)

@@ -33,7 +33,7 @@ PITCHES = (0.0, 5.0, 10.0, 15.0)
 """Pitch angles at which C_p is drawn [deg]."""
 PITCH_COLOURS = colormaps["viridis"]([0.0, 0.35, 0.65, 0.9])
 LEAST_SHOWN = -0.25
-"""C_p below which operating points are only counted: an overspeeding rotor brakes with up to some -1."""
+"""C_p below which operating points are only counted: an overspeeding rotor brakes at a C_p down to about -1."""
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -45,7 +45,7 @@ def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
 def power_and_speed(snapshot: Snapshot) -> Figure:
     """The last episode: wind, generator speed and power beside their references, torque and pitch (paper, fig. 00).
 
-    The reference speed follows the filtered wind, and the filtered speed is what the policies compare it with.
+    The reference speed follows the filtered wind, and the policies compare the filtered speed with it.
     """
     plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
     state = record.states[:-1]
@@ -87,9 +87,9 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
 def power_coefficient(snapshot: Snapshot) -> Figure:
     """C_p over λ at four pitch angles, and in the last episode over the wind speed (paper, fig. 14b).
 
-    Left: the true table, the learned law and the law that the training started from. Each tick at the top is a λ
-    of the episode, in the colour of the pitch angle within 2.5 deg of its own: a twin can only know what was visited.
-    Curves are pale outside the range of those λ.
+    The left panel shows the true table, the learned law and the law that the training started from. Each tick at the
+    top is a λ of the episode, in the colour of the pitch angle within 2.5 deg of its own, because a twin can only know
+    what was visited. Curves are pale outside the range of those λ.
     """
     visited = _Visited.of(snapshot)
     true, learned, initial = visited.C_p.values()
@@ -124,7 +124,7 @@ def scatter(snapshot: Snapshot) -> Figure:
 
 
 class _Visited(NamedTuple):
-    """Operating points of the last episode and C_p there under each closure."""
+    """Operating points of the last episode, and their C_p under each closure."""
 
     lam: np.ndarray
     beta: np.ndarray

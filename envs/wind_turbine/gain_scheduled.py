@@ -1,4 +1,4 @@
-r"""A turbine controller as wind engineers build it, whose gains are trained."""
+r"""A turbine controller as wind engineers build it, with gains that are trained."""
 
 import math
 from typing import TYPE_CHECKING
@@ -14,29 +14,30 @@ if TYPE_CHECKING:
 
 
 class GainScheduled(nn.Module):
-    r"""Torque by :math:`K\omega^2` below rated speed, at constant power above; pitch by a gain-scheduled PI law.
+    r"""Torque :math:`K\omega^2` below rated speed and at constant power above it, and pitch by a gain-scheduled PI law.
 
     .. math::
         \tau_g = (1 - s)\,K\omega_F^2 + s\,P_r/\omega_F, \qquad
         s = \sigma\big((\omega_F - \omega_s + c\,\beta)/w_s\big), \\
         \beta^+ = \beta + \Delta t\,\frac{K_P\,\dot\omega_F + K_I(\omega_F - \omega_{ref})}{1 + \beta/\beta_K}
 
-    The last line is the PI law by its increments: the pitch that was applied last is its integral, so that it winds up
-    no further than the blades turn. σ is the logistic function: it blends the regions where Jonkman's table switches.
-    Both commands are held to the ranges of the actions.
+    The last line is the PI law in its increments. The pitch that was applied last is its integral, which thus winds up
+    no further than the blades turn. The logistic function σ blends the regions where Jonkman's table switches. Both
+    commands are clamped to the ranges of the actions.
 
     The weights are the logarithms of K, K_P, K_I and β_K over their values in ``NOMINAL``, those of Jonkman's
-    controller. The set-points are no weights: the reference power of the turbine's J_a, K ω_g³, is a fifth below what
-    the drivetrain gives at rated speed, and a set-point that follows J_a throws that power away. ω_s is a little below
-    Jonkman's 120 rad/s and ω_ref 1.3 % above rated speed, because a speed held tighter than his spills wind otherwise.
+    controller. The set-points are no weights: the reference power K ω_g³ of the turbine's J_a is a fifth below the
+    power of the drivetrain at rated speed, and a set-point that follows J_a would throw that power away. This law holds
+    the speed tighter than Jonkman's. So that it spills no wind, ω_s is a little below his 120 rad/s and ω_ref 1.3 %
+    above rated speed.
 
     Args:
-        plant: an :class:`InstrumentedTurbine`, for scales, ranges and the control interval.
-        detuning: the gains start from exp(U(−detuning, detuning)) times the nominal ones.
-        reference_speed: ω_ref [rad/s] of the pitch law.
-        switch_speed: ω_s [rad/s] at which the torque leaves region 2.
-        switch_width: w_s [rad/s] of that transition.
-        switch_pitch: c [rad/s per deg]; keeps region 3 while the blades are pitched.
+        plant: an :class:`InstrumentedTurbine`, which gives scales, ranges and the control interval.
+        detuning: width of the draw of the first gains, exp(U(−detuning, detuning)) times the nominal gains.
+        reference_speed: reference speed ω_ref of the pitch law [rad/s].
+        switch_speed: speed ω_s at which the torque leaves region 2 [rad/s].
+        switch_width: width w_s of that transition [rad/s].
+        switch_pitch: factor c, which keeps region 3 while the blades are pitched [rad/s per deg].
         generator: source of the detuning.
 
     Raises:
@@ -93,7 +94,7 @@ class GainScheduled(nn.Module):
         omega, beta = self.rated_speed + self.speed_scale * above, pitch * self.high[1]
         g = self.gains()
         share = torch.sigmoid((omega - self.switch_speed + self.switch_pitch * beta) / self.switch_width)
-        # Near standstill constant power has no torque; there is no region 3 there.
+        # At standstill no torque gives constant power; region 3 does not reach there.
         region_3 = self.power / torch.where(omega > 0.5 * self.rated_speed, omega, 0.5 * self.rated_speed)
         torque = (1.0 - share) * g["torque_gain"] * omega**2 + share * region_3
         push = g["proportional"] * self.fast_filter * self.speed_scale * rate

@@ -10,10 +10,10 @@ from rt_torchrl.plants.signal import Signal
 
 
 class InstrumentedTurbine(WindTurbine):
-    r"""A :class:`WindTurbine` that is observed by more than its speed error.
+    r"""A :class:`WindTurbine` with observations beyond the speed error.
 
-    A policy has no memory. What a PI law keeps in one is here in the plant: the pitch that was applied last is its
-    integral, and a faster low-pass of the generator speed, of Jonkman's corner frequency ω_c = 0.25 Hz, gives the rate,
+    A policy has no memory. The plant therefore holds the memory of a PI law: the pitch that was applied last is its
+    integral, and a faster low-pass of the generator speed with Jonkman's corner frequency ω_c = 0.25 Hz gives the rate,
 
     .. math:: \dot\omega_F = \omega_c(\omega_g - \omega_F)
 
@@ -73,10 +73,10 @@ class InstrumentedTurbine(WindTurbine):
         return torch.cat([state, self.gear_ratio * state[:, :1]], -1)
 
     def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
-        """A gain-scheduled law whose gains start up to twice too large or too small.
+        """A gain-scheduled law whose gains start too large or too small by a factor of up to 2.
 
         Raises:
-            ValueError: if a bias is asked for, which this law does not have.
+            ValueError: if ``bias`` is true, because this law has no bias.
         """
         if bias:
             raise ValueError(f"bias={bias} must be False: a gain-scheduled law has no bias. Take WindTurbine for one.")

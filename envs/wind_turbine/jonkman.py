@@ -1,4 +1,4 @@
-"""The classical controller of the NREL 5-MW turbine, to compare learned policies with."""
+"""The classical controller of the NREL 5-MW turbine, which learned policies are compared with."""
 
 import json
 import math
@@ -15,19 +15,19 @@ CONSTANTS = Path(__file__).parent / "data" / "nrel5mw_constants.json"
 
 
 class JonkmanController(ClassicalController):
-    r"""Torque by regions of the generator speed, pitch by a gain-scheduled PI law.
+    r"""Torque by regions of the generator speed, and pitch by a gain-scheduled PI law.
 
     .. math::
         \tau_g = \begin{cases}0 & \text{1}\\ \text{linear} & 1\tfrac12\\ K\omega_F^2 & 2\\ \text{linear} & 2\tfrac12\\
         P_r/\omega_F & 3\end{cases}, \qquad
         \beta = \frac{K_P(\omega_F - \omega_r) + K_I\int(\omega_F - \omega_r)\,dt}{1 + \beta/\beta_K}
 
-    of the low-passed generator speed ω_F. Its memory holds ω_F and the integral; its constants are published, so that
-    it has no gains to tune.
+    with the low-passed generator speed ω_F. The memory holds ω_F and the integral. The constants are published, so that
+    there are no gains to tune.
 
     Args:
         plant: the turbine; its actuators limit the rates.
-        compiled: compile the flight.
+        compiled: whether flights are compiled.
 
     Source: Jonkman et al., NREL/TP-500-38060, section 7; the variables are those of ``DISCON.F90``.
     """
@@ -47,7 +47,7 @@ class JonkmanController(ClassicalController):
         self.transition = (self.slope_25 - root) / (2.0 * c["VS_Rgn2K"])
 
     def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch 2"]:
-        """The speed as it is, and the integral that holds the pitch it finds."""
+        """The memory at the start: the present speed, and the integral that keeps the present pitch."""
         pitch = torch.deg2rad(state[:, 5])
         integral = pitch * (1.0 + pitch / self.c["PC_KK_rad"]) / self.c["PC_KI"]
         return torch.stack([self.plant.gear_ratio * state[:, 0], integral], -1)

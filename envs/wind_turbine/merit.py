@@ -1,4 +1,4 @@
-"""What a wind engineer judges an episode by."""
+"""The quantities by which a wind engineer judges an episode."""
 
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ def merit(
     applied: Float[Tensor, "batch n 2"],
     exogenous: Float[Tensor, "batch n 1"],
 ) -> dict[str, Float[Tensor, " batch"]]:
-    """Mean and deviation of the generator's power, its speed above rated (RMS) and at most, travel of the blades."""
+    """Mean and deviation of generator power, RMS of the speed above rated, top speed, and travel of the blade pitch."""
     speed = plant.gear_ratio * states[..., 0]
     power = plant.generator_power(states[:, :-1], applied)
     return {

@@ -18,22 +18,22 @@ class SaintDrenan(nn.Module):
         C_p = c_1\Big(\frac{c_2}{\xi} - c_3\beta - c_4\xi\beta - c_5\beta^x - c_6\Big)e^{-c_7/\xi} + c_8\lambda, \qquad
         \frac1\xi = \frac1{\lambda + c_9\beta} - \frac{c_{10}}{\beta^3 + 1}
 
-    with β in degrees. The trained weights are the coefficients divided by their typical sizes, which differ by 10⁴, and
-    log((x − 1)/0.5) for the exponent, which thereby stays above 1.
+    with β in degrees. The trained weights are the coefficients divided by their typical sizes, which differ by 10⁴. The
+    exponent is trained as log((x − 1)/0.5), so that x stays above 1.
 
-    Note: the paper's last term is c8·ξ, its exponent c12 and it has a c11; here c8·λ and x, because with c8·ξ the
-    published sets peak at the wrong height, and no c11 appears in any source. Note: β^x is taken as
-    (β² + 0.01²)^{x/2}, because it has no slope at β = 0.
+    Note: the paper's last term is c8·ξ, its exponent is c12, and it has a c11; here they are c8·λ and x, because with
+    c8·ξ the published sets peak at the wrong height, and no c11 appears in any source. Note: the law computes β^x as
+    (β² + 0.01²)^{x/2}, because β^x has no slope at β = 0.
 
     Args:
         coefficients: c1 ... c10 and x, in the order of ``NAMES``.
-        free_c1: train c1 too; it only scales c2 ... c6.
+        free_c1: whether c1 is trained too; it only scales c2 ... c6.
 
     Raises:
-        ValueError: if there are not eleven finite coefficients, or x is not above 1 (no slope at β = 0 otherwise).
+        ValueError: if there are not eleven finite coefficients, or x is not above 1, where C_p has no slope at β = 0.
     """
 
-    # Typical size of c1 ... c10: about the step that changes C_p by some hundredths near the optimum.
+    # Typical sizes of c1 ... c10: steps of this size change C_p by some hundredths near the optimum.
     scales = (0.1, 10.0, 0.1, 0.01, 0.01, 1.0, 2.0, 0.01, 0.05, 0.01)
     smallest_pitch = 0.01  # ε [deg]
 
@@ -54,7 +54,7 @@ class SaintDrenan(nn.Module):
 
     @classmethod
     def from_set(cls, name: str, *, free_c1: bool = False) -> "SaintDrenan":
-        """A published set of coefficients; those with c5 = 0 start at c5 = 1e-3 and x = 1.5, or neither could move.
+        """A law with a published set of coefficients; c5 = 0 becomes c5 = 1e-3 with x = 1.5, or neither could move.
 
         Raises:
             ValueError: if there is no set of that name.

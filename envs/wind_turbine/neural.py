@@ -1,4 +1,4 @@
-r"""Closure of the turbine's twin with a perceptron in it."""
+r"""Closure of the turbine's twin with a perceptron."""
 
 from collections.abc import Sequence
 
@@ -11,15 +11,15 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 
 
 class NeuralPowerCoefficient(nn.Module):
-    r"""Saint-Drenan's law and what it cannot express, both trained.
+    r"""Saint-Drenan's law plus a perceptron for what the law cannot express; both are trained.
 
     .. math:: C_p(\lambda, \beta) = C_p^{SD}(\lambda, \beta) + \tfrac12\tanh N(\lambda, \beta)
 
-    It starts as the law alone. The perceptron sees λ and β on the scales of the rotor's table; far from what was
-    visited it adds at most 0.5 to the law.
+    The closure starts as the law alone. The perceptron takes λ and β on the scales of the rotor's table. Far from the
+    visited points it adds at most 0.5 to the law.
 
     Args:
-        law: where it starts from.
+        law: law that the closure starts from.
         hidden: width of each hidden layer.
         generator: source of the perceptron's initial weights.
     """

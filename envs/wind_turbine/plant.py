@@ -18,9 +18,9 @@ from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
 
 DRIVETRAIN_INERTIA = 38_759_228.0 + 534.116 * 97.0**2
-"""Rotor and generator on the low-speed shaft, 43 784 725 kg m² (NREL/TP-500-38060)."""
+"""Inertia of rotor and generator on the low-speed shaft, 43 784 725 kg m² (NREL/TP-500-38060)."""
 HUB_INERTIA = 115_926.0
-"""What the paper prints for J [kg m²]: the hub alone."""
+"""Inertia of the hub alone, which the paper prints for J [kg m²]."""
 
 
 class WindTurbine(Plant):
@@ -46,19 +46,19 @@ class WindTurbine(Plant):
     e     speed_error_integral       :math:`e_2`                                     -        about [-1, 1]
     ====  =========================  ==============================================  =======  ======================
 
-    Note: the paper prints J = 115 926 kg m²; here it is that of rotor and generator, because 115 926 is the hub alone,
+    Note: the paper prints J = 115 926 kg m²; here J is that of rotor and generator, because 115 926 is the hub alone,
     with which the rotor would follow the wind within 44 ms. ``inertia=HUB_INERTIA`` with a step below 0.12 s shows it.
-    Note: the paper prints τ_a with C_p/ω_r; here with C_p/λ, the same where both exist, because a braked rotor reaches
-    λ = 0. Note: the paper lets the pitch reach 90 deg; here 30 deg, because the closure is valid up to there.
+    Note: the paper prints τ_a with C_p/ω_r; here it has C_p/λ, which is equal where both exist, because a braked rotor
+    reaches λ = 0. Note: the paper lets the pitch reach 90 deg; here it reaches 30 deg, the limit of the closure.
 
     Args:
-        dt: control interval [s]; 0.5, or 0.25 (the paper prints both 0.5 s and 4 Hz).
+        dt: control interval [s], 0.5 or 0.25; the paper prints both 0.5 s and 4 Hz.
         horizon: length of an episode T_o [s].
-        closure: C_p(λ, β [deg]) of the real rotor; None for the table of the NREL 5-MW rotor.
+        closure: closure for C_p(λ, β [deg]) of the real rotor; None for the table of the NREL 5-MW rotor.
         wind: source of the wind speed.
-        inertia: J [kg m²] of the drivetrain on the low-speed shaft.
+        inertia: inertia J of the drivetrain on the low-speed shaft [kg m²].
         rate_limits: greatest |dτ_g/dt| [N m/s] and |dβ/dt| [deg/s] of the actuators; None for ideal ones.
-        cost_weights: α1 and α2 of J_a.
+        cost_weights: weights α1 and α2 of J_a.
 
     Raises:
         ValueError: for a non-positive inertia or rate limit, a negative cost weight, or a step that is unstable.
@@ -75,7 +75,7 @@ class WindTurbine(Plant):
     minimum_generator_speed = 70.16  # [rad/s]
     filter_frequency = 0.04  # f_c [Hz]
     speed_error_scale = 20.0  # γ1 [rad/s]
-    cut_in_generator_speed = 20.0  # middle of the band in which the generator comes in [rad/s]
+    cut_in_generator_speed = 20.0  # middle of the band in which the generator torque sets in [rad/s]
     cut_in_band = 10.0  # half width of that band [rad/s]
     standstill_tip_speed_ratio = 1.0  # λ below which the blades are taken out of the flow [-]
 
@@ -129,12 +129,12 @@ class WindTurbine(Plant):
         )
 
     def _optimal_gain(self) -> float:
-        r"""K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared)."""
+        r"""Gain K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared)."""
         power = 0.5 * self.air_density * math.pi * self.radius**5 * self.best_power_coefficient
         return power / (self.best_tip_speed_ratio * self.gear_ratio) ** 3
 
     def time_constant(self, wind_speed: float, pitch: float = 0.0) -> float:
-        r"""−1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and a pitch [deg]."""
+        r"""Time constant −1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and a pitch [deg]."""
         omega_r = torch.tensor(self.rated_rotor_speed, dtype=torch.float64, requires_grad=True)
         u, beta = torch.tensor(wind_speed, dtype=torch.float64), torch.tensor(pitch, dtype=torch.float64)
         torque = self.aerodynamic_torque(omega_r, beta, u, self.closure)
@@ -158,17 +158,17 @@ class WindTurbine(Plant):
             \dot{\hat\omega}_g = 2\pi f_c(N_g\omega_r - \hat\omega_g), \quad
             \dot{\hat u} = 2\pi f_c(u - \hat u), \quad \dot e_2 = (e_1 - e_2)/T_r
 
-        Note: the paper's recursion uses the unfiltered y(t_{k−1}) and α̂ = 0.98; here ŷ(t_{k−1}), whose continuous form
-        this is, and α̂ = exp(−2π f_c dt), because the printed one is no low-pass and 0.98 fits no dt of the paper.
-        Note: the paper integrates e_1 over exactly one revolution; here over an exponential window of one revolution
-        T_r, because a state of finite memory is what an adjoint can see.
+        Note: the paper's recursion uses the unfiltered y(t_{k−1}) and α̂ = 0.98; this is the continuous form of that
+        with ŷ(t_{k−1}) and α̂ = exp(−2π f_c dt), because the printed one is no low-pass, and 0.98 fits no printed dt.
+        Note: the paper integrates e_1 over exactly one revolution; here e_2 integrates it over an exponential window of
+        one revolution T_r, because an adjoint can only see states of finite memory.
 
         Args:
-            t: time [s]; unused, the wind enters through ``exogenous``.
-            state: see the class.
+            t: time [s], unused; the wind enters through ``exogenous``.
+            state: states in the order of the class.
             action: applied generator torque τ_g [N m] and pitch β [deg].
             exogenous: wind speed u [m/s].
-            closure: C_p(λ, β) [-]; the table in the real plant, the learned law in the twin.
+            closure: closure for C_p(λ, β) [-]: the table in the real plant, the learned law in the twin.
         """
         omega_r, omega_hat, u_hat, e2 = state[..., :4].unbind(-1)
         (tau_g, beta), u = action.unbind(-1), exogenous[..., 0]
@@ -183,9 +183,9 @@ class WindTurbine(Plant):
         return torch.stack([acceleration, *filters, integral, held, held], -1)
 
     def aerodynamic_torque(self, omega_r: Tensor, beta: Tensor, u: Tensor, closure: nn.Module) -> Tensor:
-        r"""τ_a = ½ρπR³(C_p/λ)u² [N m], fading to zero over λ < 1 (standstill), where no closure is defined.
+        r"""Torque τ_a = ½ρπR³(C_p/λ)u² [N m], which fades to zero over λ < 1 (standstill), where no closure is defined.
 
-        The fade is the plant's, not the closure's: a rotor that hardly turns is in deep stall, in the twin as in fact.
+        The fade belongs to the plant, not to the closure: a rotor that hardly turns is in deep stall in the twin too.
         """
         lam = omega_r * self.radius / u
         fade = smoothstep(lam / self.standstill_tip_speed_ratio)
@@ -194,14 +194,14 @@ class WindTurbine(Plant):
         return 0.5 * self.air_density * math.pi * self.radius**3 * fade * C_p / lam * u**2
 
     def cut_in(self, omega_g: Tensor) -> Tensor:
-        """Share of the torque that the generator delivers: it comes in over 10 ... 30 rad/s, since it only brakes."""
+        """Share of the torque that the generator delivers; it rises over 10 ... 30 rad/s: a generator only brakes."""
         start = self.cut_in_generator_speed - self.cut_in_band
         return smoothstep((omega_g - start) / (2.0 * self.cut_in_band))
 
     def actuate(
         self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch 2"]:
-        """Rate limits: torque and pitch move by at most their limit times dt from what was applied before."""
+        """The command under rate limits: torque and pitch change from the last action by at most limit times dt."""
         last = state[..., 4:6]
         change = torch.maximum(torch.minimum(command - last, self.greatest_increment), -self.greatest_increment)
         return last + change
@@ -215,16 +215,16 @@ class WindTurbine(Plant):
     # The control problem
 
     def speed_error(self, omega_hat: Tensor, u_hat: Tensor) -> Tensor:
-        r"""e_1 = (ω̂_g − ω̃_g)/γ_1 with ω̃_g = N_g λ* û/R between its limits (paper, eq. omega_ref)."""
+        r"""The error e_1 = (ω̂_g − ω̃_g)/γ_1 with ω̃_g = N_g λ* û/R between its limits (paper, eq. omega_ref)."""
         return (omega_hat - self.reference_speed(u_hat)) / self.speed_error_scale
 
     def reference_speed(self, u_hat: Tensor) -> Tensor:
-        """Generator speed ω̃_g [rad/s] wanted at a filtered wind speed û [m/s]."""
+        """Reference ω̃_g of the generator speed [rad/s] at a filtered wind speed û [m/s]."""
         best = self.gear_ratio * self.best_tip_speed_ratio * u_hat / self.radius
         return best.clamp(self.minimum_generator_speed, self.rated_generator_speed)
 
     def reference_power(self, omega_g: Tensor) -> Tensor:
-        """P̃ = min(P_N, K ω_g³) [W] (paper, eq. P_ref)."""
+        """Reference P̃ = min(P_N, K ω_g³) of the power [W] (paper, eq. P_ref)."""
         return (self.optimal_gain * omega_g**3).clamp(max=self.rated_power)
 
     def generator_power(self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch 2"]) -> Tensor:
@@ -244,7 +244,7 @@ class WindTurbine(Plant):
         applied: Float[Tensor, "*batch 2"],
         exogenous: Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch"]:
-        r"""½(α_1 e_1² + α_2 e_P²), e_P = (τ_g ω_g − P̃)/P_N (paper, eq. control_functional_mb)."""
+        r"""The cost ½(α_1 e_1² + α_2 e_P²) with e_P = (τ_g ω_g − P̃)/P_N (paper, eq. control_functional_mb)."""
         e1 = self.speed_error(state[..., 1], state[..., 2])
         reference = self.reference_power(self.gear_ratio * state[..., 0])
         e_P = (self.generator_power(state, applied) - reference) / self.rated_power
@@ -253,14 +253,14 @@ class WindTurbine(Plant):
     def discrepancy(
         self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
     ) -> Float[Tensor, "*batch"]:
-        """½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
+        """The discrepancy ½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
         return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
 
     def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
         return merit(self, states, applied, exogenous)
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
-        """From the rotor speed alone: the filters start settled, the last actions are those of the record."""
+        """All states from the rotor speed: the filters start settled, and the last actions are those of the record."""
         if "rotor_speed" not in measured:
             return super().complete_states(measured, exogenous, actions)
         return completed(self, measured, exogenous, actions)
@@ -268,7 +268,7 @@ class WindTurbine(Plant):
     # Randomness
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
-        """Rotor between 70 % and 100 % of rated speed on the torque law K ω_g², blades at 0 deg, filters settled."""
+        """Rotor at 70 % to 100 % of rated speed on the torque law K ω_g², blades at 0 deg, and settled filters."""
         share = 0.7 + 0.3 * torch.rand(batch, generator=generator, dtype=torch.float64, device=generator.device)
         omega_r = share * self.rated_rotor_speed
         omega_g = self.gear_ratio * omega_r
@@ -282,19 +282,19 @@ class WindTurbine(Plant):
         return self.wind.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1)
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        """Saint-Drenan's C_p with the coefficients of Dai 2016; draws nothing."""
+        """Saint-Drenan's C_p with the coefficients of Dai 2016; nothing is drawn."""
         return SaintDrenan.from_set("Dai2016")
 
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
-        """The same and a perceptron of (λ, β)."""
+        """Saint-Drenan's C_p with the coefficients of Dai 2016, plus a perceptron of (λ, β)."""
         return NeuralPowerCoefficient(SaintDrenan.from_set("Dai2016"), hidden=hidden, generator=generator)
 
     def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
-        """The paper's policy: one affine law per action through the smooth clip, without bias unless asked for."""
+        """The paper's policy: one affine law per action through the smooth clip, by default without bias."""
         return SaturatedAffine(2, self.actions, bias=bias, weight_scale=0.5, generator=generator)
 
 
 def smoothstep(x: Tensor) -> Tensor:
-    """0 for x ≤ 0, 1 for x ≥ 1, with continuous slope between: x²(3 − 2x)."""
+    """A step from 0 at x ≤ 0 to 1 at x ≥ 1 with a continuous slope, x²(3 − 2x) in between."""
     x = x.clamp(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)

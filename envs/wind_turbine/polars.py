@@ -1,4 +1,4 @@
-"""A blade as data: its elements, and the lift and drag of their sections over the full circle of angles of attack."""
+"""The data of a blade: its elements, and lift and drag of their sections over all angles of attack."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from rt_torchrl.envs.wind_turbine.power_coefficient import csv_rows
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Polar:
-    """Lift and drag coefficients of a section; between the entries monotone cubic (PCHIP), which does not overshoot.
+    """Lift and drag coefficients of a section, interpolated by monotone cubics (PCHIP), which do not overshoot.
 
     Args:
         alpha: array of angles of attack [deg], increasing from -180 to 180: a rotor at standstill or at a large pitch
@@ -68,7 +68,7 @@ class Polar:
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "Polar":
-        """Read columns ``alpha_deg``, ``cl``, ``cd`` of a file with a header; others are skipped.
+        """Read columns ``alpha_deg``, ``cl``, ``cd`` of a file with a header; other columns are skipped.
 
         Raises:
             ValueError: if a column is missing or an entry is no number.
@@ -99,14 +99,14 @@ class Polar:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blade:
-    """A blade as elements; each carries the loads of its mid-point.
+    """The elements of a blade; each carries the loads of its mid-point.
 
     Args:
         r: array of distances of the mid-points from the rotor axis along the blade [m], increasing.
         dr: lengths of the elements [m].
-        chord: [m].
-        twist: angle of the section to the plane of rotation, towards feather positive [deg].
-        airfoil: name of each element's polar.
+        chord: chords of the sections [m].
+        twist: angles of the sections to the plane of rotation, positive towards feather [deg].
+        airfoil: names of the elements' polars.
 
     Raises:
         ValueError: if the columns differ in length, are not finite, not positive (r, dr, chord) or not increasing (r),
@@ -168,7 +168,7 @@ class Blade:
 
 
 def csv_columns(path: str | Path, required: tuple[str, ...]) -> dict[str, list[str]]:
-    """Columns of a file by the names in its header.
+    """The columns of a file by the names in its header.
 
     Raises:
         ValueError: if a required column is missing or a row is shorter or longer than the header.
@@ -186,7 +186,7 @@ def numbers(path: str | Path, columns: dict[str, list[str]], name: str) -> Float
     """One column as numbers.
 
     Raises:
-        ValueError: if an entry is no number, with the path and the column.
+        ValueError: if an entry is no number; the message names the path and the column.
     """
     try:
         return np.array([float(entry) for entry in columns[name]])

@@ -14,9 +14,9 @@ Axis = Sequence[float] | np.ndarray
 Rows = Sequence[Sequence[float]] | np.ndarray
 DATA = Path(__file__).parent / "data"
 STALL_KNOT = 0.5
-"""Where the two pieces of the stall element meet, as a fraction of the table's least λ."""
+"""Knot between the two pieces of the stall element, as a fraction of the table's least λ."""
 STALL_SHARE = 0.2
-"""C_p there, as a fraction of C_p at the table's least λ; it keeps C_p positive on the rotors of this folder."""
+"""C_p at that knot, as a fraction of C_p at the table's least λ; it keeps C_p positive on the rotors of this folder."""
 
 
 class PowerCoefficientTable(nn.Module):
@@ -24,18 +24,19 @@ class PowerCoefficientTable(nn.Module):
 
     .. math:: C_p(\lambda, \beta) = \sum_{m,n=0}^{3} c_{ij,mn} (\lambda-\lambda_i)^m (\beta-\beta_j)^n
 
-    - *Table*: the not-a-knot tensor-product cubic spline through the values, twice continuously differentiable.
-    - *Stall*, λ below the first row λ_1: C_p goes to zero like λ², so that the torque ½ρπR³(C_p/λ)u² vanishes at
+    - *Table*: within the table C_p is the not-a-knot tensor-product cubic spline through the values, which is twice
+      continuously differentiable.
+    - *Stall*: below the first row λ_1, C_p goes to zero like λ², so that the torque ½ρπR³(C_p/λ)u² vanishes at
       standstill. With :math:`\lambda_0 = \lambda_1/2`, it is
       :math:`C_p = 0.2\,C_p(\lambda_1,\beta)(\lambda/\lambda_0)^2` up to λ_0, then the cubic that meets value and slope
-      at both ends. One cubic :math:`\lambda^2(a + b\lambda)` would take one cell less, but on a steep table (slope
-      above three times C_p/λ_1, as on the NREL 5-MW at fine pitch) it has a < 0: the wind would brake a slow rotor and
-      hold it at standstill for good, which blade-element momentum theory contradicts. Below λ = 0, C_p = 0.
-    - *Extrapolation*, λ above the last row and β on either side: linear, with value and slope of the table's edge. An
-      overspeeding rotor is braked (C_p falls below zero); no value is clipped.
+      at both ends. One cubic :math:`\lambda^2(a + b\lambda)` would take one cell less. On a steep table, however, with
+      a slope above three times C_p/λ_1 as on the NREL 5-MW at fine pitch, it has a < 0: the wind would brake a slow
+      rotor and hold it at standstill for good, which blade-element momentum theory contradicts. Below λ = 0, C_p is 0.
+    - *Extrapolation*: for λ above the last row and for β outside the columns, C_p is linear, with value and slope of
+      the table's edge. An overspeeding rotor is braked (C_p falls below zero); no value is clipped.
 
     C_p is continuously differentiable everywhere. The extensions are cells of the same polynomial, so that an
-    evaluation is a search, a gather and Horner's rule, with no case distinction.
+    evaluation is a search, a gather and Horner's rule, without case distinction.
 
     Args:
         tip_speed_ratio: rows λ = ω_r R/u [-], positive and increasing, at least four.
@@ -87,10 +88,10 @@ class PowerCoefficientTable(nn.Module):
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "PowerCoefficientTable":
-        """Read a table: a header with the pitch angles [deg] after one label, then rows of λ and C_p; ``#`` comments.
+        """Read a table with a header of a label and the pitch angles [deg], rows of λ and C_p, and ``#`` comments.
 
         Raises:
-            ValueError: if an entry is no number or the rows differ in length, with the path.
+            ValueError: if an entry is no number or the rows differ in length; the message names the path.
         """
         header, *rows = csv_rows(path)
         try:
@@ -108,12 +109,12 @@ class PowerCoefficientTable(nn.Module):
 
     @classmethod
     def nrel5mw(cls) -> "PowerCoefficientTable":
-        """The NREL 5-MW rotor, λ 2…14.5 and β -5…30 deg, by blade-element momentum; source in ``data/NOTICE.md``."""
+        """The NREL 5-MW rotor by blade-element momentum, λ 2…14.5, β -5…30 deg; ``data/NOTICE.md`` names the source."""
         return cls.from_csv(DATA / "nrel5mw_Cp_table_rosco.csv")
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
-        """C_p [-] at tip-speed ratio λ [-] and pitch β [deg], the two features, of the module's dtype (float64)."""
-        # The search wants contiguous memory; Tensor.contiguous would not see the batch dimension of torch.func.vmap.
+        """C_p [-] at the features, tip-speed ratio λ [-] and pitch β [deg], in the module's dtype (float64)."""
+        # The search needs contiguous memory; Tensor.contiguous does not see the batch dimension of torch.func.vmap.
         lam, beta = (features[..., k].clone(memory_format=torch.contiguous_format) for k in (0, 1))
         i = torch.bucketize(lam, self._lam_knots, right=True)
         j = torch.bucketize(beta, self.pitch, right=True)
@@ -126,13 +127,13 @@ class PowerCoefficientTable(nn.Module):
 
     @torch.no_grad()
     def maximum(self, pitch: float | None = 0.0) -> tuple[float, float, float]:
-        """Highest C_p of the table's range and where it is.
+        """The highest C_p in the table's range, and its place.
 
         Args:
-            pitch: search along this pitch angle [deg], fine pitch unless told; None searches all pitch angles.
+            pitch: pitch angle of the search [deg], by default fine pitch; None searches all pitch angles.
 
         Returns:
-            C_p,max [-], λ* [-], β* [deg]; λ* and β* to about 1e-7, the square root of the rounding error.
+            C_p,max [-], λ* [-], β* [deg]; λ* and β* err by about 1e-7, the square root of the rounding error.
 
         Raises:
             ValueError: if ``pitch`` lies outside the table.
@@ -144,7 +145,7 @@ class PowerCoefficientTable(nn.Module):
             )
         lam, beta = self.tip_speed_ratio, self.pitch if pitch is None else self.pitch.new_tensor([pitch])
         lam_axis, beta_axis = _subdivided(lam, 8), _subdivided(beta, 8)
-        for _ in range(9):  # each pass narrows the box to a tenth: to 1e-8 of a table cell
+        for _ in range(9):  # each pass narrows the box to a tenth, in the end to 1e-8 of a table cell
             grid = torch.cartesian_prod(lam_axis, beta_axis).reshape(-1, 2)
             values = self(grid).squeeze(-1)
             best = values.argmax()
@@ -160,7 +161,7 @@ class PowerCoefficientTable(nn.Module):
 
 
 def csv_rows(path: str | Path) -> list[list[str]]:
-    """Rows of a comma-separated file, header first, without blank lines and ``#`` comments.
+    """The rows of a comma-separated file from the header on, without blank lines and ``#`` comments.
 
     Raises:
         ValueError: if there is no row below the header.
@@ -203,7 +204,7 @@ def _add_stall(
 
 
 def _origins(knots: Float[np.ndarray, " n"]) -> Float[np.ndarray, " cells"]:
-    """Origin of the local coordinate in each cell, outer ones included."""
+    """Origin of the local coordinate in each cell, including the outer cells."""
     return np.concatenate([knots[:1], knots])
 
 
@@ -214,7 +215,7 @@ def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
 
 
 def _neighbours(axis: Float[Tensor, " n"], at: Float[Tensor, ""]) -> Float[Tensor, " m"]:
-    """The points of an axis around one of them; three on either side, since a slanting ridge moves the best point."""
+    """The three points of an axis on either side of one of them: a slanting ridge moves the best point."""
     index = int(torch.searchsorted(axis, at))
     return axis[max(index - 3, 0) : index + 4]
 

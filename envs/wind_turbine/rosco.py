@@ -1,7 +1,7 @@
-"""NREL's ROSCO simulator of the 5-MW turbine as a real system, and ROSCO's own controller to compare with.
+"""NREL's ROSCO simulator of the 5-MW turbine as a real system, and ROSCO's own controller for comparison.
 
-The simulator owns its loop and calls a controller; here that call is answered by a policy. See
-https://github.com/NREL/ROSCO; Apache License 2.0.
+The simulator owns its loop and calls a controller; here a policy answers the call. Source:
+https://github.com/NREL/ROSCO, Apache License 2.0.
 """
 
 import contextlib
@@ -32,10 +32,10 @@ STEP = 0.1
 
 @cache
 def rosco() -> ModuleType:
-    """The toolbox, with its modules.
+    """ROSCO's toolbox with its modules.
 
     Raises:
-        ValueError: if it is not installed.
+        ValueError: if the toolbox is not installed.
     """
     try:
         import rosco
@@ -49,7 +49,7 @@ def rosco() -> ModuleType:
 
 
 def examples() -> Path:
-    """Where ROSCO's package keeps the reference turbines."""
+    """The folder of the reference turbines in ROSCO's package."""
     return Path(str(rosco().__file__)).parent.parent / "Examples"
 
 
@@ -73,7 +73,7 @@ def nrel5mw() -> Any:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Nothing on the terminal, neither from Python nor from the compiled controller, which writes to it directly."""
+    """A context in which neither Python nor the compiled controller, which bypasses Python, writes to the terminal."""
     sys.stdout.flush()
     kept = os.dup(1)
     with open(os.devnull, "w") as nowhere:
@@ -87,11 +87,11 @@ def silenced() -> Iterator[None]:
 
 
 class Instruments:
-    """The state of the plant as it is measured: rotor speed and actuators as told, the filters run along.
+    """The measured state of the plant: reported rotor speed and actuators, and filters that run along.
 
     Args:
-        plant: whose filters these are.
-        state: at the start of the episode; filters and actuators begin there.
+        plant: plant with the filters.
+        state: state at the start of the episode, from which filters and actuators begin.
     """
 
     def __init__(self, plant: WindTurbine, state: Tensor):
@@ -102,7 +102,7 @@ class Instruments:
         self.state[0] = rotor_speed
 
     def advance(self, rotor_speed: float, wind: float) -> None:
-        """Over one step of the simulator, under the wind that acted in it: the filters by Heun's method."""
+        """Take the filters over one step of the simulator by Heun's method, under the wind that acted in it."""
         before, after = self.state, self.state.clone()
         after[0] = rotor_speed
         slope = self._slope(before, wind)
@@ -116,24 +116,24 @@ class Instruments:
         return rate[self._filters]
 
     def latch(self, applied: Tensor) -> None:
-        """Remember what the actuators are told."""
+        """Remember the action that the actuators receive."""
         self.state = self.plant.latch(self.state, applied)
 
 
 MEASURED = ("generator_torque", "blade_pitch")
-"""States of the plant that are the actuators'."""
+"""States of the plant that belong to the actuators."""
 
 
 class Answer:
-    """Stands where ROSCO's simulator expects its interface to a compiled controller.
+    """Takes the place of the compiled controller's interface in ROSCO's simulator.
 
     Args:
-        plant: the twin's physics, whose signals and actuators these are.
+        plant: the twin's physics, with signals and actuators.
         start: state at the start of the episode.
-        wind: of every control interval [m/s].
-        decide: (torque [N m], pitch [deg]) to apply from a state, the wind of the interval to come, and what the
-            simulator tells; asked every ``every`` steps, and in between what was applied is held.
-        every: steps of the simulator between two decisions.
+        wind: wind speeds of all control intervals [m/s].
+        decide: function that returns the action (torque [N m], pitch [deg]) for a state, the wind of the interval to
+            come, and the simulator's report. It is called every ``every`` steps; in between the action is held.
+        every: number of steps of the simulator between two decisions.
     """
 
     def __init__(
@@ -163,21 +163,21 @@ class Answer:
         return torque * share, math.radians(pitch), 0.0
 
     def kill_discon(self) -> None:
-        """Nothing to unload."""
+        """Do nothing, because there is no library to unload."""
 
 
 def simulate(plant: WindTurbine, seed: int, answer: Callable[[Tensor, np.ndarray], Any]) -> None:
-    """One episode of ROSCO's simulator, with start and wind as the plant draws them from a seed.
+    """Run one episode of ROSCO's simulator, with a start and a wind that the plant draws from the seed.
 
     Args:
         plant: the twin's physics.
-        seed: of the episode.
-        answer: makes the controller interface from start state and wind.
+        seed: seed of the episode.
+        answer: function that makes the controller interface from start state and wind.
     """
     generator = torch.Generator().manual_seed(seed)
     start = plant.draw_initial_state(1, generator)[0]
     wind = plant.draw_exogenous(1, generator)[0, :, 0].numpy()
-    # The simulator moves once before its first call and the wind of a step stands at its end.
+    # The simulator moves once before its first call, and it uses the wind at the end of a step.
     series = np.concatenate([wind[:1], wind[:1], wind.repeat(steps_of(plant))])
     interface = answer(start, wind)
     simulator = rosco().toolbox.sim.Sim(nrel5mw(), interface)
@@ -188,7 +188,7 @@ def simulate(plant: WindTurbine, seed: int, answer: Callable[[Tensor, np.ndarray
 
 
 def steps_of(plant: WindTurbine) -> int:
-    """Steps of the simulator in a control interval.
+    """The number of the simulator's steps in a control interval.
 
     Raises:
         ValueError: if the interval is no multiple of a step.
@@ -200,12 +200,12 @@ def steps_of(plant: WindTurbine) -> int:
 
 
 def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | str = "cpu") -> RealSystem:
-    """The real system. Ranges and rates of the actuators are the plant's, because ROSCO's simulator has none.
+    """ROSCO's simulator as the real system, with the plant's ranges and rates of the actuators; it has none itself.
 
     Args:
-        plant: the twin's physics; start and wind of every episode are as it draws them.
-        seed: of the episodes.
-        device: where its entries go.
+        plant: the twin's physics, which also draws start and wind of every episode.
+        seed: seed of the episodes.
+        device: device of the reported tensors.
 
     Raises:
         ValueError: if ROSCO is not installed, or the plant's control interval does not fit.
@@ -226,10 +226,10 @@ def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | s
 
 
 class RoscoController(RealController):
-    """ROSCO's compiled controller, as ROSCO tunes it for this turbine, in ROSCO's simulator.
+    """ROSCO's compiled controller in ROSCO's simulator, with ROSCO's tuning for this turbine.
 
-    It decides at every step of the simulator; what counts as applied in a control interval is what it asks for at the
-    start of it. For its arguments see :class:`RealController`.
+    The controller decides at every step of the simulator. The action at the start of a control interval counts as the
+    applied action of that interval. :class:`RealController` describes the arguments.
     """
 
     plant: WindTurbine
@@ -256,7 +256,7 @@ class RoscoController(RealController):
 
             with silenced():
                 simulate(self.plant, seed, lambda start, wind: Answer(self.plant, start, wind.repeat(every), decide, 1))
-                # Its Fortran runtime would otherwise write what it holds when nobody keeps it off the terminal.
+                # The Fortran runtime would otherwise write its buffers to the terminal after this context.
                 if hasattr(interface.discon, "_gfortran_flush_i4"):
                     interface.discon._gfortran_flush_i4(None)
                 interface.kill_discon()
@@ -265,9 +265,10 @@ class RoscoController(RealController):
 
 
 def controller_interface(folder: Path) -> Any:
-    """ROSCO's controller, tuned by ROSCO, with its inputs and logs in a folder.
+    """ROSCO's controller with ROSCO's tuning, and with its inputs and logs in a folder.
 
-    The wind is measured, not estimated: ROSCO's simulator is known to upset the estimators.
+    The controller measures the wind and does not estimate it, because ROSCO's simulator is known to upset
+    the estimators.
     """
     toolbox, path = rosco().toolbox, str(folder / "DISCON.IN")
     with silenced():

@@ -12,13 +12,13 @@ from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
 
 
 def read_wind(path: str | os.PathLike) -> WindRecord:
-    """Wind at the hub from a TurbSim file of either kind, told apart by the suffix.
+    """Wind at the hub from a TurbSim file of either kind; the suffix tells the kind.
 
     Args:
-        path: a ``.hh`` file, see :func:`read_hh`, or a ``.bts`` file, see :func:`read_bts`.
+        path: path of a ``.hh`` file, see :func:`read_hh`, or of a ``.bts`` file, see :func:`read_bts`.
 
     Raises:
-        ValueError: if the suffix is another, there is no such file, or it is malformed.
+        ValueError: if the suffix is another one, or the file does not exist or is malformed.
     """
     readers = {".hh": read_hh, ".bts": read_bts}
     suffix = Path(path).suffix.lower()
@@ -42,15 +42,15 @@ def read_hh(path: str | os.PathLike) -> WindRecord:
 
     .. math:: u = (V_{hor} + V_{gust}) \cos\delta
 
-    The horizontal speed alone contains the lateral turbulence and is larger than u by 1 % at 16 % turbulence; with the
-    direction, u is the one of the ``.bts`` file of the same run.
+    The horizontal speed alone contains the lateral turbulence and exceeds u by 1 % at 16 % turbulence. With the
+    direction, u agrees with the ``.bts`` file of the same run.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Raises:
-        ValueError: with the line, if one has too few columns or a value that is no finite number; otherwise as
-            :class:`WindRecord`.
+        ValueError: if a line has too few columns or a value that is no finite number; the message names the line.
+            Otherwise as in :class:`WindRecord`.
 
     Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198; OpenFAST InflowWind, uniform wind.
     """
@@ -115,17 +115,17 @@ _HEADER = struct.Struct("<h4i12fi")
 def read_bts(path: str | os.PathLike) -> WindRecord:
     r"""Longitudinal wind at the hub from a binary full field, TurbSim's ``.bts`` (``WrADFF``).
 
-    The file is little endian: a header (:class:`_FieldHeader`), a description, then for every time step 16-bit
-    integers, the components u, v, w fastest, y next, z slowest, and last the points of the tower. A velocity is
-    :math:`v = (\mathrm{raw} - \mathrm{offset})/\mathrm{slope}`. The hub, on the middle of the grid's width, need not be
-    a grid point: u is interpolated bilinearly between the four around it.
+    The file is little endian. It holds a header (:class:`_FieldHeader`), a description, and 16-bit integers for every
+    time step: those of the grid, with the components u, v, w fastest, y next and z slowest, then those of the tower. A
+    velocity is :math:`v = (\mathrm{raw} - \mathrm{offset})/\mathrm{slope}`. The hub is at the middle of the grid's
+    width and need not be a grid point: u is interpolated bilinearly between the four points around it.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Raises:
-        ValueError: if the file is not of this format, its length is not the one its header implies, or the hub lies
-            outside the grid; otherwise as :class:`WindRecord`.
+        ValueError: if the file is not of this format, its length is not the one that its header implies, or the hub
+            lies outside the grid; otherwise as in :class:`WindRecord`.
 
     Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198, appendix on binary full-field files.
     """
@@ -141,14 +141,14 @@ def read_bts(path: str | os.PathLike) -> WindRecord:
             f"{header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies {expected} bytes. "
             "Copy the file again, in binary mode, or run TurbSim again."
         )
-    # The field is mapped, not read: it has hundreds of megabytes, of which the hub needs four columns. The reader of
-    # openfast_toolbox and weio allocates what the header declares, in double precision, and checks no length.
+    # The field is mapped and not read, because it has hundreds of megabytes, of which the hub needs four columns. The
+    # reader of openfast_toolbox and weio allocates what the header declares, in double precision, and checks no length.
     raw = np.memmap(path, dtype="<i2", mode="r", offset=start, shape=shape)
     z = _interpolation(path, (header.hub_height - header.bottom) / header.dz, header.n_z, "height")
     y = _interpolation(path, 0.5 * (header.n_y - 1), header.n_y, "width")
     corners = [a * b * raw[:, i * header.n_y + j, 0].astype(np.float64) for i, a in z for j, b in y]
     hub = np.sum(corners, axis=0)
-    # The interval is stored in single precision: its shortest decimal is the number that was asked for.
+    # The interval is stored in single precision; its shortest decimal is the number that TurbSim was given.
     dt = float(str(np.float32(header.dt)))
     return WindRecord(dt * np.arange(header.n_t), (hub - header.u_offset) / header.u_slope, str(path))
 
@@ -178,7 +178,7 @@ def _read_header(path: str | os.PathLike) -> _FieldHeader:
 
 
 def _interpolation(path: str | os.PathLike, position: float, n: int, side: str) -> list[tuple[int, float]]:
-    """Grid points around a position counted in grid spacings, with their linear weights."""
+    """Grid points around a position in grid spacings, with their linear weights."""
     # A hub on the grid's edge may be off by the single precision of the heights.
     if not -1e-3 <= position <= n - 1 + 1e-3:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A rotor that has worn, as the real system's closure."""
+"""The closure of a worn rotor, for the real system."""
 
 import dataclasses
 
@@ -13,13 +13,13 @@ def worn_table(
 ) -> PowerCoefficientTable:
     """The table of the NREL 5-MW rotor after its polars have lost lift and gained drag.
 
-    The table is lowered by what blade-element momentum theory finds between the clean and the worn blade, so that the
-    theory's own error, RMS 0.004, is not taken for wear.
+    The table is lowered by the difference that blade-element momentum theory finds between the clean and the worn
+    blade, so that the theory's own error, RMS 0.004, does not count as wear.
 
     Args:
-        table: of the clean rotor.
-        lift_factor: on the lift of every section.
-        drag_factor: on its drag.
+        table: table of the clean rotor.
+        lift_factor: factor on the lift of every section.
+        drag_factor: factor on the drag of every section.
     """
     clean = Rotor.nrel5mw()
     polars = {name: p.worn(lift_factor=lift_factor, drag_factor=drag_factor) for name, p in clean.polars.items()}

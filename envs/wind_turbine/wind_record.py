@@ -15,9 +15,9 @@ class WindRecord:
     """Longitudinal wind at the hub at evenly spaced times; the arrays are copied and made read-only.
 
     Args:
-        time: sample times [s], a vector of n, increasing by equal steps to within the 1 ms that TurbSim prints.
+        time: sample times [s], a vector of n, which increase by equal steps to within the 1 ms that TurbSim prints.
         speed: longitudinal wind speed u [m/s], a vector of n, from 0 to ``GREATEST_SPEED``.
-        source: where the record comes from, such as the path of the file; named in every error.
+        source: origin of the record, such as the path of the file; every error names it.
 
     Raises:
         ValueError: if there are fewer than two samples, the lengths differ, a value is NaN or infinite, a time does not
@@ -44,7 +44,7 @@ class WindRecord:
 
     @property
     def step(self) -> float:
-        """Sampling interval [s], the mean one: it averages out the rounding of printed times."""
+        """Mean sampling interval [s], which averages out the rounding of printed times."""
         return self.duration / (len(self.time) - 1)
 
     def _check_shapes(self) -> None:
@@ -90,7 +90,7 @@ class WindRecord:
                 "increase. Sort the samples and drop repeated ones."
             )
         step = float(np.median(steps))
-        # Two times rounded to 1 ms give a step off by up to 1 ms; below 2 ms that would hide a missing sample.
+        # Two times rounded to 1 ms give a step that is off by up to 1 ms; below 2 ms this would hide a missing sample.
         tolerance = min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
         if not (bad := np.flatnonzero(np.abs(steps - step) > tolerance)).size:
             return

@@ -1,4 +1,4 @@
-"""Classical controllers: laws of the measured state that may have a memory, to compare learned policies with."""
+"""Classical controllers that learned policies are compared with: laws of the measured state, with or without memory."""
 
 from abc import ABC, abstractmethod
 
@@ -16,14 +16,14 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class ClassicalController(nn.Module, ABC):
-    r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k)` with memory m, which no ``policy(observation)`` can be.
+    r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k)` with a memory m, which a ``policy(observation)`` cannot have.
 
-    Its gains are held by their logarithms, so that a search changes each in proportion and never its sign.
+    The controller keeps the logarithms of its gains, so that a search changes a gain in proportion and never its sign.
 
     Args:
-        plant: what it controls; its actuators limit range and rate.
-        gains: in the order and the units of ``gain_units``; None for the defaults.
-        compiled: compile the flight.
+        plant: the plant to control; its actuators limit range and rate.
+        gains: values of the gains, in the order and the units of ``gain_units``; None for the defaults.
+        compiled: whether flights are compiled.
 
     Raises:
         ValueError: if the number of gains is wrong or one of them is not positive and finite.
@@ -33,7 +33,7 @@ class ClassicalController(nn.Module, ABC):
     """Unit of each gain, by name."""
     default_gains: tuple[float, ...] = ()
     placed_gains: tuple[float, ...] | None = None
-    """Gains by a rule of thumb, where a search is to start from them and not from the defaults."""
+    """Gains by a rule of thumb, if a search should start from them instead of the defaults."""
     memory_size: int = 0
     low_action: Tensor
     high_action: Tensor
@@ -56,14 +56,14 @@ class ClassicalController(nn.Module, ABC):
         return dict(zip(self.gain_units, self.log_gains.exp().tolist(), strict=True))
 
     def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
-        """Memory at the start of an episode; zeros unless overridden."""
+        """Memory at the start of an episode; zeros by default."""
         return state.new_zeros(len(state), self.memory_size)
 
     @abstractmethod
     def act(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
-        """Command, held to the ranges of the actions by the caller, and the new memory."""
+        """The command, which the caller clamps to the ranges of the actions, and the new memory."""
 
     @torch.no_grad()
     def fly(
@@ -72,7 +72,7 @@ class ClassicalController(nn.Module, ABC):
         exogenous: Float[Tensor, "batch n n_z"],
         closure: nn.Module | None = None,
     ) -> Trajectory:
-        """Real episodes under this controller, of a system with this closure; None for the plant's own."""
+        """Episodes under this controller, of a system with the closure; None takes the plant's own closure."""
         closure = self.plant.closure if closure is None else closure
         loop, n_s = ControlledInterval(self, closure), len(self.plant.states)
         start = marked_dynamic(torch.cat([initial_state, self.first_memory(initial_state)], -1), 0)
@@ -87,8 +87,8 @@ class ControlledInterval(Interval):
     """One control interval of a system under a classical controller; its state is (s, m).
 
     Args:
-        controller: with its plant.
-        closure: of the system.
+        controller: the controller, with its plant.
+        closure: closure of the system.
     """
 
     policy: ClassicalController
@@ -99,13 +99,13 @@ class ControlledInterval(Interval):
     def commanded(
         self, carry: Float[Tensor, "batch n_c"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
-        """The command within the ranges of the actions, and the new memory."""
+        """The command, clamped to the ranges of the actions, and the new memory."""
         n_s = len(self.plant.states)
         command, memory = self.policy.act(carry[..., :n_s], carry[..., n_s:])
         return command.clamp(self.policy.low_action, self.policy.high_action), memory
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
-        """(state, memory) at the end of the interval."""
+        """State and memory, (s, m), at the end of the interval."""
         command, memory = self.commanded(state)
         s = state[..., : len(self.plant.states)]
         end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state

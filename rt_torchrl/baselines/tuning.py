@@ -1,4 +1,4 @@
-"""Gains of a classical controller by a stated procedure: a simplex search for the least J_a on the real system."""
+"""Tuning of a classical controller: a simplex search for the gains of least J_a on the real system."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from rt_torchrl.trajectories.trajectory import control_cost
 
 @dataclass(frozen=True, kw_only=True)
 class Tuned:
-    """Mean J_a at the gains that the search started from and at those it found, and the evaluations it took."""
+    """Mean J_a at the first gains and at the gains that the search found, and the number of its evaluations."""
 
     start: float
     best: float
@@ -29,14 +29,14 @@ def tune(
     evaluations: int = 80,
     spread: float = 2.0,
 ) -> Tuned:
-    """Nelder and Mead's simplex over the logarithms of the gains, for the least mean J_a over the episodes given.
+    """Minimise the mean J_a of the episodes over the logarithms of the gains by Nelder and Mead's simplex.
 
     Args:
-        controller: starts from its present gains and is left with the best ones.
-        initial_state: of the episodes that it is tuned on.
-        exogenous: of the same.
-        evaluations: flights of all episodes at most.
-        spread: factor between the first simplex's corners, more than 1.
+        controller: the controller; the search starts from its present gains and leaves the best ones in it.
+        initial_state: initial states of the episodes.
+        exogenous: exogenous inputs of the episodes.
+        evaluations: greatest number of evaluations; each flies all episodes.
+        spread: factor on one gain between corners of the first simplex, more than 1.
 
     Raises:
         ValueError: if the controller has no gains, or an argument is out of its range.

@@ -1,4 +1,4 @@
-"""What a plant must fulfil, checked in one call: see :func:`check_plant`."""
+"""One call that checks the contract of a plant, see :func:`check_plant`."""
 
 from rt_torchrl.contract.check import ContractReport, PlantContractError, check_plant
 

@@ -1,4 +1,4 @@
-"""The methods of a plant with arguments that its episodes meet."""
+"""The methods of a plant, with arguments from its episodes."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ Arguments = dict[str, Tensor]
 
 
 class Method(NamedTuple):
-    """A method as a function of named tensors: which it takes, and name and trailing shape of what it gives."""
+    """A method as a function of named tensors: names of its arguments, and names and trailing shapes of its results."""
 
     name: str
     call: Callable[..., Any]
@@ -23,19 +23,19 @@ class Method(NamedTuple):
     gives: dict[str, tuple[int, ...]]
 
     def outputs(self, arguments: Arguments) -> tuple[Any, ...]:
-        """What it gives for arguments by name; others than it takes are left out."""
+        """The results of the method for named arguments; arguments that it does not take are ignored."""
         found = self.call(*(arguments[name] for name in self.takes))
         return tuple(found) if self.name == "step" and isinstance(found, tuple) else (found,)
 
 
 class Calls:
-    """Times, states, commands, actions and inputs of episodes, time first as the gradient engines stack them.
+    """Times, states, commands, actions and inputs of episodes, with the time first as in the gradient engines.
 
     Args:
         plant: the plant.
-        arguments: ``t`` is ``n 1``; ``state``, ``command``, ``applied``, ``exogenous`` and ``measured`` (states of
-            another episode) are ``n batch`` and their width.
-        seed: of the twin's closure.
+        arguments: tensors by name: ``t`` of shape ``n 1``; ``state``, ``command``, ``applied``, ``exogenous`` and
+            ``measured`` (states of another episode) of shape ``n batch`` and their number of signals.
+        seed: seed of the twin's closure.
     """
 
     def __init__(self, plant: Plant, arguments: Arguments, seed: int):
@@ -44,7 +44,7 @@ class Calls:
 
     @classmethod
     def at_the_start(cls, plant: Plant, episodes: int, seed: int) -> "Calls":
-        """The first interval of two groups of episodes, which needs no method of the plant but its draws."""
+        """Arguments in the first interval of two groups of episodes; they need only the draws of the plant."""
         generator = seeded(seed)
         state = plant.draw_initial_state(2 * episodes, generator)
         exogenous = plant.draw_exogenous(2 * episodes, generator)[:, 0]
@@ -56,7 +56,7 @@ class Calls:
     @classmethod
     @torch.no_grad()
     def in_flight(cls, plant: Plant, episodes: int, steps: int, seed: int) -> "Calls":
-        """All intervals of flights of the true plant under random commands.
+        """Arguments in all intervals of flights of the true plant under random commands.
 
         Raises:
             DivergenceError: if a flight leaves the finite numbers.
@@ -71,7 +71,7 @@ class Calls:
         return cls(plant, _named(t, *rows), seed)
 
     def methods(self) -> list[Method]:
-        """Every method with its arguments; those that take a closure with the true one and with the twin's."""
+        """Every method; a method that takes a closure comes with the true closure and with that of the twin."""
         plant = self.plant
         n_s, n_a, n_o = len(plant.states), len(plant.actions), len(plant.observations)
         now = ("t", "state", "applied", "exogenous")
@@ -91,14 +91,14 @@ class Calls:
         return found
 
     def some(self, count: int) -> Arguments:
-        """At most so many times, spread over the flights, with all episodes."""
+        """The arguments at ``count`` times at most, which are spread over the flights, for all episodes."""
         n = len(self.arguments["t"])
         at = torch.linspace(0, n - 1, min(count, n)).round().long()
         return {name: value[at].clone() for name, value in self.arguments.items()}
 
 
 def random_commands(plant: Plant, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    """Uniform within the ranges of the actions."""
+    """Random commands, uniform within the ranges of the actions."""
     low, high = bounds(plant.actions)
     share = torch.rand(*shape, len(plant.actions), generator=generator, dtype=torch.float64)
     return low + share * (high - low)

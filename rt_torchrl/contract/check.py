@@ -1,4 +1,4 @@
-"""One call that finds what is wrong with a plant, before a training finds it."""
+"""One call that finds what is wrong with a plant, before a training does."""
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator
@@ -28,13 +28,13 @@ ON_FLIGHTS: dict[str, Check] = {
 
 
 class ContractReport(NamedTuple):
-    """What :func:`check_plant` looked at and found to be right; ``print`` shows it in words.
+    """The checks of :func:`check_plant` that a plant has passed; ``print`` shows them in words.
 
     Args:
-        plant: its name.
-        checks: what was checked.
+        plant: name of the plant.
+        checks: names of the checks.
         episodes: number of flights.
-        steps: control intervals of each.
+        steps: number of control intervals of each flight.
         dt: control interval [s].
     """
 
@@ -52,7 +52,7 @@ class ContractReport(NamedTuple):
 
 
 class PlantContractError(ValueError):
-    """A plant does not fulfil its contract; ``violations`` holds a message for each way in which it does not."""
+    """A plant does not fulfil its contract; ``violations`` holds a message for each violation."""
 
     def __init__(self, plant: str, violations: list[str]):
         self.violations = violations
@@ -63,28 +63,29 @@ class PlantContractError(ValueError):
 def check_plant(
     plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int = 0, traced: bool = True
 ) -> ContractReport:
-    """Find what of the :class:`Plant` contract a plant does not fulfil: everything at once, not the first alone.
+    """Find all violations of the :class:`Plant` contract at once, not the first one alone.
 
-    Looked at, on states that ``episodes`` short flights under random commands visit: signals and their ranges; shapes,
-    precision and finiteness of every method under any leading dimensions; purity; draws and their generator; closures
-    and policy; that the step applies what the actuators say; costs; that a turn of a periodic state changes nothing;
-    gradients against finite differences; forward mode and one graph, as the engines and the compiler need them; and
-    the stability of the Runge-Kutta step. A check whose ground another one took away is left out.
+    The function flies ``episodes`` short flights under random commands, and checks the plant at the states that they
+    visit: signals and their ranges; shapes, precision and finiteness of every method under any leading dimensions;
+    purity; draws and their generator; closures and policy; the applied action of the step against the actuators; costs;
+    a turn of a periodic state, which must change nothing; gradients against finite differences; forward mode and one
+    graph, which the engines and the compiler need; and the stability of the Runge-Kutta step. A check is left out if
+    an earlier violation makes it impossible.
 
     Args:
-        plant: at the time step that it will be trained with.
+        plant: the plant, with the time step of its training.
         episodes: number of flights, at least 2.
-        steps: control intervals of each, at least 2; at most an episode's.
-        seed: of the draws and of the random commands.
-        traced: also trace the methods into one graph. It takes seconds, and methods that are checked at run time by
-            jaxtyping cannot be traced.
+        steps: number of control intervals of each flight, at least 2 and at most that of an episode.
+        seed: seed of the draws and of the random commands.
+        traced: whether the methods are also traced into one graph. Tracing takes seconds, and methods that jaxtyping
+            checks at run time cannot be traced.
 
     Returns:
-        What was checked; nothing is printed.
+        The checks that were made; the function prints nothing.
 
     Raises:
-        PlantContractError: with a message for each violation: the method, what was found, what is expected, and what
-            to change.
+        PlantContractError: if the plant violates its contract. A message for each violation names the method, what was
+            found, what is expected, and what to change.
         ValueError: if ``episodes`` or ``steps`` is below 2.
     """
     for argument, value in (("episodes", episodes), ("steps", steps)):
@@ -101,7 +102,7 @@ def check_plant(
 
 
 def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iterable[Check]) -> list[str]:
-    """The checks that need states; each only where those before it have left something to check."""
+    """The violations that need states to be found; an early violation ends the search."""
     calls = Calls.at_the_start(plant, episodes, seed)
     found = [*attempt(methods, calls), *attempt(stability, calls)]
     if found:
@@ -114,7 +115,7 @@ def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iter
 
 
 def attempt(check: Callable[..., Iterable[str]], *arguments: Any) -> Iterator[str]:
-    """The violations that a check finds; what the plant itself raises is one more."""
+    """The violations that a check finds; an error that the plant raises is one more."""
     try:
         yield from check(*arguments)
     except Exception as error:
@@ -127,9 +128,9 @@ def attempt(check: Callable[..., Iterable[str]], *arguments: Any) -> Iterator[st
 
 
 def _blamed(trace: list[inspect.FrameInfo], checked: Plant | Calls) -> tuple[str, inspect.FrameInfo]:
-    """The method of the plant that was called when an error came up, and the last line of the user's code before it.
+    """The method of the plant that raised an error, and the last frame of the user's code before the error.
 
-    Without a frame of the plant, the last one: that call itself failed.
+    If there is no frame of the plant, the call itself failed; the result is then the last frame.
     """
     plant = checked.plant if isinstance(checked, Calls) else checked
     own = [frame for frame in trace if frame.frame.f_locals.get("self") is plant and hasattr(plant, frame.function)]

@@ -1,4 +1,4 @@
-"""Costs that can be descended, and a step that applies what the actuators say."""
+"""Checks of the costs, and of the action that a step applies."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from rt_torchrl.contract.calls import Calls
 
 @torch.no_grad()
 def costs(calls: Calls) -> Iterator[str]:
-    """Signs of the costs; the step's applied action; and that to command it again changes nothing."""
+    """Violations in the signs of the costs, in the applied action of a step, and in commanding that action again."""
     plant, found = calls.plant, calls.arguments
     for method in calls.methods():
         if method.name in ("running_cost", "discrepancy"):

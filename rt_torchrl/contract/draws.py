@@ -1,4 +1,4 @@
-"""What a plant draws: initial states, inputs, closures and policies."""
+"""Checks of what a plant draws: initial states, inputs, closures and policies."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -13,12 +13,12 @@ BATCH = 3
 
 
 def seeded(seed: int) -> torch.Generator:
-    """A generator of its own."""
+    """A new generator with the seed."""
     return torch.Generator().manual_seed(seed)
 
 
 def draws(plant: Plant, seed: int) -> Iterator[str]:
-    """Shape, precision, range and source of the initial states and of the inputs."""
+    """Violations in shape, precision, range and source of the initial states and of the inputs."""
     n_s, n_z = len(plant.states), len(plant.inputs)
     wanted = {
         "draw_initial_state": (partial(plant.draw_initial_state, BATCH), (BATCH, n_s), plant.states),
@@ -40,7 +40,7 @@ def draws(plant: Plant, seed: int) -> Iterator[str]:
 
 
 def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
-    """What is wrong with a value that should be a finite float64 tensor of that shape; None if nothing."""
+    """The fault of a value that should be a finite float64 tensor of the shape; None if there is no fault."""
     if not isinstance(value, Tensor):
         return f"a {type(value).__name__}"
     if tuple(value.shape) != shape:
@@ -53,7 +53,7 @@ def misshapen(value: object, shape: tuple[int, ...]) -> str | None:
 
 
 def wanted_as(shape: tuple[int, ...]) -> str:
-    """What a finding says that it expected."""
+    """The expected value, in words for a message."""
     return f"finite numbers of shape {shape} in torch.float64"
 
 
@@ -67,7 +67,10 @@ def _out_of_range(name: str, drawn: Tensor, group: tuple[Signal, ...]) -> Iterat
 
 
 def _other_sources(name: str, draw: Callable[[], Tensor]) -> Iterator[str]:
-    """Torch's global numbers may be drawn, as layers do before they are overwritten, but nothing may depend on them."""
+    """A violation if the draw depends on more than its generator.
+
+    It may draw torch's global random numbers, as layers do before their weights are overwritten, but may not use them.
+    """
     kept = torch.random.get_rng_state()
     first = draw()
     torch.random.set_rng_state(kept)
@@ -85,7 +88,7 @@ def _other_sources(name: str, draw: Callable[[], Tensor]) -> Iterator[str]:
 
 
 def _ignored_generator(name: str, drawn: Tensor, other: Tensor) -> Iterator[str]:
-    """Draws may be the same in every episode; episodes that differ, but not by the seed, have numbers of their own."""
+    """A violation if episodes differ from each other but not between seeds; all episodes may be the same."""
     if torch.equal(drawn, other) and not torch.equal(drawn, drawn[:1].expand_as(drawn)):
         yield (
             f"{name}: draws different episodes, but the same ones for generators of another seed; take every random "
@@ -94,7 +97,7 @@ def _ignored_generator(name: str, drawn: Tensor, other: Tensor) -> Iterator[str]
 
 
 def modules(plant: Plant, seed: int) -> Iterator[str]:
-    """Precision and source of the weights of closures and policy, and what the policy does."""
+    """Violations in precision and source of the weights of closures and policy, and in the policy's commands."""
     made = {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
     for name, make in made.items():
         first = make(seeded(seed))
@@ -125,7 +128,7 @@ def _single_precision(name: str, module: nn.Module) -> Iterator[str]:
 
 
 def _commands(plant: Plant, seed: int) -> Iterator[str]:
-    """On observations of order one, as they should be scaled."""
+    """Violations in the policy's commands for observations of order one, as they should be scaled."""
     policy = plant.make_policy(seeded(seed))
     count, n_o = 50, len(plant.observations)
     seen = 3.0 * torch.rand(count, n_o, generator=seeded(seed), dtype=torch.float64) - 1.5

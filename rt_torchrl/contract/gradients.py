@@ -1,4 +1,4 @@
-"""Derivatives of the methods against finite differences."""
+"""Checks of the methods' derivatives against finite differences."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -11,17 +11,17 @@ from rt_torchrl.contract.draws import seeded
 
 MANY = 5
 STEP = 1e-6
-"""Of an argument's size; a central difference then errs by 1e-10 by rounding and by 1e-12 by curvature."""
+"""Step of a difference, as a share of the argument's size; rounding then errs by 1e-10, and curvature by 1e-12."""
 RELATIVE, ABSOLUTE = 1e-5, 1e-6
-"""Greatest gap, of the derivative and of the size of the method's value."""
+"""Greatest gap, as a share of the derivative and of the size of the method's value."""
 SIGNALS = {"state": "states", "command": "actions", "applied": "actions", "exogenous": "inputs"}
 CHECKED = ("vector_field", "step", "running_cost", "observe")
 
 
 def gradients(calls: Calls) -> Iterator[str]:
-    """Of each method by each state and action, and by each weight of the twin's closure, at states of flights.
+    """Wrong derivatives of each method by each state and action, and by each weight of the twin's closure.
 
-    What is told of a method under the true closure is not told again under the twin's.
+    They are taken at states of flights. A finding under the true closure is not repeated under the twin's closure.
     """
     arguments, told = calls.some(MANY), set()
     latest = {method.name: method for method in calls.methods()}  # under the twin's closure
@@ -61,7 +61,7 @@ def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: s
 
 
 def _by_weights(calls: Calls, method: Method, arguments: Arguments) -> Iterator[str]:
-    """Along one random direction for each tensor of weights."""
+    """Wrong derivatives along one random direction for each tensor of weights."""
     measure = _measure(method, arguments, calls.seed)
     weights = {name: w for name, w in calls.closure.named_parameters() if w.requires_grad}
     reached, gradient = _gradient(lambda: measure(arguments).sum(), list(weights.values()))
@@ -82,7 +82,7 @@ def _by_weights(calls: Calls, method: Method, arguments: Arguments) -> Iterator[
 
 @torch.no_grad()
 def _along(weight: nn.Parameter, direction: Tensor, measure: Callable[[], Tensor]) -> Tensor:
-    """Central difference; the weight is put back to the bit."""
+    """The central difference along a direction; the weight then has its value again, to the bit."""
     kept, ends = weight.clone(), []
     for sign in (1.0, -1.0):
         weight.copy_(kept + sign * STEP * direction)
@@ -108,7 +108,7 @@ def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[Argum
 
 
 def _gradient(measure: Callable[[], Tensor], inputs: list[Tensor]) -> tuple[bool, list[Tensor]]:
-    """Gradients, zero where autograd sees no path, and whether it sees one at all."""
+    """Whether autograd sees a path at all, and the gradients, which are zero where it sees none."""
     with torch.enable_grad():
         total = measure().sum()
         if not total.requires_grad:

@@ -1,4 +1,4 @@
-"""Shapes, precision and purity of the methods, under every leading dimension."""
+"""Checks of the methods' shapes, precision and purity, under every leading dimension."""
 
 from collections.abc import Iterator
 
@@ -9,12 +9,12 @@ from rt_torchrl.contract.calls import Arguments, Calls, Method
 from rt_torchrl.contract.draws import misshapen, wanted_as
 
 TOLERANCE = 1e-10
-"""Of the size of a value: vector instructions may round a power or an exponential differently in the last bits."""
+"""Greatest difference as a share of a value: vector instructions may round powers and exponentials differently."""
 
 
 @torch.no_grad()
 def methods(calls: Calls) -> Iterator[str]:
-    """For one state, for a batch, and for times by batches; as the engines, the environment and the costs call them."""
+    """Violations for one state, for a batch, and for times by batches, as engines, environment and costs call them."""
     together = calls.some(2)
     for method in calls.methods():
         found = list(_shapes(method, together)) or list(_purity(method, together)) or list(_rows(method, together))
@@ -23,14 +23,14 @@ def methods(calls: Calls) -> Iterator[str]:
 
 
 def _row(arguments: Arguments, k: int, b: int | None = None) -> Arguments:
-    """Of time k: all episodes, with the time as a scalar of its own dimension, or episode b without any dimension."""
+    """The arguments at time k, of all episodes with a time of shape ``1``, or of episode b alone with a scalar time."""
     if b is None:
         return {name: value[k] for name, value in arguments.items()}
     return {name: value[k, 0] if name == "t" else value[k, b] for name, value in arguments.items()}
 
 
 def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
-    """In the order in which they are easiest to get right."""
+    """The first wrong shape; the case that is easiest to get right comes first."""
     times, batch = arguments["state"].shape[:2]
     cases = {(): _row(arguments, 0, 0), (batch,): _row(arguments, 0), (times, batch): arguments}
     for lead, case in cases.items():
@@ -50,7 +50,7 @@ def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
 
 
 def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
-    """Arguments stay as they are, and the same ones give the same again, whatever was asked in between."""
+    """A violation if the method changes its arguments, or gives different results for the same arguments."""
     kept = {name: value.clone() for name, value in arguments.items()}
     first = [value.clone() for value in _tensors(method, arguments)]
     changed = [name for name in method.takes if not torch.equal(kept[name], arguments[name])]
@@ -73,7 +73,7 @@ def _tensors(method: Method, arguments: Arguments) -> list[Tensor]:
 
 
 def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
-    """What a batch gives is what its rows give one by one."""
+    """A violation if the results of a batch differ from those of its rows one by one."""
     times, batch = arguments["state"].shape[:2]
     together = method.outputs(arguments)
     rows = [[method.outputs(_row(arguments, k, b)) for b in range(batch)] for k in range(times)]
@@ -88,7 +88,7 @@ def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
 
 
 def _judgement(calls: Calls) -> Iterator[str]:
-    """Merit and categories of whole episodes."""
+    """Violations in merit and categories of whole episodes."""
     state, applied, exogenous = (calls.arguments[name].transpose(0, 1) for name in ("state", "applied", "exogenous"))
     batch, n = state.shape[:2]
     if n < 3:  # the start alone is no episode

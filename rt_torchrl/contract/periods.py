@@ -1,4 +1,4 @@
-"""A whole turn of a periodic state changes nothing."""
+"""A check that a whole turn of a periodic state changes nothing."""
 
 from collections.abc import Iterator
 
@@ -9,12 +9,12 @@ from rt_torchrl.contract.signals import GROUPS
 from rt_torchrl.plants.signal import differences
 
 TOLERANCE = 1e-6
-"""Of what a method gives, relative; the rounding of an angle that a turn was added to is far below."""
+"""Greatest relative change of a result; the rounding of an angle plus one turn is far smaller."""
 
 
 @torch.no_grad()
 def periods(calls: Calls) -> Iterator[str]:
-    """That states alone are periodic, and that what a plant says of one is the same a turn further."""
+    """Periodic signals that are no states, and methods whose results change with a turn of a periodic state."""
     plant, found = calls.plant, calls.arguments
     for group in GROUPS:
         for signal in getattr(plant, group):

@@ -1,4 +1,4 @@
-"""Are the signals of a plant declared?"""
+"""A check of the name and the signals that a plant declares."""
 
 import math
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ GROUPS = {"states": "n_s", "actions": "n_a", "inputs": "n_z", "observations": "n
 
 
 def signals(plant: Plant) -> Iterator[str]:
-    """Name, and the four tuples of signals with names, units and ranges."""
+    """Violations in the name and in the four tuples of signals, with their names, units and ranges."""
     name = getattr(plant, "name", None)
     if not isinstance(name, str) or not name.isidentifier():
         yield f"name: is {name!r}; give the class a name such as name = 'two_tanks', which run folders are called by."
@@ -31,7 +31,7 @@ def _of_group(group: str, declared: tuple[Signal, ...]) -> Iterator[str]:
     for signal in declared:
         for attribute in ("unit", "symbol"):
             if not getattr(signal, attribute):
-                yield f"{group}: {signal.name!r} has no {attribute}; give one (unit='-' for a number without)."
+                yield f"{group}: {signal.name!r} has no {attribute}; give one (unit='-' for a number without unit)."
         bounded = math.isfinite(signal.low) and math.isfinite(signal.high)
         if group == "actions" and not bounded:
             yield (

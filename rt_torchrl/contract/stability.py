@@ -1,4 +1,4 @@
-"""Does the explicit Runge-Kutta step stand the fastest decay of the plant?"""
+"""A check that the explicit Runge-Kutta step is stable for the fastest decay of the plant."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -10,16 +10,16 @@ from rt_torchrl.contract.calls import Arguments, Calls
 from rt_torchrl.plants.plant import Plant
 
 GROWTH = 1.0 + 1e-6
-"""Factor per step from which a mode that decays counts as growing; an undamped one has rounding around 1."""
+"""Factor per step above which a decaying mode counts as growing; that of an undamped mode is 1 to rounding."""
 MANY = 20
 
 
 @torch.no_grad()
 def stability(calls: Calls) -> Iterator[str]:
-    r"""Modes that decay in the plant must not grow in a step: |R(μΔt)| ≤ 1 where Re μ ≤ 0.
+    r"""A violation if a mode that decays in the plant grows in a step: |R(μΔt)| ≤ 1 must hold where Re μ ≤ 0.
 
-    With R(z) = 1 + z + z²/2 + z³/6 + z⁴/24, whose limit is 2.785 on the negative real axis and 2.83 on the imaginary
-    one. A plant with a step of its own answers for it itself.
+    R(z) = 1 + z + z²/2 + z³/6 + z⁴/24 reaches its limit at 2.785 on the negative real axis and at 2.83 on the imaginary
+    axis. A plant with a step of its own is not checked, because this R does not describe that step.
     """
     plant, arguments = calls.plant, calls.some(MANY)
     if not steps_by_runge_kutta(plant, arguments):
@@ -41,7 +41,7 @@ def stability(calls: Calls) -> Iterator[str]:
 
 
 def steps_by_runge_kutta(plant: Plant, arguments: Arguments) -> bool:
-    """Whether the plant's step is that of :class:`Plant`, as it is or in a wrapping."""
+    """Whether the plant's step has the results of :meth:`Plant.step`, which it may wrap."""
     t, state, command, exogenous = (arguments[name] for name in ("t", "state", "command", "exogenous"))
     steps = (plant.step, partial(Plant.step, plant))
     own, library = (step(t, state, command, exogenous, plant.closure).state for step in steps)
@@ -60,7 +60,7 @@ def jacobian(plant: Plant, closure: nn.Module, arguments: Arguments) -> Tensor:
 
 
 def amplification(z: Tensor) -> Tensor:
-    """|R(z)| of a four-stage Runge-Kutta step of fourth order."""
+    """The factor |R(z)| of a four-stage Runge-Kutta step of fourth order."""
     return (1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))).abs()
 
 

@@ -1,4 +1,4 @@
-"""Forward mode and one graph: what the engines and the compiler need of the methods."""
+"""Checks of forward mode and of tracing, which the engines and the compiler need."""
 
 from collections.abc import Iterator
 
@@ -18,9 +18,10 @@ MANY = 3
 
 
 def forward_mode(calls: Calls) -> Iterator[str]:
-    """The Jacobians of the step as the parallel engine takes them, by batched forward-mode products, against reverse.
+    """A violation if the Jacobian of the step by batched forward-mode products differs from that by reverse mode.
 
-    Both are exact: they differ by rounding, of numbers of a millionth of the greatest and above.
+    The parallel engine uses the forward-mode products. Both Jacobians are exact, so that only rounding may differ; it
+    is measured against entries down to a millionth of the greatest.
     """
     arguments = calls.some(MANY)
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
@@ -41,7 +42,7 @@ def forward_mode(calls: Calls) -> Iterator[str]:
 
 
 def tracing(calls: Calls) -> Iterator[str]:
-    """Each method as one graph; traced without a compiler, so that it is the plant and not the machine that fails."""
+    """Methods that are not one graph; they are traced without a compiler, so that only the plant can fail."""
     arguments = calls.some(MANY)
     for method in calls.methods():
 
@@ -56,7 +57,7 @@ def tracing(calls: Calls) -> Iterator[str]:
             continue
         for (name, _), one, other in zip(method.gives.items(), found, method.outputs(arguments), strict=True):
             if not torch.allclose(one, other, rtol=1e-10, atol=1e-10):
-                yield f"{method.name}: {name} is another one when it is traced; expected {REMEDY}."
+                yield f"{method.name}: {name} has another value when it is traced; expected {REMEDY}."
 
 
 def _first_line(error: Exception) -> str:

@@ -1,6 +1,6 @@
-"""Takes a trained policy away from the library: as a PyTorch program, an ONNX model or a C99 file.
+"""Export of a trained policy as a PyTorch program, an ONNX model or a C99 file.
 
-Every export is compared with the policy on random observations before a file is written, see :mod:`.agreement`.
+Before a file is written, the export is compared with the policy on random observations, see :mod:`.agreement`.
 """
 
 from rt_torchrl.export.c_file import export_c

@@ -1,4 +1,4 @@
-"""Whether what was exported acts as the policy does."""
+"""The comparison of an exported policy with the original."""
 
 import copy
 import math
@@ -13,18 +13,18 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
 
 TOLERANCE = 1e-6
-"""Greatest difference allowed, as a share of the action's range; what is computed in double precision needs 1e-12."""
+"""Greatest difference allowed, as a share of the action's range; computation in double precision needs 1e-12."""
 OBSERVATIONS = 1000
 SEED = 20_250_131
-"""Of the observations: the same for every export, and of no training."""
+"""Seed of the observations, which is the same for every export and is used in no training."""
 
 
 def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED) -> Float[Tensor, "{count} n_o"]:
-    """Random observations, the first of which is as near to zero as the ranges let it.
+    """Random observations, the first of which is as near to zero as the ranges allow.
 
-    Uniform over a signal's range. Without one or both of its bounds a signal, scaled to order one as observations are,
-    is normal (its absolute value added to the bound) with a deviation drawn from 0.1 ... 30: that covers the middle of
-    a policy and its saturated ends.
+    A signal with two bounds is uniform over its range. A signal without bounds is normal with a deviation drawn from
+    0.1 ... 30; with one bound, the absolute value of such a number is added to the bound or subtracted from it.
+    Observations are scaled to order one, so that these numbers reach the middle of a policy and its saturated ends.
     """
     generator, columns = torch.Generator().manual_seed(seed), []
     for signal in signals:
@@ -43,17 +43,18 @@ def sample_observations(signals: Sequence[Signal], count: int, seed: int = SEED)
 
 
 def detached(policy: nn.Module, plant: Plant) -> nn.Module:
-    """A copy on the CPU, in evaluation mode and without gradients, that is proved to be a policy of the plant.
+    """A copy of a policy on the CPU, in evaluation mode and without gradients, after a check that it fits the plant.
 
     Raises:
-        ValueError: if it does not map observations of the plant to its actions, in double precision, or changes itself.
+        ValueError: if the policy does not map the plant's observations to its actions in double precision, or if a call
+            changes its buffers.
     """
     policy = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
     name, n_o, n_a = type(policy).__name__, len(plant.observations), len(plant.actions)
     observations, before = sample_observations(plant.observations, 3), copy.deepcopy(dict(policy.named_buffers()))
     try:
         actions = policy(observations)
-    except Exception as error:  # of whatever the user's module is made of
+    except Exception as error:  # any error of the user's module
         raise ValueError(
             f"policy {name} cannot take float64 observations of shape (3, {n_o}) of plant {plant.name!r}: {error}"
         ) from error
@@ -75,19 +76,19 @@ def detached(policy: nn.Module, plant: Plant) -> nn.Module:
 def require_agreement(
     policy: nn.Module, exported: Callable[[Float[Tensor, "n n_o"]], Tensor], plant: Plant, *, what: str
 ) -> float:
-    """Compare on random observations, one, two and many at a time.
+    """Compare an export with its policy on random observations, one, two and many at a time.
 
     Args:
-        policy: the original.
-        exported: what a user of the exported file would compute.
-        plant: whose observations and ranges of actions.
-        what: the exported thing, for the message.
+        policy: the original policy.
+        exported: function that computes what a user of the exported file would compute.
+        plant: plant with the observations and the ranges of the actions.
+        what: name of the exported thing, for the message.
 
     Returns:
-        Greatest difference of an action as a share of its range, or of its greatest size where it has none.
+        Greatest difference of an action, as a share of its range or, for an action without range, of its greatest size.
 
     Raises:
-        ValueError: if it exceeds ``TOLERANCE``, or the policy's actions are not finite.
+        ValueError: if the difference exceeds ``TOLERANCE``, or the policy's actions are not finite.
     """
     observations = sample_observations(plant.observations, OBSERVATIONS)
     with torch.no_grad():

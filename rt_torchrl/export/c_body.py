@@ -13,12 +13,12 @@ from rt_torchrl.export.c_operators import literal
 
 WIDTH = 110
 LONGEST_NAME = 48
-"""C99 tells names apart by their first 63 characters; some are left for a number at the end."""
+"""Length to which names are cut: C99 compares 63 characters, of which some are left for a number at the end."""
 
 
 @dataclass(frozen=True)
 class Elements:
-    """A tensor whose elements are those of a C array, at these places."""
+    """A tensor whose elements are elements of a C array; ``places`` holds their places in it."""
 
     array: str
     places: Int[Tensor, "*shape"]
@@ -29,7 +29,7 @@ class Elements:
 
 
 def counted(shape: Sequence[int]) -> Int[Tensor, "*shape"]:
-    """The places of a new array, row by row."""
+    """The places of the elements of a new array, row by row."""
     return torch.arange(torch.Size(shape).numel()).view(tuple(shape))
 
 
@@ -44,13 +44,13 @@ class CBody:
         self._known: list[tuple[Tensor, Elements]] = []
 
     def begin(self, name: str, layer: str) -> None:
-        """What the next statements compute, and where it comes from."""
+        """Name the result of the next statements, and the layer that they come from."""
         self._name = name
         if layer not in self._layers:
             self._layers.append(layer)
 
     def constant(self, value: Tensor, label: str) -> Elements:
-        """An array of the file, written once however often it is read."""
+        """A constant array of the file, which is written once however often it is read."""
         for known, elements in self._known:
             if known is value:
                 return elements
@@ -61,28 +61,28 @@ class CBody:
         return self._known[-1][1]
 
     def read(self, elements: Elements, shape: Sequence[int]) -> str:
-        """The i-th element, broadcast to a shape and flattened."""
+        """The expression of the i-th element, broadcast to a shape and flattened."""
         return f"{elements.array}[{self._subscript(elements.places.expand(*shape).reshape(-1, 1))}]"
 
     def assign(self, expression: str, shape: Sequence[int]) -> Elements:
-        """A new array of that shape, whose i-th element the expression is."""
+        """A new array of the shape, with the expression as its i-th element."""
         result = self._local(shape)
         self._loop(result.places.numel(), f"{result.array}[I] = {expression};")
         return result
 
     def finish(self, expression: str, count: int) -> None:
-        """Write the action."""
+        """Write the elements of the action."""
         self._loop(count, f"action[I] = {expression};")
 
     @staticmethod
     def later(shape: Sequence[int]) -> Elements:
-        """Stands for what the expression of another result will hold."""
+        """A placeholder for elements that the expression of another result will hold."""
         return Elements("", counted(shape))
 
     def sum(
         self, factors: Sequence[Elements], shape: Sequence[int], *, start: str = "0.0", scale: str = "1.0"
     ) -> Elements:
-        """A new array, start + scale·Σ_j of the product of the factors, over their last dimension."""
+        """A new array, start + scale·Σ_j Π factors, where j runs over the last dimension of the factors."""
         count, rows = factors[0].places.shape[-1], torch.Size(shape).numel()
         places = [(f.array, f.places.expand(*shape, count).reshape(rows, count)) for f in factors]
         term = " * ".join(f"{array}[{self._subscript(p)}]" for array, p in places)
@@ -98,7 +98,7 @@ class CBody:
         return result
 
     def join(self, parts: Sequence[Elements], dim: int = 0) -> Elements:
-        """A new array of several, as torch.cat joins them."""
+        """A new array that joins several arrays as torch.cat does."""
         owner = torch.cat([torch.full_like(part.places, k) for k, part in enumerate(parts)], dim)
         places = torch.cat([part.places for part in parts], dim).flatten()
         result = self._local(owner.shape)
@@ -110,7 +110,7 @@ class CBody:
         return result
 
     def _loop(self, count: int, *lines: str) -> None:
-        """The lines for every i, which is written [I] where they write."""
+        """Write a loop of the lines over i; [I] stands for the subscript of the element that they write."""
         if self._layers:
             self.statements.append(f"/* {', '.join(self._layers)} */")
             self._layers.clear()
@@ -127,7 +127,7 @@ class CBody:
         return Elements(name, places)
 
     def _subscript(self, places: Int[Tensor, "rows columns"]) -> str:
-        """Where the element of row i and column j is: base + a·i + b·j, or looked up where there is no such rule."""
+        """The subscript of the element in row i and column j: base + a·i + b·j, or a look-up if no such rule holds."""
         rows, columns = places.shape
         base = int(places[0, 0])
         a = int(places[1, 0]) - base if rows > 1 else 0
@@ -147,7 +147,7 @@ class CBody:
         self.constants.append("\n".join([head, *(f"    {line}" for line in wrapped), "};"]))
 
     def _new(self, label: str) -> str:
-        """A name of its own; the letter in front keeps it apart from the words of C and math.h."""
+        """A name that is not taken yet; its first letter keeps it apart from the words of C and math.h."""
         stem = re.sub(r"[^0-9A-Za-z_]", "_", label)[:LONGEST_NAME]
         name, number = stem, 1
         while name in self._taken:

@@ -1,4 +1,4 @@
-"""The policy as a C99 file and its header, that need nothing but the C library's mathematics."""
+"""The policy as a C99 file and its header, which need nothing but the mathematics of the C library."""
 
 import ctypes
 import math
@@ -22,31 +22,32 @@ from rt_torchrl.plants.signal import Signal
 
 COMPILERS = ("cc", "gcc", "clang")
 EXAMPLES = 3
-"""Observations with their actions in the header, to try the function on the machine it is meant for."""
+"""Number of observations with their actions in the header, to test the function on its target machine."""
 
 
 def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str | None = None) -> float | None:
     """Write a policy as C99: one function ``void <function>(const double *observation, double *action)``.
 
-    Weights, normalisation and saturation are inside. The function allocates nothing, keeps nothing between calls and
-    needs only ``math.h``. The header says what goes in and out, with units and ranges, and gives examples. A policy may
-    be built of anything that torch.export traces to the operators of :mod:`.c_operators`: Linear layers, activations,
-    LayerNorm, BatchNorm, arithmetic, choosing and joining of elements.
+    The function holds weights, normalisation and saturation. It allocates nothing, keeps nothing between calls and
+    needs only ``math.h``. The header describes observations and actions, with units and ranges, and gives examples. A
+    policy may be built of anything that torch.export traces to the operators of :mod:`.c_operators`: Linear layers,
+    activations, LayerNorm, BatchNorm, arithmetic, choosing and joining of elements.
 
-    The check compiles the file and calls the function; where there is no compiler a warning says that it was left out.
+    The check compiles the file and calls the function. If there is no compiler, a warning says that the check was left
+    out.
 
     Args:
-        policy: any ``policy(observation) -> action`` in double precision, of such operators.
+        policy: any ``policy(observation) -> action`` in double precision, built of such operators.
         path: file to write, such as ``policy.c``; the header gets the same name with ``.h``.
-        plant: whose observations and actions these are.
-        function: name of the function; by default the plant's and ``_policy``.
+        plant: plant with the policy's observations and actions.
+        function: name of the function; by default the name of the plant with ``_policy``.
 
     Returns:
-        Greatest difference from the policy, see :func:`require_agreement`; None if it was not checked.
+        Greatest difference from the policy, see :func:`require_agreement`; None without a check.
 
     Raises:
-        ValueError: if the path or the name is unfit, it is no policy of the plant, a layer has no C form (the message
-            names it), the file does not compile, or it does not agree with the policy.
+        ValueError: if the path or the name does not fit, the policy does not fit the plant, a layer has no C form (the
+            message names it), the file does not compile, or the function does not agree with the policy.
     """
     path, function = Path(path), f"{plant.name}_policy" if function is None else function
     if path.suffix != ".c":
@@ -65,7 +66,7 @@ def export_c(policy: nn.Module, path: Path | str, plant: Plant, *, function: str
 
 def _source(written: CFunction, header: str, function: str) -> str:
     body = written.body
-    # A compiler warns of an argument that a policy does not read.
+    # A compiler warns of an argument that the function does not read.
     unread = [] if any("observation[" in line for line in body.statements) else ["(void)observation;"]
     lines = [*unread, *body.statements]
     parts = [
@@ -122,7 +123,7 @@ void {function}(const double *observation, double *action);
 
 
 def _table(plant: Plant) -> list[str]:
-    """A line per component: place, name, unit, range."""
+    """A line for each component, with its place, name, unit and range."""
 
     def range_of(signal: Signal) -> str:
         low, high = (f"{bound:.10g}" if math.isfinite(bound) else "unbounded" for bound in (signal.low, signal.high))
@@ -143,7 +144,7 @@ def _examples(policy: nn.Module, plant: Plant) -> list[str]:
     def row(values: Tensor) -> str:
         return "{" + ", ".join(f"{value:.9g}" for value in values.tolist()) + "}"
 
-    # Of the rounded observations, so that what is printed is what goes in.
+    # The actions are those of the rounded observations, so that the printed numbers are what goes in.
     observations = torch.tensor(
         [[float(f"{v:.9g}") for v in row_] for row_ in observations.tolist()], dtype=torch.float64
     )
@@ -171,7 +172,7 @@ def compile_c(compiler: str, file: Path, *options: str) -> Path:
     """Compile a C file to a shared library beside it.
 
     Raises:
-        ValueError: if the compiler refuses it.
+        ValueError: if the compiler refuses the file.
     """
     library = file.with_suffix(".so")
     command = [compiler, "-std=c99", "-O1", "-shared", "-fPIC", *options, str(file), "-o", str(library), "-lm"]

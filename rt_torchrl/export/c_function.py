@@ -1,8 +1,8 @@
-"""From the graph of a traced policy to the statements of a C function.
+"""The translation of a traced policy's graph into the statements of a C function.
 
-Three kinds of operators cover a policy. What does not depend on the observation is computed here and now. What only
-moves elements is carried out on their places, and needs no C at all. The rest are loops: an expression per element
-(:data:`.c_operators.ELEMENTWISE`) or a sum of products (``mm`` and its kin).
+A policy has three kinds of operators. An operator that does not depend on the observation is computed during the
+translation. An operator that only moves elements is applied to their places, and needs no C. Every other operator
+becomes a loop, with an expression for each element (:data:`.c_operators.ELEMENTWISE`) or a sum of products (``mm``).
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ class CFunction:
     """Translates the graph of a policy, operator by operator; the statements are in :attr:`body`.
 
     Args:
-        program: of one observation, (1, n_o) -> (1, n_a).
+        program: traced policy of one observation, (1, n_o) -> (1, n_a).
         policy: name of the policy, for messages.
 
     Raises:
@@ -92,17 +92,17 @@ class CFunction:
         )
 
     def _as_elements(self, argument: Node) -> Elements:
-        """A tensor as elements of an array; a constant becomes an array of the file."""
+        """The elements of a tensor in an array; a constant becomes an array of the file."""
         value = self._values[argument]
         return value if isinstance(value, Elements) else self.body.constant(value, self._labels[argument])
 
     @staticmethod
     def _keeps_values(node: Node) -> bool:
-        """Whether a cast changes no value: to the same kind of number, or of a truth value."""
+        """Whether a cast changes no value, because it keeps the type or casts a truth value."""
         return node.args[0].meta["val"].dtype in (node.meta["val"].dtype, torch.bool)
 
     def _operand(self, argument: Any, shape: torch.Size) -> Any:
-        """The i-th element of an operand, broadcast to a shape; what is no tensor or number as it is."""
+        """The i-th element of an operand, broadcast to a shape; other operands than tensors and numbers stay."""
         if not isinstance(argument, Node):
             return literal(argument) if isinstance(argument, (bool, int, float)) else argument
         if argument in self._inlined:
@@ -124,7 +124,7 @@ class CFunction:
 
     @staticmethod
     def _can_inline(node: Node, shape: torch.Size) -> bool:
-        """Whether its one reader writes it down once, element by element."""
+        """Whether the expression has one reader, which writes it down once, element by element."""
         readers = list(node.users)
         if len(readers) != 1 or readers[0].all_input_nodes.count(node) != 1:
             return False
@@ -133,7 +133,7 @@ class CFunction:
         return _name(readers[0]) in READ_ONCE and readers[0].meta["val"].shape == shape
 
     def _product(self, *factors: Elements, beta: float = 1, alpha: float = 1) -> Elements:
-        """A matrix product, added to the first argument where there are three."""
+        """A matrix product; the first of three arguments is added to it."""
         left, right = factors[-2:]
         shape = (*left.places.shape[:-1], right.places.shape[-1])
         start = literal(0.0)
@@ -153,19 +153,19 @@ class CFunction:
 
 
 def _name(node: Node) -> str:
-    """Of the operator, such as add for aten.add.Tensor."""
+    """The name of the operator, such as add for aten.add.Tensor."""
     return getattr(node.target, "__name__", str(node.target)).partition(".")[0]
 
 
 def _varies(value: Any) -> bool:
-    """Whether it depends on the observation."""
+    """Whether a value depends on the observation."""
     return isinstance(value, Elements) or (isinstance(value, tuple) and any(map(_varies, value)))
 
 
 def _moved(node: Node, args: tuple, kwargs: dict) -> Any:
-    """The operator, carried out on the places of the elements."""
+    """The result of an operator that is applied to the places of the elements."""
     source, *rest = args
-    if isinstance(source, tuple):  # of split or unbind, to be picked from
+    if isinstance(source, tuple):  # the results of split or unbind, of which one is picked
         return source[rest[0]]
     if _name(node) == "_to_copy":
         return source

@@ -1,6 +1,6 @@
-"""What the operators of a traced policy are in C99: expressions of their operands, all double.
+"""C99 expressions of the operators of a traced policy; all operands are double.
 
-Comparisons are written such that a NaN among the operands stays one, as in torch, where C's fmin and fmax drop it.
+Comparisons keep a NaN among the operands, as torch does and C's fmin and fmax do not.
 A truth value is 0.0 or 1.0.
 """
 
@@ -13,7 +13,7 @@ aten = torch.ops.aten
 
 
 def literal(value: float | int) -> str:
-    """A number in C, read back to the bit."""
+    """A number in C, which is read back to the bit."""
     value = float(value)
     if math.isnan(value):
         return "NAN"
@@ -22,7 +22,7 @@ def literal(value: float | int) -> str:
 
 
 def call(function: str) -> Callable[..., str]:
-    """A function of math.h."""
+    """A call of a function of math.h."""
     return lambda *operands: f"{function}({', '.join(operands)})"
 
 
@@ -55,7 +55,7 @@ def extremum(operator: str) -> Callable[..., str]:
 
 
 def clamp(x: str, low: str | None = None, high: str | None = None) -> str:
-    """torch lets the upper bound win where the bounds cross."""
+    """An operand, clamped to its bounds; the upper bound wins where they cross, as in torch."""
     inner = x if high is None else f"({x} > {high} ? {high} : {x})"
     if low is None:
         return inner
@@ -118,7 +118,7 @@ ELEMENTWISE: dict[str, Callable[..., str]] = {name: call(name) for name in FUNCT
 """C expression of an operator's result, by its name in torch; operands are elements of arrays or literals."""
 
 READ_ONCE = frozenset([*FUNCTIONS, "abs", "add", "div", "mul", "neg", "reciprocal", "rsqrt", "sigmoid", "sub"])
-"""Those whose expression holds each operand once, so that it may be an expression in turn."""
+"""Operators whose expression holds each operand once, so that an operand may itself be an expression."""
 
 MOVING = frozenset(
     ["alias", "clone", "detach", "diagonal", "expand", "flip", "gather", "getitem", "index", "index_select", "permute"]
@@ -143,7 +143,7 @@ FILLING = frozenset(["full_like", "new_full", "new_zeros", "new_ones", "ones_lik
 """Operators that take the shape of a tensor, not its values."""
 
 CHECKS = frozenset(["_assert_tensor_metadata"])
-"""Operators that compute nothing; what they check held when the policy was traced."""
+"""Operators that compute nothing but check what held when the policy was traced."""
 
 
 def layer_norm(x, shape, weight, bias, eps):

@@ -21,20 +21,20 @@ NEEDED = ("onnx", "onnxscript", "onnxruntime")
 def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     """Write a policy as an ONNX model, input ``observation`` and output ``action``.
 
-    They have the shapes (batch, n_o) and (batch, n_a), with any batch, in double precision. The model's metadata hold
-    ``interface.json``, names, units and ranges. The weights are in the one file.
+    Their shapes are (batch, n_o) and (batch, n_a) for any batch, in double precision. The model's metadata hold
+    ``interface.json`` with names, units and ranges. The file contains the weights.
 
     Args:
         policy: any ``policy(observation) -> action`` in double precision.
         path: file to write, such as ``policy.onnx``.
-        plant: whose observations and actions these are.
+        plant: plant with the policy's observations and actions.
 
     Returns:
-        Greatest difference from the policy as onnxruntime computes it, see :func:`require_agreement`.
+        Greatest difference between the model in onnxruntime and the policy, see :func:`require_agreement`.
 
     Raises:
-        ValueError: if the packages of the extra ``onnx`` are missing, it is no policy of the plant, has no ONNX form,
-            onnxruntime cannot run it, or the model does not agree with it.
+        ValueError: if a package of the extra ``onnx`` is missing, the policy does not fit the plant or has no ONNX
+            form, onnxruntime cannot run the model, or the model does not agree with the policy.
     """
     require_packages()
     policy = detached(policy, plant)
@@ -51,7 +51,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
                 output_names=["action"],
                 dynamic_shapes=({0: "batch"},),
             )
-    except Exception as error:  # of the exporter, of several kinds
+    except Exception as error:  # the exporter raises several kinds
         raise ValueError(
             f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
         ) from error
@@ -65,10 +65,10 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
 
 
 def require_packages() -> None:
-    """The packages of the extra ``onnx``.
+    """Refuse to go on without the packages of the extra ``onnx``.
 
     Raises:
-        ValueError: if one is not installed.
+        ValueError: if a package is not installed.
     """
     for package in NEEDED:
         try:
@@ -84,7 +84,7 @@ def _runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
 
     try:
         session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's are of no common class
+    except Exception as error:  # the errors of onnxruntime have no common class
         raise ValueError(
             f"onnxruntime cannot run policy {policy} in double precision: {str(error).strip()}. Use the .pt2 program "
             "or C instead."
@@ -98,7 +98,7 @@ def _runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's notices, that torchvision is not installed and what torch itself should no longer use."""
+    """A context without the exporter's notices, of a missing torchvision and of outdated functions in torch itself."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

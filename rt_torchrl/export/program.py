@@ -23,20 +23,20 @@ def trace(policy: nn.Module, plant: Plant, *, batch: int | None = None) -> Expor
     """The graph of a policy, ``(batch, n_o) -> (batch, n_a)``.
 
     Args:
-        policy: as :func:`detached` gives it.
-        plant: whose observations it takes.
-        batch: number of observations; None for any.
+        policy: policy from :func:`detached`.
+        plant: plant with the policy's observations.
+        batch: number of observations; None for any number.
 
     Raises:
-        ValueError: if torch.export cannot trace it, or it draws random numbers.
+        ValueError: if torch.export cannot trace the policy, or the policy draws random numbers.
     """
     name, observations = type(policy).__name__, sample_observations(plant.observations, batch or 3)
     shapes = None if batch else ({0: Dim("batch")},)
     try:
         program = torch.export.export(policy, (observations,), dynamic_shapes=shapes)
-        # Without any operator taken apart; it takes out what does nothing in evaluation, such as dropout.
+        # This takes no operator apart, but removes those that do nothing in evaluation, such as dropout.
         program = program.run_decompositions({})
-    except Exception as error:  # torch.export has many, of several modules
+    except Exception as error:  # torch.export raises many kinds, of several modules
         raise ValueError(
             f"policy {name} cannot be traced by torch.export: {str(error).strip()} Write branches on values as "
             "torch.where, and sizes such that any batch can be passed."
@@ -48,7 +48,7 @@ def trace(policy: nn.Module, plant: Plant, *, batch: int | None = None) -> Expor
 
 
 def layer_of(node: torch.fx.Node, policy: str) -> str:
-    """The module a node of a graph comes from, in words."""
+    """The module that a node of a graph comes from, in words."""
     stack = list((node.meta.get("nn_module_stack") or {}).values())
     path, kind = stack[-1] if stack else ("", policy)
     kind = kind if isinstance(kind, str) else kind.__name__
@@ -56,7 +56,7 @@ def layer_of(node: torch.fx.Node, policy: str) -> str:
 
 
 def interface(plant: Plant) -> dict[str, Any]:
-    """What a user of an exported policy must know of it, as JSON can hold it; an absent bound is None."""
+    """The description of a policy's observations and actions, as JSON can hold it; an absent bound is None."""
 
     def described(signals: Sequence[Signal]) -> list[dict[str, Any]]:
         return [{"name": s.name, "unit": s.unit, "low": finite(s.low), "high": finite(s.high)} for s in signals]
@@ -73,9 +73,9 @@ def interface(plant: Plant) -> dict[str, Any]:
 
 
 def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
-    """Write a policy as a program of torch.export, of (batch, n_o) -> (batch, n_a) in double precision.
+    """Write a policy as a program of torch.export, (batch, n_o) -> (batch, n_a) in double precision.
 
-    It is used without this library, and its extra file ``interface.json`` names and bounds what goes in and out::
+    A program runs without this library. Its extra file ``interface.json`` describes observations and actions::
 
         policy = torch.export.load("policy.pt2").module()
         action = policy(observation)
@@ -83,13 +83,13 @@ def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     Args:
         policy: any ``policy(observation) -> action`` in double precision.
         path: file to write, such as ``policy.pt2``.
-        plant: whose observations and actions these are.
+        plant: plant with the policy's observations and actions.
 
     Returns:
         Greatest difference from the policy, see :func:`require_agreement`.
 
     Raises:
-        ValueError: if it is no policy of the plant, cannot be traced, or the program does not agree with it.
+        ValueError: if the policy does not fit the plant or cannot be traced, or the program does not agree with it.
     """
     policy = detached(policy, plant)
     file = io.BytesIO()

@@ -1,1 +1,1 @@
-"""Descents that steps 4 and 5 share."""
+"""Descents of the assimilation (step 4) and the planning (step 5)."""

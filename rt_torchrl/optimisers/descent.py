@@ -1,4 +1,4 @@
-"""Gradient descent as steps 4 and 5 share it: a few steps a time, the best weights kept."""
+"""The gradient descent of steps 4 and 5, which takes a few iterations at a time and keeps the best weights."""
 
 import copy
 import math
@@ -22,14 +22,14 @@ class DescentConfig:
     The cost is divided by its value at the start of the episode, so that no parameter depends on a plant's units.
 
     Adam's second moment forgets within about ten steps (β₂ = 0.9), because the gradient of a policy that starts in
-    saturation or stall is hundreds of times larger than later ones: with the usual 0.999 that first gradient keeps the
+    saturation or stall is hundreds of times larger than later ones. With the usual 0.999 that first gradient keeps the
     steps near zero for the rest of a training of some hundred steps.
 
     Args:
-        optimiser: ``adam``, or ``lbfgs`` with a strong-Wolfe line search, every trial point counting as an iteration.
+        optimiser: ``adam``, or ``lbfgs`` with a strong-Wolfe line search, each of whose trials counts as an iteration.
         rate: learning rate of Adam; first step length of L-BFGS.
-        gradient_limit: greatest norm of the (relative) gradient that Adam sees, infinite for none; L-BFGS has its line
-            search instead.
+        gradient_limit: greatest norm of the (relative) gradient that Adam sees, infinite for no limit; L-BFGS has
+            its line search instead.
         second_moment: β₂ of Adam.
     """
 
@@ -48,7 +48,7 @@ class DescentConfig:
 
 
 class Descended(NamedTuple):
-    """Cost at the start and at the best weights, norm of its first gradient (not relative), iterations made."""
+    """Cost at the start and at the best weights, norm of its first gradient (not relative), and iterations."""
 
     start: float
     best: float
@@ -57,14 +57,14 @@ class Descended(NamedTuple):
 
 
 class Descent:
-    """Updates the weights of a module in place and leaves the best ones seen in it.
+    """Updates the weights of a module in place and leaves the best weights in it.
 
-    A step to weights where the cost diverges (it raises ``FloatingPointError``, or cost or gradient is not finite) is
-    halved until it does not; every such trial counts as an iteration.
+    The cost diverges where it raises ``FloatingPointError``, or where cost or gradient is not finite. A step to such
+    weights is halved until the cost does not diverge; every such trial counts as an iteration.
 
     Args:
-        module: holds the weights.
-        config: see :class:`DescentConfig`.
+        module: module with the weights.
+        config: options of the descent.
     """
 
     def __init__(self, module: nn.Module, config: DescentConfig):
@@ -83,9 +83,9 @@ class Descent:
         """Take ``iterations`` gradients of ``cost`` and keep the best weights.
 
         Args:
-            cost: scalar cost at the module's present weights; the same function throughout.
+            cost: function that returns the scalar cost at the module's present weights; it stays the same in a run.
             iterations: number of gradients; 0 does nothing.
-            stop_below: stop early once the cost is below this share of its start; 0 never does.
+            stop_below: share of the first cost below which the run stops early; 0 never stops it.
 
         Raises:
             FloatingPointError: if the cost diverges at the weights that the descent starts from.
@@ -93,7 +93,7 @@ class Descent:
         seen = _Seen(self.module, cost, self.config, iterations, stop_below)
         try:
             if self.config.optimiser == "lbfgs":
-                # Another episode has another cost: curvature of the last one would mislead the line search.
+                # Another episode has another cost: the curvature of the last one would mislead the line search.
                 self.restart()
                 self._optimiser.param_groups[0].update(max_iter=iterations, max_eval=iterations)
                 self._optimiser.step(seen.or_infinite)
@@ -120,15 +120,15 @@ class Descent:
 
 
 class _Finished(Exception):
-    """Leaves an optimiser that would go on."""
+    """The run has ended, although the optimiser would go on."""
 
 
 class _Diverged(Exception):
-    """There is no finite cost and gradient at the present weights, which are not the first."""
+    """Cost or gradient is not finite at the present weights, which are not the first weights of the run."""
 
 
 class _Seen:
-    """The closure an optimiser calls: cost and gradient at the present weights, with a memory of the best."""
+    """The function that an optimiser calls for cost and gradient; it remembers the best weights."""
 
     def __init__(self, module, cost, config, iterations, stop_below):
         self._module, self._cost, self._config = module, cost, config
@@ -158,7 +158,7 @@ class _Seen:
         return relative
 
     def or_infinite(self) -> Tensor:
-        """The same for a line search, whose trials may diverge."""
+        """The relative cost for a line search, which is infinite where a trial diverges."""
         try:
             return self()
         except _Diverged:
@@ -174,7 +174,7 @@ class _Seen:
             weight.lerp_(sound, 0.5)
 
     def _differentiated(self) -> tuple[Tensor, float, float]:
-        """Relative cost, cost and norm of the gradient, which is left in the weights.
+        """Relative cost, cost, and norm of the gradient; the gradient itself is left in the weights.
 
         Raises:
             FloatingPointError: if one of them is not finite.
@@ -206,7 +206,7 @@ class _Seen:
             with torch.no_grad():
                 cost = self._cost().item()
         except FloatingPointError:
-            return  # the best weights are others then
+            return  # these are not the best weights
         self._note(cost)
 
     def _note(self, cost: float) -> None:

@@ -1,11 +1,11 @@
-r"""Levenberg-Marquardt steps: the natural optimiser for a closure of a few weights of very different effect.
+r"""Levenberg-Marquardt steps, the natural descent for a closure with a few weights of very different effect.
 
 .. math::
     (H + \mu\,\mathrm{diag}\,H)\,\Delta w = -g, \qquad
     H = \mathbb E\sum_kS_k^\top\frac{\partial^2L}{\partial s^2}S_k\,\Delta t
 
-A first-order step follows the weight that the record shows best and leaves the others behind; this one weighs them by
-what the record says of each.
+A first-order step follows the weight that the record shows best and leaves the others behind. A
+Levenberg-Marquardt step weighs each weight by what the record says of it.
 """
 
 import copy
@@ -31,12 +31,13 @@ class LevenbergMarquardt:
     """Updates the trainable weights of a module in place; the damping μ is kept from run to run.
 
     Args:
-        module: holds the weights.
-        damping: μ at the start; it falls tenfold with every step that lowers the cost and rises tenfold otherwise.
-        tolerance: the run ends where an undamped step promises to lower the cost by less than this share of it: what is
-            left of the cost is then not the weights' doing, and more equations would be solved for nothing.
-        longest_step: greatest change of a weight in one step, a factor of e for a weight that is a logarithm. Far from
-            the minimum a longer one can end where the states no longer depend on the weight, and stay there.
+        module: module with the weights.
+        damping: μ at the start; it falls tenfold after each step that lowers the cost and rises tenfold otherwise.
+        tolerance: share of the cost; the run ends when an undamped step promises to lower the cost by less than this
+            share. The weights are then not the reason for the rest of the cost, and more equations would not help.
+        longest_step: greatest change of a weight in one step; a change of 1 is a factor of e for a weight that is a
+            logarithm. Far from the minimum, a longer step can end where the states no longer depend on the weight, and
+            the weight would stay there.
     """
 
     least_damping, greatest_damping = 1e-12, 1e12
@@ -55,9 +56,9 @@ class LevenbergMarquardt:
         """Try ``iterations`` steps; a step that raises the cost, or makes it infinite, is taken back.
 
         Args:
-            equations: at the module's present weights.
+            equations: function that returns the equations at the module's present weights.
             iterations: number of trial steps; 0 does nothing.
-            stop_below: stop early once the cost is below this share of its start; 0 never does.
+            stop_below: share of the first cost below which the run stops early; 0 never stops it.
         """
         if iterations == 0:
             return Descended(float("nan"), float("nan"), float("nan"), 0)
@@ -83,14 +84,14 @@ class LevenbergMarquardt:
 
     def _arrived(self, current: NormalEquations) -> bool:
         if not current.gradient.any():
-            return True  # nor may there be a matrix to solve with, where no weight shows
+            return True  # where the record shows no weight, the matrix may be singular
         newton = self._step(current, self.least_damping)
         little = promised(current, newton) <= self.tolerance * current.cost
         return bool(little or newton.abs().max() < self.least_step)
 
     def _step(self, current: NormalEquations, damping: float) -> Tensor:
         diagonal = current.matrix.diagonal()
-        # A weight that the record does not show at all gets the smallest curvature that is not rounding.
+        # A weight that the record does not show gets the smallest curvature that exceeds rounding.
         floor = diagonal.max() * torch.finfo(diagonal.dtype).eps
         damped = current.matrix + damping * torch.diag(diagonal.clamp_min(floor))
         return -torch.linalg.solve(damped, current.gradient)
@@ -111,5 +112,5 @@ def _add(step: Tensor, weights: list[nn.Parameter]) -> None:
 
 
 def promised(equations: NormalEquations, step: Tensor) -> Tensor:
-    """By how much the quadratic model of the cost falls with a step."""
+    """The decrease of the cost by a step, according to its quadratic model."""
     return -(equations.gradient @ step + 0.5 * step @ equations.matrix @ step)

@@ -1,1 +1,1 @@
-"""What a plant is, and the laws that may stand in it."""
+"""The contract of a plant, with closures and policies that any plant can use."""

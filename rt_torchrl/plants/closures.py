@@ -1,4 +1,4 @@
-"""Closures of general use: any ``closure(features) -> coefficients`` can stand in for a plant's own."""
+"""Closures of general use: any ``closure(features) -> coefficients`` can replace a plant's own."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,20 +13,20 @@ from rt_torchrl.plants.policies import mlp
 class PositiveCoefficients(nn.Module):
     """Base of a closure with a few positive coefficients; a subclass names them and says in ``forward`` what they do.
 
-    The trained weights are the logarithms: the coefficients stay positive, and a step changes each by the same
-    percentage, whatever its size and unit.
+    The trained weights are the logarithms of the coefficients. The coefficients therefore stay positive, and a step
+    changes each of them by the same percentage, whatever its size and unit.
 
     Args:
-        coefficients: in the order and the units of ``names``.
+        coefficients: values of the coefficients, in the order and the units of ``names``.
 
     Raises:
-        ValueError: if their number is wrong or one of them is not positive and finite.
+        ValueError: if the number of coefficients is wrong, or one of them is not positive and finite.
     """
 
     names: dict[str, str]
     """Unit of each coefficient, by name."""
     true_coefficients: tuple[float, ...]
-    """Those of the real system."""
+    """Coefficients of the real system."""
 
     def __init__(self, coefficients: Float[Tensor, " n"]):
         super().__init__()
@@ -42,12 +42,12 @@ class PositiveCoefficients(nn.Module):
 
     @classmethod
     def true(cls) -> "PositiveCoefficients":
-        """Those of the real system; the weights are frozen, they are not what is learned."""
+        """A closure with the coefficients of the real system; its weights are frozen, because they are not learned."""
         return cls(torch.tensor(cls.true_coefficients, dtype=torch.float64)).requires_grad_(False)
 
     @property
     def coefficients(self) -> Float[Tensor, " n"]:
-        """In the units of ``names``."""
+        """The coefficients in the units of ``names``."""
         return self.log_coefficients.exp()
 
     def named_coefficients(self) -> dict[str, Tensor]:
@@ -60,13 +60,14 @@ class BoundedPerceptron(nn.Module):
 
     .. math:: y = b\,\tanh N(\hat x), \qquad \hat x_i = \frac{2x_i - x_{i,hi} - x_{i,lo}}{x_{i,hi} - x_{i,lo}}
 
-    What a neural closure adds to a law it starts from: nothing at first, and never more than b, wherever the states go.
+    A neural closure adds these outputs to the law that it starts from. They are zero at first and never exceed b,
+    wherever the states go.
 
     Args:
-        ranges: low and high end of each feature, a fixed physical range that is scaled to [−1, 1]; no limit.
-        bounds: b, greatest absolute value of each output.
+        ranges: low and high end of a physical range of each feature, which is scaled to [−1, 1] and does not limit it.
+        bounds: greatest absolute value b of each output.
         hidden: width of each hidden layer.
-        generator: source of the initial weights; those of the last layer are zero.
+        generator: source of the initial weights; the weights of the last layer are zero.
 
     Raises:
         ValueError: if a range is empty or a bound is not positive.

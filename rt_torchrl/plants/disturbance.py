@@ -1,19 +1,19 @@
-"""What every model of an exogenous input asks of whoever draws from it."""
+"""The check that every model of an exogenous input makes before it draws."""
 
 import math
 
 
 def require_request(batch: int, n_steps: int, dt: float, *, least_steps: int = 1) -> None:
-    """Refuse a draw of no episodes, of episodes too short, or at a sampling interval that is none.
+    """Refuse a draw of no episodes, of too few samples, or at a sampling interval that is not positive and finite.
 
     Args:
         batch: number of episodes.
-        n_steps: samples of each.
+        n_steps: number of samples of each episode.
         dt: sampling interval [s].
-        least_steps: fewest samples that the model can draw.
+        least_steps: least number of samples that the model can draw.
 
     Raises:
-        ValueError: naming the argument that is out of its range.
+        ValueError: if an argument is out of its range; the message names it.
     """
     if batch < 1:
         raise ValueError(f"batch={batch} must be at least 1.")

@@ -1,4 +1,4 @@
-"""The time step, the same in the real system, the twin and every gradient engine."""
+"""The Runge-Kutta step, which is the same in the real system, the twin and every gradient engine."""
 
 from collections.abc import Callable
 
@@ -22,10 +22,10 @@ def rk4_step(
         k_4 = f(t+h, s+h(k_1-k_2+k_3)),\quad s' = s + \tfrac h8(k_1+3k_2+3k_3+k_4)
 
     Args:
-        field: f(t, s) [state unit / s].
+        field: the vector field f(t, s) [state unit / s].
         t: start of the step [s].
-        state: s at ``t``.
-        dt: step h [s].
+        state: state s at ``t``.
+        dt: length h of the step [s].
 
     Source: Hairer, Nørsett, Wanner, *Solving Ordinary Differential Equations I*, table II.1.2.
     """

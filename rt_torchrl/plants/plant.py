@@ -1,12 +1,12 @@
-r"""The contract a plant fulfils.
+r"""The contract that a plant fulfils.
 
-A plant is sampled-data: at :math:`t_k = k\,\Delta t` the agent sends a command, the actuators make an applied action
-of it, that action and the exogenous input are held over :math:`[t_k, t_{k+1}]` while the vector field is integrated
-by one Runge-Kutta step. :meth:`Plant.step` is that map,
+A plant is a sampled-data system. At :math:`t_k = k\,\Delta t` the agent sends a command, and the actuators turn it into
+an applied action. This action and the exogenous input are held over :math:`[t_k, t_{k+1}]`, and one Runge-Kutta step
+integrates the vector field over that interval. :meth:`Plant.step` is the map of the interval,
 
-.. math:: s_{k+1} = \Phi(t_k, s_k, a_k, z_k; w_p),
+.. math:: s_{k+1} = \Phi(t_k, s_k, a_k, z_k; w_p).
 
-and it is the *same* map for the real system and for its digital twin: they differ in the closure they pass.
+The real system and its digital twin have the *same* map: they differ in the closure that they pass to it.
 """
 
 import math
@@ -23,35 +23,35 @@ from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
 
 MOST_STEPS = 10_000_000
-"""Control intervals of the longest episode; a hundred numbers of each take 8 GB."""
+"""Control intervals of the longest episode; a hundred numbers for each interval take 8 GB."""
 
 
 class Transition(NamedTuple):
-    """What one control interval did: the state at its end and the action the actuators applied during it."""
+    """The outcome of one control interval: the state at its end and the action that was applied during it."""
 
     state: Tensor
     applied: Tensor
 
 
 class Plant(nn.Module, ABC):
-    """Physics and control problem of one system; see ``envs/`` for three of them.
+    """Physics and control problem of one system; ``envs/`` holds examples.
 
-    A subclass names its signals in the four class attributes (``inputs`` may be empty), and writes
+    A subclass declares its signals in the four class attributes (``inputs`` may be empty), and defines
     :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`discrepancy`, :meth:`draw_initial_state`,
-    :meth:`draw_exogenous` and :meth:`make_closure`. Every method is pure and takes any leading batch dimensions,
-    features last, so that it can be compiled, batched and differentiated: no clamp, detach, random number, device
-    choice or Python branch on a tensor.
-    :func:`rt_torchrl.check_plant` finds where a subclass falls short of this.
+    :meth:`draw_exogenous` and :meth:`make_closure`. Every method is pure and takes any leading batch dimensions; the
+    last dimension is that of the signals. A method must work when it is compiled, batched and differentiated: it
+    contains no clamp, detach, random number, device choice or Python branch on a tensor.
+    :func:`rt_torchrl.check_plant` finds where a subclass does not fulfil this.
 
     Args:
         dt: control interval and integration step Δt [s].
         horizon: length of an episode T_o [s], a whole number of steps.
-        closure: the true closure, used by the real system; maps the features that :meth:`vector_field` hands it to
-            coefficients.
+        closure: the true closure, which the real system uses; it maps the features that :meth:`vector_field` passes to
+            it to coefficients.
 
     Raises:
-        ValueError: if ``dt`` or ``horizon`` is not positive, or ``horizon`` is no multiple of ``dt`` or is more than
-            ``MOST_STEPS`` of them.
+        ValueError: if ``dt`` or ``horizon`` is not positive, or ``horizon`` is no multiple of ``dt`` or exceeds
+            ``MOST_STEPS`` intervals.
     """
 
     name: str
@@ -60,7 +60,10 @@ class Plant(nn.Module, ABC):
     inputs: tuple[Signal, ...]
     observations: tuple[Signal, ...]
     own_scheme: bool = False
-    """Whether :meth:`step` is another scheme, to be kept to the last digit; ``odeint_adjoint`` is then refused."""
+    """Whether :meth:`step` has a scheme of its own, which a twin must follow to the last digit.
+
+    The engine ``odeint_adjoint`` cannot follow it and is refused.
+    """
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module):
         super().__init__()
@@ -102,13 +105,13 @@ class Plant(nn.Module, ABC):
     def actuate(
         self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch n_a"]
     ) -> Float[Tensor, "*batch n_a"]:
-        """The action that the actuators apply on a command, such as one with a rate limit; here the command itself."""
+        """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
     def latch(
         self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch n_a"]
     ) -> Float[Tensor, "*batch n_s"]:
-        """Write what the sampled-data parts remember at the end of an interval into its end state; here nothing."""
+        """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
 
     def step(
@@ -124,8 +127,8 @@ class Plant(nn.Module, ABC):
         Args:
             t: start of the interval [s].
             state: state at ``t``.
-            command: what the policy asks for.
-            exogenous: input, held over the interval.
+            command: action that the policy asks for.
+            exogenous: exogenous input, held over the interval.
             closure: the true closure in the real system, the learned one in the twin.
         """
         applied = self.actuate(state, command)
@@ -141,7 +144,7 @@ class Plant(nn.Module, ABC):
         state: Float[Tensor, "*batch n_s"],
         exogenous: Float[Tensor, "*#batch n_z"],
     ) -> Float[Tensor, "*batch n_o"]:
-        """What the policies see: the tracking errors e, scaled to order one."""
+        """The observation of the policies: the tracking errors e, scaled to order one."""
 
     @abstractmethod
     def running_cost(
@@ -165,11 +168,11 @@ class Plant(nn.Module, ABC):
         applied: Float[Tensor, "batch n n_a"],
         exogenous: Float[Tensor, "batch n n_z"],
     ) -> dict[str, Float[Tensor, " batch"]]:
-        """Physical quantities an engineer judges whole episodes by, named with their unit; here none."""
+        """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""
         return {}
 
     def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
-        """Kinds of episodes, by name, that results are also shown apart for; here none."""
+        """Kinds of episodes, by name, for which results are also shown separately; by default none."""
         return {}
 
     def complete_states(
@@ -178,17 +181,17 @@ class Plant(nn.Module, ABC):
         exogenous: Float[Tensor, "n n_z"],
         actions: Float[Tensor, "n n_a"],
     ) -> Float[Tensor, "samples n_s"]:
-        """All states at n + 1 samples, from those that a log holds; here it must hold all.
+        """All states at n + 1 samples, completed from the states in a log; by default the log must hold all states.
 
-        A plant overrides it for states that no sensor gives but that follow from the rest, such as filters.
+        A plant overrides this method if some states have no sensor but follow from the others, such as filters.
 
         Args:
             measured: states that were logged, by name.
-            exogenous: inputs of the n intervals between.
-            actions: applied actions of the n intervals between.
+            exogenous: exogenous inputs of the n intervals between the samples.
+            actions: applied actions of the n intervals between the samples.
 
         Raises:
-            ValueError: with the names of the states that are missing.
+            ValueError: if states are missing; the message names them.
         """
         missing = [state.name for state in self.states if state.name not in measured]
         if missing:
@@ -210,18 +213,20 @@ class Plant(nn.Module, ABC):
 
     @abstractmethod
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        """The closure a twin of this plant starts from, w_p⁰."""
+        """The closure that a twin of this plant starts from, with the weights w_p⁰."""
 
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
-        """A closure with a perceptron in it that starts where :meth:`make_closure` does, for a plant that has one.
+        """A closure with a perceptron that starts with the values of :meth:`make_closure`; by default there is none.
 
         Raises:
-            ValueError: if this one has none.
+            ValueError: if the plant has no such closure.
         """
-        raise ValueError(f"plant {self.name!r} has no neural closure; write its make_neural_closure or take its own.")
+        raise ValueError(
+            f"plant {self.name!r} has no neural closure; define its make_neural_closure, or use that of make_closure."
+        )
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """The policy both controllers start from, w_a⁰; a saturated affine law of the observation unless overridden."""
+        """The policy that both controllers start from, w_a⁰; by default a saturated affine law of the observation."""
         return SaturatedAffine(len(self.observations), self.actions, generator=generator)
 
     def extra_repr(self) -> str:
@@ -235,8 +240,8 @@ def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy
         plant: name of the plant, for the message.
         dt: step [s].
         rate: fastest decay rate |Re μ| of the linearised plant [1/s].
-        mode: what decays at that rate, for the message.
-        remedy: what else the user can do, for the message.
+        mode: name of the state that decays at that rate, for the message.
+        remedy: another remedy than a smaller step, for the message.
 
     Raises:
         ValueError: if dt·rate exceeds the stability limit of RK4 on the negative real axis, 2.785.

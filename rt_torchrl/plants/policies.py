@@ -1,6 +1,6 @@
-r"""Policies of general use: any ``policy(observation) -> action`` with actions in physical units can stand in for them.
+r"""Policies of general use: any ``policy(observation) -> action`` with actions in physical units can replace them.
 
-Both saturate by the paper's smooth clip (eq. clip), which maps x = 0 to the middle of the range:
+They saturate by the paper's smooth clip (eq. clip), which maps x = 0 to the middle of the range:
 
 .. math:: \mathrm{clip}(x, a_{lo}, a_{hi}) = \tfrac12(\tanh x + 1)(a_{hi} - a_{lo}) + a_{lo}
 """
@@ -20,7 +20,7 @@ class SmoothClip(nn.Module):
 
     Args:
         actions: the actions, each with a finite range.
-        device: where the ranges are kept; torch's default if None.
+        device: device of the ranges; torch's default if None.
 
     Raises:
         ValueError: if an action has no finite range.
@@ -51,8 +51,8 @@ class SaturatedAffine(nn.Module):
     Args:
         n_observations: number of observations.
         actions: the actions and their ranges.
-        bias: learn b; without it zero error gives mid-range.
-        weight_scale: standard deviation of the initial W; zero starts at mid-range.
+        bias: whether b is learned; without b, zero error gives the middle of the range.
+        weight_scale: standard deviation of the initial W; with zero the policy starts in the middle of the ranges.
         generator: source of the initial weights.
     """
 
@@ -84,7 +84,8 @@ class SaturatedMLP(nn.Module):
         n_observations: number of observations.
         actions: the actions and their ranges.
         hidden: width of each hidden layer.
-        output_scale: factor on the last layer's initial weights, so that the policy starts near mid-range.
+        output_scale: factor on the last layer's initial weights, so that the policy starts near the middle of the
+            ranges.
         generator: source of the initial weights.
     """
 

@@ -18,13 +18,13 @@ class Signal:
     r"""A component of a state, action, exogenous input or observation.
 
     Args:
-        symbol: the letter of the formulas, as matplotlib mathtext without the dollars (``r"\omega_r"``).
-        name: the word of the interfaces, a valid identifier (``"rotor_speed"``).
+        symbol: letter in formulas, as matplotlib mathtext without the dollars (``r"\omega_r"``).
+        name: word in interfaces, a valid identifier (``"rotor_speed"``).
         unit: SI unit, or the unit a correlation is defined in (``"rad/s"``, ``"deg"``, ``"-"``).
         low: least admissible value in ``unit``.
         high: greatest admissible value in ``unit``.
-        periodic: of a state that turns, such as an angle: whether its range is one turn, so that ``low`` and ``high``
-            are the same place.
+        periodic: whether the range is one turn of a state such as an angle, so that ``low`` and ``high`` are the same
+            place.
 
     Raises:
         ValueError: if the name is no identifier, the range is empty, or a periodic signal has no finite range.
@@ -56,11 +56,11 @@ class Signal:
         return self.high - self.low
 
     def wrapped(self, values: Values) -> Values:
-        """The same places within the range, where the signal is periodic; otherwise the values themselves."""
+        """The values, moved into the range by whole turns if the signal is periodic."""
         return self.low + (values - self.low) % self.period if self.periodic else values
 
     def short_way(self, change: Values) -> Values:
-        """A change of the signal, by at most half a turn where it is periodic; otherwise the change itself."""
+        """The change, reduced to at most half a turn either way if the signal is periodic."""
         return (change + 0.5 * self.period) % self.period - 0.5 * self.period if self.periodic else change
 
     @property
@@ -72,7 +72,7 @@ class Signal:
 def differences(
     signals: Sequence[Signal], first: Float[Tensor, "*batch n"], second: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch n"]:
-    """``first`` − ``second``, the short way round where a signal is periodic."""
+    """The differences ``first`` − ``second``, taken the short way round where a signal is periodic."""
     changes = (first - second).unbind(-1)
     return torch.stack([signal.short_way(change) for signal, change in zip(signals, changes, strict=True)], -1)
 

@@ -4,7 +4,7 @@ r"""Trajectories :math:`s_{k+1} = \Phi(s_k, x_k; w)` and their gradients, by thr
 engine             gradient                                            for
 =================  ==================================================  ======================================
 ``parallel``       exact discrete adjoint, parallel over time          training
-``odeint_adjoint`` continuous adjoint by torchdiffeq, order of the dt  reference, the paper's method
+``odeint_adjoint`` continuous adjoint by torchdiffeq, error O(dt)      reference, the paper's method
 ``autograd``       backpropagation through every step, exact           short horizons, double-checking
 =================  ==================================================  ======================================
 """
@@ -35,17 +35,17 @@ class DivergenceError(FloatingPointError):
 
 
 class Rollout:
-    """Rolls a plant out under a closure, with held commands from a record or with a policy in the loop.
+    """Rolls a plant out under a closure, with commands from a record or with a policy in the loop.
 
     Args:
         plant: the physics.
         closure: the plant's own closure for the real system, a learned one for its twin.
-        policy: acts on the observation at each interval; None if commands are given at each call.
-        engine: how gradients with respect to the weights, the initial state and the drive are computed.
+        policy: policy that computes the command of each interval; None if each call passes the commands.
+        engine: name of the engine that computes gradients with respect to weights, initial state and drive.
         compiled: compile with torch.compile; eager is quicker for short horizons.
 
     Raises:
-        ValueError: if the engine does not exist, does not know the plant's own scheme, or a module is not in double
+        ValueError: if the engine does not exist, cannot follow the plant's own scheme, or a module is not in double
             precision.
     """
 
@@ -79,15 +79,15 @@ class Rollout:
         """The trajectory of ``n`` intervals.
 
         Args:
-            initial_state: s_0 of each realisation.
-            exogenous: z, held over each interval.
-            command: actions from a record; None with a policy.
-            start: time of s_0 [s], one for all realisations or one for each, of an engine that takes the latter.
+            initial_state: initial state s_0 of each realisation.
+            exogenous: exogenous inputs z, held over each interval.
+            command: actions from a record; None if there is a policy.
+            start: time of s_0 [s], one for all realisations, or one for each if the engine supports this.
 
         Raises:
             ValueError: if shapes do not fit the plant and each other, commands are given beside a policy, or the engine
                 does not take a start for each realisation.
-            DivergenceError: if a state is not finite; says which plant, realisation, time and state.
+            DivergenceError: if a state is not finite; the message names plant, realisation, time and state.
         """
         self._validate(initial_state, exogenous, command)
         if isinstance(start, Tensor) and not self._engine.start_per_realisation:
@@ -100,7 +100,7 @@ class Rollout:
         ends = self._engine.end_states(self.interval, marked_dynamic(plain(initial_state), 0), drive)
         require_finite(self.plant, ends, initial_state, [self.interval.closure, self.interval.policy], start=start)
         states = torch.cat([initial_state.unsqueeze(0), ends])
-        # A function of the states, so that every engine differentiates the actions the same way.
+        # The actions are a function of the states, so that every engine differentiates the actions the same way.
         applied = self.plant.actuate(states[:-1], self.interval.command(states[:-1], drive))
         return Trajectory(states.transpose(0, 1), applied.transpose(0, 1), exogenous, start)
 
@@ -128,7 +128,7 @@ class Rollout:
 
 
 def refusal(engine: Engine, plant: Plant) -> str | None:
-    """Why an engine cannot roll a plant out, for a message; None if it can."""
+    """The reason why an engine cannot roll a plant out, for a message; None if it can."""
     if engine not in ENGINES:
         return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
     if plant.own_scheme and not ENGINES[engine].own_scheme:
@@ -154,13 +154,13 @@ def require_finite(
     Args:
         plant: the physics.
         ends: states at the end of every interval.
-        initial_state: s_0.
-        modules: closure and policy it was computed with, for the message.
-        start: time of s_0 [s], one for all or one for each realisation.
-        remedy: what the user can do, for the message.
+        initial_state: initial states s_0.
+        modules: closure and policy of the trajectory, for the message.
+        start: time of s_0 [s], one for all realisations or one for each.
+        remedy: advice to the user, for the message.
 
     Raises:
-        DivergenceError: with plant, realisation, time and the last state that was finite.
+        DivergenceError: if a state is not finite; the message names plant, realisation, time and the last finite state.
     """
     if ends.isfinite().all():
         return
@@ -178,7 +178,7 @@ def require_finite(
 def drive_of(
     plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Float[Tensor, " batch"] = 0.0
 ) -> Drive:
-    """The drive, time first, of inputs and commands that come batch first; ``start`` as in :class:`Rollout`."""
+    """The drive, time first, of inputs and commands with the batch first; :class:`Rollout` explains ``start``."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)
     commands = exogenous.new_empty(n, batch, 0) if command is None else plain(command.transpose(0, 1))
@@ -192,7 +192,7 @@ def require_double(role: str, module: nn.Module | None) -> None:
     """Refuse modules that would mix single with double precision.
 
     Raises:
-        ValueError: naming the first parameter that is not float64.
+        ValueError: if a parameter is not float64; the message names the first one.
     """
     for name, weight in module.named_parameters() if module is not None else ():
         if weight.dtype != torch.float64:

@@ -4,9 +4,9 @@ r"""Forward sensitivities of a trajectory to the closure's weights, :math:`S_k =
     S_0 = 0, \qquad S_{k+1} = A_kS_k + B_k, \quad
     A_k = \frac{\partial\Phi}{\partial s}(s_k, x_k), \quad B_k = \frac{\partial\Phi}{\partial w}(s_k, x_k)
 
-As in the parallel adjoint, all A_k and B_k are one batched call each; only the linear recurrence is sequential. They
-give the gradient, the Gauss-Newton matrix and the Fisher information of an identification. Their cost grows with the
-number of weights, that of an adjoint does not: they are for closures of up to some hundred weights.
+As in the parallel adjoint, a batched call computes all A_k and B_k; only the linear recurrence is sequential. The
+sensitivities give the gradient, the Gauss-Newton matrix and the Fisher information of an identification. Their cost
+grows with the number of weights, unlike that of an adjoint: they are for closures of up to some hundred weights.
 """
 
 from functools import partial
@@ -24,7 +24,7 @@ from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan, mar
 from rt_torchrl.trajectories.rollout import drive_of
 
 WIDE = 4
-"""Weights for each state from which on a reverse-mode product for each state is quicker than one for each weight."""
+"""Ratio of weights to states above which reverse-mode products for all states are quicker than one for each weight."""
 
 
 class Sensitivities:
@@ -32,16 +32,16 @@ class Sensitivities:
 
     Args:
         plant: the physics.
-        closure: its trainable weights are what is varied, flattened in the order of ``parameters()``.
+        closure: closure with the trainable weights w_p, flattened in the order of ``parameters()``.
         compiled: compile recurrences and Jacobians, for trajectories that all have the same length.
-        compiled_step: compile one interval instead, which then serves trajectories of any length.
+        compiled_step: compile one interval instead, for trajectories of any length.
     """
 
     def __init__(self, plant: Plant, closure: nn.Module, *, compiled: bool = False, compiled_step: bool = False):
         self.interval = Interval(plant, closure, None)
         self._march = march_by_step if compiled_step else compiled_if(compiled, march_by_scan, march)
         wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
-        # By rows uncompiled: the compiler gains little there.
+        # The Jacobians by rows are not compiled: the compiler gains little there.
         self._jacobians = linearise_by_rows if wide else compiled_if(compiled, linearise)
         self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
 
@@ -58,11 +58,11 @@ class Sensitivities:
         """States s_1 ... s_n and their sensitivities S_1 ... S_n.
 
         Args:
-            initial_state: s_0 of each trajectory.
-            exogenous: z, held over each interval.
-            actions: held likewise.
-            start: time of s_0 [s], one for all or one for each trajectory.
-            initial: append n_s columns, ds_k/ds_0.
+            initial_state: initial state s_0 of each trajectory.
+            exogenous: exogenous inputs z, held over each interval.
+            actions: actions, held over each interval.
+            start: time of s_0 [s], one for all trajectories or one for each.
+            initial: append the n_s columns of ds_k/ds_0.
         """
         drive = drive_of(self.interval.plant, exogenous, actions, start=start)
         initial_state = marked_dynamic(plain(initial_state), 0)
@@ -78,7 +78,7 @@ class Sensitivities:
 
 
 def propagate(A: Tensor, B: Tensor) -> Tensor:
-    """S_1 ... S_n, ``n batch n_s n_w``, by a loop."""
+    """The sensitivities S_1 ... S_n, ``n batch n_s n_w``, by a loop."""
     sensitivity, found = torch.zeros_like(B[0]), []
     for transition, source in zip(A, B, strict=True):
         sensitivity = transition @ sensitivity + source
@@ -87,7 +87,7 @@ def propagate(A: Tensor, B: Tensor) -> Tensor:
 
 
 def propagate_by_scan(A: Tensor, B: Tensor) -> Tensor:
-    """The same by one ``scan``, for the compiler."""
+    """The sensitivities of :func:`propagate` by one ``scan``, for the compiler."""
 
     def body(sensitivity, x):
         transition, source = x

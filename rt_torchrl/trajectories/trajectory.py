@@ -1,4 +1,4 @@
-"""What a system did, what it is to be flown under, and what an episode costs."""
+"""Trajectories of a system, the scenarios that they start from, and their costs."""
 
 from typing import NamedTuple
 
@@ -10,19 +10,19 @@ from rt_torchrl.plants.plant import Plant
 
 
 class Scenario(NamedTuple):
-    """What episodes start from, s_0, and what acts in them from outside, z of every interval."""
+    """Initial states s_0 of episodes, and the exogenous inputs z of all their intervals."""
 
     initial_state: Float[Tensor, "*batch n_s"]
     exogenous: Float[Tensor, "*batch n n_z"]
 
 
 class Trajectory(NamedTuple):
-    """What a system did, as the real system reported it or as a twin computed it; any number of batch dimensions.
+    """States and actions of a system, reported by the real system or computed by a twin, in any batch dimensions.
 
     Args:
-        states: s_0 ... s_n.
-        actions: applied in the n intervals between.
-        exogenous: z, held over the same intervals.
+        states: states s_0 ... s_n.
+        actions: actions that were applied in the n intervals between the states.
+        exogenous: exogenous inputs z, held over the same intervals.
         start: time of s_0 on the plant's clock [s], one for all trajectories or one for each.
     """
 
@@ -40,10 +40,10 @@ class Trajectory(NamedTuple):
         )
 
     def segments(self, length: int, dt: float) -> "Trajectory":
-        """A batch of trajectories cut into segments of that many intervals, in the order of time.
+        """The segments of all trajectories of a batch, as one batch; those of a trajectory are in the order of time.
 
         Args:
-            length: control intervals of a segment; what is left over at the end is dropped.
+            length: number of control intervals of a segment; a shorter rest at the end is dropped.
             dt: control interval [s].
         """
         states, actions, exogenous, start = self

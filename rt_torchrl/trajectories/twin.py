@@ -14,10 +14,10 @@ from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 class DigitalTwin:
     """Flies virtual episodes of a plant whose true closure it does not know.
 
-    ``sensitivities`` gives replayed states with their derivatives by the closure's weights.
+    The attribute ``sensitivities`` gives replayed states with their derivatives by the closure's weights.
 
     Args:
-        plant: shared with the real system in simulation; its own closure is never used here.
+        plant: the physics, which a simulated real system shares; the plant's own closure is never used here.
         closure: the learned closure g(·; w_p).
         engine: gradient engine, see :mod:`rt_torchrl.trajectories.rollout`.
         compiled: compile the engine.
@@ -53,7 +53,7 @@ class DigitalTwin:
     ) -> Trajectory:
         """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
 
-        Differentiable by the policy's weights and the initial state; the closure is held constant.
+        The trajectory is differentiable by the policy's weights and the initial state; the closure is held constant.
         """
         return self._rollout(constant(self.closure), policy)(initial_state, exogenous, start=start)
 
@@ -65,7 +65,7 @@ class DigitalTwin:
 
 
 def constant(module: nn.Module) -> nn.Module:
-    """The same module, sharing its weights, of which no gradient is asked."""
+    """A copy of the module that shares its weights but asks for no gradient of them."""
     shared = {id(w): nn.Parameter(w.detach(), requires_grad=False) for w in module.parameters()}
     shared |= {id(buffer): buffer for buffer in module.buffers()}
     return copy.deepcopy(module, shared)

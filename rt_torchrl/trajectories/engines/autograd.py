@@ -8,7 +8,7 @@ from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
 class Autograd:
-    """Tapes every operation of every step; memory and time grow with the number of steps.
+    """Records every operation of every step; memory and time grow with the number of steps.
 
     Args:
         compiled: run the recurrence and its reverse as one compiled scan.

@@ -1,4 +1,4 @@
-"""Compiled or eager, decided in one place."""
+"""The choice between compiled and eager functions, and the settings of the compiler."""
 
 import shutil
 import sysconfig
@@ -24,7 +24,7 @@ LIMITS = {
 
 
 def raised_limits() -> AbstractContextManager[None]:
-    """The tracer's settings that this library compiles under, for as long as the context lasts."""
+    """A context in which the tracer has the settings that this library compiles under."""
     return torch._dynamo.config.patch(LIMITS)
 
 
@@ -46,7 +46,7 @@ def compiled_if(compiled: bool, function: Callable, eager: Callable | None = Non
 
 
 def marked_dynamic(tensor: Tensor, dim: int) -> Tensor:
-    """The tensor, of which the compiler is told that the size of a dimension changes: one graph for all sizes."""
+    """Tell the compiler that a dimension of the tensor changes its size, so that one graph serves all sizes."""
     torch._dynamo.maybe_mark_dynamic(tensor, dim)
     return tensor
 
@@ -54,14 +54,14 @@ def marked_dynamic(tensor: Tensor, dim: int) -> Tensor:
 def plain(tensor: Tensor) -> Tensor:
     """A copy with the strides of its shape.
 
-    A tensor with a dimension of one counts as contiguous whatever its stride there is, but the compiler traces again
-    for another, and a scan refuses it.
+    A tensor with a dimension of size one counts as contiguous whatever its stride in that dimension. The compiler
+    nevertheless traces again for another stride, and a scan refuses it.
     """
     return tensor.clone(memory_format=torch.contiguous_format)
 
 
 def missing_for_compilation() -> str | None:
-    """What torch.compile lacks on this machine's CPU, in words; None if nothing."""
+    """The name of what torch.compile lacks on this machine's CPU; None if it lacks nothing."""
     candidates = [c for c in inductor_config.cpp.cxx if c] if isinstance(inductor_config.cpp.cxx, tuple) else ["g++"]
     if not any(shutil.which(str(candidate)) for candidate in candidates):
         return "a C++ compiler"
@@ -72,7 +72,7 @@ def missing_for_compilation() -> str | None:
 
 @contextmanager
 def watched_compilation(tell: Callable[[bool], None]) -> Iterator[None]:
-    """Tell when the compiler begins, with True, and when it ends, for as long as the context lasts."""
+    """A context that calls ``tell(True)`` when the compiler begins and ``tell(False)`` when it ends."""
     handler = torch._dynamo.callback_handler
     begun = handler.register_start_callback(lambda arguments: tell(True))
     ended = handler.register_end_callback(lambda arguments: tell(False))
@@ -93,8 +93,8 @@ def _compile(function: Callable) -> Callable:
 def _lasting(guards: Sequence[GuardFilterEntry]) -> list[bool]:
     """Leave out the one guard that fails again and again although nothing has changed.
 
-    TensorDict takes part in every vmap and remembers there which classes are its own. That memory grows as a program
-    goes on, and each time every graph with a vmap in it would be traced once more.
+    TensorDict takes part in every vmap and remembers there which classes are its own. This memory grows as a program
+    goes on, and each time the compiler would trace every graph with a vmap in it once more.
     """
     return ["_TENSORCLASS_MEMO" not in guard.name for guard in guards]
 

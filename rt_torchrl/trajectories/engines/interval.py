@@ -8,7 +8,7 @@ from rt_torchrl.plants.plant import Plant
 
 
 class Drive(NamedTuple):
-    """What drives the intervals from outside, time first: t [s], exogenous input z, and commands if none is computed.
+    """Times t [s], exogenous inputs z and recorded commands of the intervals, with the time as first dimension.
 
     Shapes: ``t`` is ``n 1``, ``exogenous`` ``n batch n_z``, ``command`` ``n batch n_a`` (zero-width with a policy).
     """
@@ -24,7 +24,7 @@ class Interval(nn.Module):
     Args:
         plant: the physics; holds no trained weights.
         closure: the true or the learned closure.
-        policy: computes the command from the observation; None to take the command from the drive.
+        policy: policy that computes the command from the observation; None takes the command from the drive.
     """
 
     def __init__(self, plant: Plant, closure: nn.Module, policy: nn.Module | None):
@@ -32,7 +32,7 @@ class Interval(nn.Module):
         self.plant, self.closure, self.policy = plant, closure, policy
 
     def command(self, state: Tensor, drive: Drive) -> Tensor:
-        """What is asked of the actuators at the start of the interval."""
+        """The command to the actuators at the start of the interval."""
         if self.policy is None:
             return drive.command
         return self.policy(self.plant.observe(drive.t, state, drive.exogenous))

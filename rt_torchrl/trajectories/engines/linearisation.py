@@ -10,32 +10,32 @@ from rt_torchrl.trajectories.engines.compilation import plain
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
 PIECE = 2048
-"""Intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one number;
-with pieces of this there is one for all trajectories that are not shorter."""
+"""Number of intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one
+number of intervals; with this fixed number one graph serves all trajectories that are not shorter."""
 
 
 def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
-    """The intervals of all realisations as rows, ``n·batch`` of them.
+    """The intervals of all realisations as ``n·batch`` rows.
 
-    What is asked of every interval at once does not care which trajectory it is of. One graph then serves every length
-    and every number of realisations, and its loops are over one dimension: those over time and realisations, of which t
-    has only the former, take the compiler of a drone's step a minute.
+    A function of single intervals does not depend on the trajectories that these belong to. As rows, one graph serves
+    every length and every number of realisations, and its loops run over one dimension. With loops over both time and
+    realisations, of which t has only the time, the compiler takes a minute for the step of a drone.
     """
     t = drive.t.expand(starts.shape[:2]).flatten()
     return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
 
 
 def piece(rows: Tensor, drive: Drive, first: int, last: int) -> tuple[Tensor, Drive]:
-    """Rows ``first`` to ``last`` in memory of their own.
+    """Rows ``first`` to ``last`` − 1 in memory of their own.
 
-    The compiler traces a view together with the tensor that it looks at. Rows that look at ``n batch ...`` have two
-    sizes that it does not know, of which it finds only the product; it then gives up.
+    The compiler traces a view together with the tensor behind it. Behind the rows is a tensor ``n batch ...`` with two
+    unknown sizes, of which the compiler finds only the product; it then gives up.
     """
     return plain(rows[first:last]), Drive(*(plain(x[first:last]) for x in drive))
 
 
 def pieces(count: int) -> list[slice]:
-    """Cut ``count`` rows into as few pieces as :data:`PIECE` allows, of lengths that differ by one at most.
+    """Cut ``count`` rows into as few pieces as :data:`PIECE` allows, with lengths that differ by one at most.
 
     No piece is left with a single row, for which the compiler would trace again.
     """
@@ -45,7 +45,7 @@ def pieces(count: int) -> list[slice]:
 
 
 def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
-    """``function`` of every interval, ``n batch ...``, in pieces of :data:`PIECE`, of which the last may overlap."""
+    """``function`` of every interval, ``n batch ...``, in pieces of :data:`PIECE`; the last one may overlap another."""
     rows, driven = as_one_batch(starts, drive)
     length = min(PIECE, len(rows))
     firsts = [*range(0, len(rows) - length, length), len(rows) - length]
@@ -58,8 +58,8 @@ def linearise(interval: Interval, names: tuple[str, ...], starts: Tensor, drive:
     """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column.
 
     Args:
-        interval: Φ.
-        names: those weights w of its closure; without one there is ∂Φ/∂s alone.
+        interval: the map Φ.
+        names: names of the weights w of its closure; without names the result is ∂Φ/∂s alone.
         starts: states at the starts of the intervals, ``rows n_s``.
         drive: times and inputs of the intervals.
     """
@@ -80,7 +80,7 @@ def linearise(interval: Interval, names: tuple[str, ...], starts: Tensor, drive:
 
 
 def linearise_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
-    """The same by a reverse-mode product for each row, which is less work where n_w is far above n_s."""
+    """The result of :func:`linearise` by a reverse-mode product for each row: less work where n_w is far above n_s."""
     weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
 
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:

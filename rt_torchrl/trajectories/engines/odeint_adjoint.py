@@ -11,9 +11,9 @@ from rt_torchrl.trajectories.engines.interval import Drive, Interval
 class OdeintAdjoint:
     r"""Chains :func:`torchdiffeq.odeint_adjoint` over the control intervals.
 
-    The applied action and the exogenous input are constant components of the integrated state, so that the co-state of
-    an action is :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, from which ordinary
-    backpropagation goes on into the policy. The co-state is integrated backwards with the step of the forward solution:
+    The applied action and the exogenous input are constant components of the integrated state. The co-state of an
+    action is then :math:`\int \lambda^\top \partial f/\partial a\,dt` over its interval, and ordinary backpropagation
+    carries it on into the policy. The co-state is integrated backwards with the step of the forward solution, so that
     the gradient differs from the exact one of the discrete trajectory by the order of that step.
 
     Args:
@@ -36,7 +36,7 @@ class OdeintAdjoint:
             now = Drive(drive.t[k], drive.exogenous[k], drive.command[k])
             applied = interval.plant.actuate(state, interval.command(state, now))
             held = torch.cat([state, applied, now.exogenous], -1)
-            # In absolute time: the field is evaluated again in the backward pass, long after this loop has moved on.
+            # The span is in absolute time: the backward pass evaluates the field again, long after this loop moved on.
             span = drive.t[k] + interval_span
             end = odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1]
             state = interval.plant.latch(end[..., : state.shape[-1]], applied)
@@ -45,7 +45,7 @@ class OdeintAdjoint:
 
 
 class _HeldField(nn.Module):
-    """d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
+    """The vector field of the held state, d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
 
     def __init__(self, interval: Interval, n_states: int, *, compiled: bool):
         super().__init__()

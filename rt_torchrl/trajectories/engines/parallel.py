@@ -8,8 +8,8 @@ With one interval as :math:`s_{k+1} = \Phi(s_k, x_k; w)`, the gradient of a cost
     \lambda_k = A_k^\top\lambda_{k+1} + \frac{\partial J}{\partial s_k}, \qquad
     \frac{dJ}{dw} = \sum_k \lambda_{k+1}^\top\frac{\partial\Phi}{\partial w}(s_k, x_k).
 
-Only the recurrence of the states and the (linear) one of λ are sequential. The Jacobians of all intervals and all
-trajectories are one batched call, and so is the sum over k; both are cut into pieces where there are many.
+Only the recurrence of the states and the linear recurrence of λ are sequential. One batched call computes the Jacobians
+of all intervals of all trajectories, and another one the sum over k; both are cut into pieces where intervals are many.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
 class Parallel:
-    """See the module.
+    """Computes the exact discrete adjoint in parallel over time; the module describes it.
 
     Args:
         compiled: compile the two recurrences, the Jacobians and the final product.
@@ -82,9 +82,9 @@ def _products(
     costates: Tensor,
     wanted: Sequence[bool],
 ) -> list[Tensor | None]:
-    """λᵀ∂Φ/∂x for t, z and a of every interval and, summed over the intervals, for every weight; None if not wanted.
+    """λᵀ∂Φ/∂x for t, z and a of every interval, and its sum over the intervals for every weight; None if not wanted.
 
-    In pieces, because the tape of an interval holds every unit of a perceptron.
+    The products are computed in pieces, because the tape of an interval holds every unit of a perceptron.
     """
     if not any(wanted):
         return [None] * len(wanted)
@@ -106,7 +106,7 @@ def _products(
 
 
 def _of_rows(parts: Sequence[Tensor | None], shape: torch.Size, drive: Tensor) -> Tensor | None:
-    """Gradients of all rows in the shape of the drive, of which t may be one for all realisations."""
+    """The gradients of all rows in the shape of the drive, where t may be the same for all realisations."""
     if parts[0] is None:
         return None
     return torch.cat(parts).unflatten(0, shape).sum_to_size(drive.shape)
@@ -122,7 +122,7 @@ def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
 
 
 def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
-    """λ_1 ... λ_n from A_1 ... A_{n−1} and ∂J/∂s_1 ... ∂J/∂s_n, by a loop."""
+    """The co-states λ_1 ... λ_n from A_1 ... A_{n−1} and ∂J/∂s_1 ... ∂J/∂s_n, by a loop."""
     costate = cost_gradient[-1]
     reversed_costates = [costate]
     for transition, source in zip(jacobians.flip(0), cost_gradient[:-1].flip(0), strict=True):
@@ -132,7 +132,7 @@ def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
 
 
 def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
-    """The same by one ``scan``, for the compiler."""
+    """The co-states of :func:`costates` by one ``scan``, for the compiler."""
 
     def body(costate, x):
         transition, source = x

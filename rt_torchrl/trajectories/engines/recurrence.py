@@ -18,7 +18,7 @@ def march(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
 
 
 def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
-    """The same by one ``scan``, for the compiler."""
+    """The states of :func:`march` by one ``scan``, for the compiler."""
 
     def body(state, x):
         # The scan wants a carry that keeps its strides and an output that does not alias it.
@@ -29,7 +29,10 @@ def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Te
 
 
 def march_by_step(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
-    """The same by a loop over one compiled interval: slower than the scan, but compiled once for all lengths."""
+    """The states of :func:`march` by a loop over one compiled interval.
+
+    The loop is slower than the scan, but is compiled once for all lengths.
+    """
     step = compiled_if(True, _one_interval)
     state, states = initial_state, []
     for k in range(drive.t.shape[0]):
