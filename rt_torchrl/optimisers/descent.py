@@ -67,6 +67,8 @@ class Descent:
         config: see :class:`DescentConfig`.
     """
 
+    _optimiser: torch.optim.Adam | torch.optim.LBFGS
+
     def __init__(self, module: nn.Module, config: DescentConfig):
         self.module, self.config = module, config
         self.restart()
@@ -130,7 +132,14 @@ class _Diverged(Exception):
 class _Seen:
     """The closure an optimiser calls: cost and gradient at the present weights, with a memory of the best."""
 
-    def __init__(self, module, cost, config, iterations, stop_below):
+    def __init__(
+        self,
+        module: nn.Module,
+        cost: Callable[[], Tensor],
+        config: DescentConfig,
+        iterations: int,
+        stop_below: float,
+    ):
         self._module, self._cost, self._config = module, cost, config
         self._iterations, self._stop_below = iterations, stop_below
         self.start = self.best = float("nan")

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -52,7 +52,7 @@ class SafetyConfig:
     patience: float = math.inf
     log: Path | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 0.0 < self.interval < math.inf:
             raise ValueError(f"interval={self.interval} s must be positive and finite: the system's control interval.")
 
@@ -85,7 +85,7 @@ class SafetyReport:
     """Of one episode: its events, and how many intervals each reason was met in."""
 
     events: list[SafetyEvent] = field(default_factory=list)
-    counts: Counter = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
 
 
 class SafetyLayer(EnvBase):
@@ -141,7 +141,9 @@ class SafetyLayer(EnvBase):
             )
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config = env, config
-        self._clock, self.reports = clock, []
+        self._clock = clock
+        self.reports: list[SafetyReport] = []
+        self._good: dict[str, Tensor] = {}
         self.watchdog = Watchdog(config.ranges, deadline=config.deadline, hold=config.hold, patience=config.patience)
         self._make_specs()
         self.limits = ActionLimits(
@@ -170,7 +172,7 @@ class SafetyLayer(EnvBase):
         self.done_spec = done
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         """What the layer does not have itself is the system's, such as ``plant``."""
         try:
             return super().__getattr__(name)
@@ -184,7 +186,7 @@ class SafetyLayer(EnvBase):
         """Of the present episode, or of the last one until the next begins."""
         return self.reports[-1]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
         faults = self._faults(found, 0.0, "after its reset")
@@ -281,9 +283,9 @@ class SafetyLayer(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.env.set_seed(seed)
 
-    def state_dict(self, *args, **kwargs) -> dict:
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """The system's; the layer itself has nothing that outlives an episode."""
         return self.env.state_dict(*args, **kwargs)
 
-    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+    def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.env.load_state_dict(state, *args, **kwargs)

@@ -14,6 +14,7 @@ trajectories are one batched call, and so is the sum over k; both are cut into p
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
+from typing import ClassVar
 
 import torch
 from hoptorch.scan import scan
@@ -33,8 +34,8 @@ class Parallel:
         compiled: compile the two recurrences, the Jacobians and the final product.
     """
 
-    own_scheme = True
-    start_per_realisation = True
+    own_scheme: ClassVar[bool] = True
+    start_per_realisation: ClassVar[bool] = True
 
     def __init__(self, *, compiled: bool):
         self.march = compiled_if(compiled, march_by_scan, march)
@@ -107,13 +108,18 @@ def _products(
 
 def _of_rows(parts: Sequence[Tensor | None], shape: torch.Size, drive: Tensor) -> Tensor | None:
     """Gradients of all rows in the shape of the drive, of which t may be one for all realisations."""
-    if parts[0] is None:
-        return None
-    return torch.cat(parts).unflatten(0, shape).sum_to_size(drive.shape)
+    found = _known(parts)
+    return torch.cat(found).unflatten(0, shape).sum_to_size(drive.shape) if found else None
 
 
 def _summed(parts: Sequence[Tensor | None]) -> Tensor | None:
-    return None if parts[0] is None else reduce(torch.add, parts)
+    found = _known(parts)
+    return reduce(torch.add, found) if found else None
+
+
+def _known(parts: Sequence[Tensor | None]) -> list[Tensor]:
+    """Gradients of the pieces: all of them, or none for an input that the intervals do not depend on."""
+    return [part for part in parts if part is not None]
 
 
 def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
