@@ -115,7 +115,8 @@ class ReinforcementTwinning:
         Raises:
             ValueError: if several episodes in a row cannot be learned from; nothing of them is in a memory.
         """
-        live, strength, refused = self.referee.live, self.config.exploration.strength(self.episodes_done), []
+        live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
+        refused: list[str] = []
         while True:
             self.actor.begin(self.policies[live], strength=strength)
             episode = self.collector.rollout()[0]
@@ -279,7 +280,8 @@ class ReinforcementTwinning:
         """
         kept = {name: state[name] for name in KEPT}
         state = state | tree_map_only(Tensor, lambda tensor: tensor.to(self.generator.device), kept)
-        parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
+        parts: dict[str, tuple[Any, Any]] = {}
+        parts |= {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
         parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
         for name, (part, saved) in parts.items():
@@ -303,6 +305,7 @@ def require_own_policies(algorithm: ReinforcementTwinning) -> None:
     Raises:
         ValueError: naming it.
     """
-    for part, role in (("learner", "model_free"), ("planner", "model_based")):
+    trained: dict[str, Role] = {"learner": "model_free", "planner": "model_based"}
+    for part, role in trained.items():
         if getattr(algorithm, part).policy is not algorithm.policies[role]:
             raise ValueError(f"{part} trains another policy than {role}; build it with the module given as {role}.")

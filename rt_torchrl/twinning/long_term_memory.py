@@ -32,7 +32,7 @@ class LongTermMemoryConfig:
     correction: float = 0.4
     offset: float = 1e-3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.capacity < 1:
             raise ValueError(f"capacity={self.capacity} of the long-term memory must be at least 1.")
@@ -182,10 +182,10 @@ class LeastPriorityWriter(Writer):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Nothing to restore, as in :meth:`_empty`."""
 
-    def dumps(self, path) -> None:
+    def dumps(self, path: str) -> None:
         """Nothing to write, as in :meth:`_empty`."""
 
-    def loads(self, path) -> None:
+    def loads(self, path: str) -> None:
         """Nothing to read, as in :meth:`_empty`."""
 
 
