@@ -38,6 +38,9 @@ class InitialStates(nn.Module):
         scale: unit of the offsets, by state; about the noise, so that a step of one is neither long nor short.
     """
 
+    measured: Tensor
+    unit: Tensor
+
     def __init__(self, segments: Sequence[Trajectory], free: Sequence[int], scale: Float[Tensor, " n_s"]):
         super().__init__()
         self.register_buffer("measured", torch.stack([segment.states[0] for segment in segments]))
@@ -72,14 +75,14 @@ class Replayed(NamedTuple):
     """A segment as the twin replays it: states s_0 ... s_n, and what every sample says of the unknowns.
 
     ``gradient`` and ``curvature`` are those of L_p by the state, ``sensitivity`` is that of the state by the unknowns
-    with the places ``index`` in the vector of all.
+    with these ``places`` in the vector of all.
     """
 
     states: Float[Tensor, "samples n_s"]
     gradient: Float[Tensor, "samples n_s"]
     curvature: Float[Tensor, "samples n_s n_s"]
     sensitivity: Float[Tensor, "samples n_s n_local"]
-    index: Int[Tensor, " n_local"]
+    places: Int[Tensor, " n_local"]
 
 
 class OutputError:
@@ -114,7 +117,7 @@ class OutputError:
 
     def cost(self) -> Tensor:
         """J_p, differentiable by the adjoint of the twin's engine."""
-        total = 0.0
+        total = self.initial.measured.new_zeros(())
         for (states, actions, exogenous, start), first in zip(self.segments, self.initial(), strict=True):
             flown = self.twin.replay(first[None], exogenous[None], actions[None], start=start)
             total = total + self.plant.dt * self.plant.discrepancy(flown.states[0], states).sum()
@@ -138,7 +141,7 @@ class OutputError:
         S = torch.cat([at_start[None], S[0]])
         by_initial = S[..., self.weight_count :] @ self.initial.unit.T
         g, H = discrepancy_derivatives(self.plant, states[None], measured[None])
-        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
+        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._places(number))
 
     @torch.no_grad()
     def normal_equations(self, replays: Sequence[Replayed] | None = None) -> NormalEquations:
@@ -147,7 +150,7 @@ class OutputError:
         gradient, matrix = self.initial.measured.new_zeros(count), self.initial.measured.new_zeros(count, count)
         cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
         for replayed, segment in zip(replays or self.replays(), self.segments, strict=True):
-            S, i = replayed.sensitivity, replayed.index
+            S, i = replayed.sensitivity, replayed.places
             cost = cost + dt * self.plant.discrepancy(replayed.states, segment.states).sum()
             gradient[i] += dt * torch.einsum("ki,kiw->w", replayed.gradient, S)
             matrix[i[:, None], i] += dt * torch.einsum("kiv,kiw->vw", S, replayed.curvature @ S)
@@ -157,7 +160,7 @@ class OutputError:
         """Estimate the initial states under the present weights, of an output error whose only unknowns they are."""
         LevenbergMarquardt(self.initial, tolerance=NOISE_TOLERANCE).run(self.normal_equations, INITIAL_ITERATIONS)
 
-    def _index(self, number: int) -> Int[Tensor, " n_local"]:
+    def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)
         own = self._shown + number * free + torch.arange(free)
         return torch.cat([torch.arange(self._shown), own])

@@ -75,7 +75,9 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
     return Resampled(segments, interval, float(within.std() / interval), float(limit), gaps, too_short)
 
 
-def hold_out(segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10) -> tuple[list, list]:
+def hold_out(
+    segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10
+) -> tuple[list[Trajectory], list[Trajectory]]:
     """Segments to train on and, last in time, segments to judge by; the one in which the cut falls is divided.
 
     Args:
