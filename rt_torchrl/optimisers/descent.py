@@ -38,7 +38,7 @@ class DescentConfig:
     gradient_limit: float = 1.0
     second_moment: float = 0.9
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self, infinite=("gradient_limit",))
         for argument in ("rate", "gradient_limit"):
             if not getattr(self, argument) > 0:

@@ -14,7 +14,7 @@ trajectories are one batched call, and so is the sum over k; both are cut into p
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from hoptorch.scan import scan
@@ -53,7 +53,16 @@ class _DiscreteAdjoint(torch.autograd.Function):
     """Maps (s_0, t, z, a, w) to s_1 ... s_n; the engine and the interval are passed along for their maps."""
 
     @staticmethod
-    def forward(ctx, engine, interval, initial_state, t, exogenous, command, *weights):
+    def forward(
+        ctx: Any,
+        engine: Parallel,
+        interval: Interval,
+        initial_state: Tensor,
+        t: Tensor,
+        exogenous: Tensor,
+        command: Tensor,
+        *weights: Tensor,
+    ) -> Tensor:
         ends = engine.march(interval, initial_state, Drive(t, exogenous, command))
         ctx.engine, ctx.interval = engine, interval
         # Saving the weights lets autograd notice when one is changed between forward and backward.
@@ -62,7 +71,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, cost_gradient):
+    def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
         jacobians = over_all(partial(ctx.engine.linearise, ctx.interval, ()), starts, drive)
@@ -140,7 +149,7 @@ def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
 def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
     """The same by one ``scan``, for the compiler."""
 
-    def body(costate, x):
+    def body(costate: Tensor, x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         transition, source = x
         costate = ((transition * costate.unsqueeze(-1)).sum(-2) + source).contiguous()
         return costate, costate.clone()
