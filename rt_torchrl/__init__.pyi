@@ -17,7 +17,7 @@ from .systems.exploration import ExplorationConfig
 from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyEvent, SafetyLayer, SafetyReport
-from .evaluation.real_episodes import RealController
+from .evaluation.baseline import RealController
 
 # Trajectories and the twin
 from .trajectories.rollout import DivergenceError, Engine, Rollout
@@ -41,7 +41,8 @@ from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, T
 # Trainings from the command line, and their results
 from .options import check_options
 from .runs.loaded_run import LoadedRun, load_run
-from .runs.run import Run, main_of, require_device
+from .runs.machine import require_device
+from .runs.run import Run, main_of
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot

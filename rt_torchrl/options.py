@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any, Literal
 
 
-def check_options(config: Any, *, infinite: Sequence[str] = ()) -> None:
+def check_options(config: object, *, infinite: Sequence[str] = ()) -> None:
     """Refuse options whose values do not fit the types that their configuration declares.
 
     A dataclass does not check its types itself. This function checks every field that is declared as a ``Literal``, a
@@ -24,7 +24,8 @@ def check_options(config: Any, *, infinite: Sequence[str] = ()) -> None:
     Raises:
         ValueError: if a value does not fit; the message names the option, its value, and what is allowed.
     """
-    for name, kind in _kinds(type(config)).items():
+    config_class: type = type(config)
+    for name, kind in _kinds(config_class).items():
         _check(name, getattr(config, name), kind, finite=name not in infinite)
 
 

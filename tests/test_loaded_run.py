@@ -171,6 +171,7 @@ def test_recipes_that_cannot_be_found_are_told(tmp_path):
         "gone:Config": "'gone:Config' cannot be imported",
         "rt_torchrl:Plant": "rt_torchrl:Plant is no class derived from RunConfig",
         "gone.py:Config": "gone.py does not exist",
+        str(tmp_path / "config.json"): "config.json is no Python code, by its name; give a file that ends in .py",
     }.items():
         with pytest.raises(ValueError, match=message):
             load_run(tmp_path, given)

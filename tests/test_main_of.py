@@ -42,5 +42,7 @@ def test_an_interrupt_leaves_as_shells_report_it(monkeypatch):
 
 @pytest.mark.parametrize("horizon", [1e308, 1e300, 1e9])
 def test_an_episode_that_no_memory_holds_is_refused(horizon):
-    with pytest.raises(ValueError, match=r"horizon=.* s of plant 'linear_quadratic' is .* steps dt=0.1 s; it must be at most 1e\+07"):
+    with pytest.raises(
+        ValueError, match=r"horizon=.* s of plant 'linear_quadratic' is .* steps dt=0.1 s; it must be at most 1e\+07"
+    ):
         LinearQuadratic(horizon=horizon)

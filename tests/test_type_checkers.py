@@ -57,3 +57,10 @@ def test_the_link_is_the_folder_beside_the_package():
     if not LINK.is_dir():
         pytest.skip("this checkout has no symbolic links; docs/contributing.md says how to get them")
     assert LINK.resolve() == (ROOT / "envs").resolve()
+
+
+def test_no_error_of_a_type_checker_is_silenced():
+    for folder in ("rt_torchrl", "envs"):
+        for path in (ROOT / folder).rglob("*.py*"):
+            if path.suffix in (".py", ".pyi"):
+                assert "type: ignore" not in path.read_text(encoding="utf-8"), path

@@ -54,7 +54,7 @@ class CyclicLoad:
     width: float = 675.0
     noise: float = 25.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, unit in (("minimum", "W"), ("peak", "W"), ("noise", "W")):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):

@@ -7,7 +7,7 @@ import zipfile
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -181,9 +181,9 @@ def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
     return np.stack(powers, 1)
 
 
-def _open_fluid(fluid: str, low: float, high: float):
+def _open_fluid(fluid: str, low: float, high: float) -> Any:
     """CoolProp's state of a pure fluid, after a check that the range lies between its triple and critical points."""
-    import CoolProp.CoolProp as CP  # imported here: loading takes a second, and a cached fit does not need it
+    import CoolProp.CoolProp as CP  # here, because it takes a second to load and a cached fit does without
 
     try:
         fluid_state = CP.AbstractState("HEOS", fluid)
@@ -206,7 +206,7 @@ def _open_fluid(fluid: str, low: float, high: float):
     return fluid_state
 
 
-def _from_coolprop(fluid_state, pressures: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
+def _from_coolprop(fluid_state: Any, pressures: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
     import CoolProp.CoolProp as CP
 
     rows = []

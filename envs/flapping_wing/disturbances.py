@@ -59,7 +59,7 @@ class GaussianGust:
     std: float = 1.0
     time_scale: float = 3.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not math.isfinite(self.mean):
             raise ValueError(f"mean={self.mean} m/s of GaussianGust must be finite.")
         if not (math.isfinite(self.std) and self.std >= 0):

@@ -62,7 +62,7 @@ class Rotor:
     shear: float = 0.2
     n_sectors: int = 8
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         missing = sorted(set(self.blade.airfoil) - set(self.polars))
         if missing:
             raise ValueError(f"polars has {sorted(self.polars)}, the blade also uses {missing}; add a Polar for each.")

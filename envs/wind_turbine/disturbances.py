@@ -67,7 +67,7 @@ class KaimalWind:
     floor: float = CUT_IN_SPEED
     scale_to_target: bool = True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for argument, value, unit in (("mean", self.mean, "m/s"), ("length_scale", self.length_scale, "m")):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{argument}={value} {unit} of KaimalWind must be positive and finite.")
@@ -151,7 +151,7 @@ class RecordedWind:
     records: Sequence[WindRecord]
     floor: float = CUT_IN_SPEED
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.records) == 0:
             raise ValueError("records of RecordedWind is empty; pass at least one, for example from read_wind(path).")
         if not self.floor < math.inf:

@@ -33,7 +33,7 @@ class Polar:
     cd: np.ndarray
     _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         columns = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("alpha", "cl", "cd")}
         shapes = {name: column.shape for name, column in columns.items()}
         if len(set(shapes.values())) > 1 or columns["alpha"].ndim != 1 or columns["alpha"].size < 2:
@@ -119,7 +119,7 @@ class Blade:
     twist: np.ndarray
     airfoil: Sequence[str]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("r", "dr", "chord", "twist"):
             column = np.asarray(getattr(self, name), dtype=np.float64)
             if column.shape != (len(self.airfoil),) or len(self.airfoil) < 2:

@@ -11,7 +11,7 @@ import numpy as np
 from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
 
 
-def read_wind(path: str | os.PathLike) -> WindRecord:
+def read_wind(path: str | os.PathLike[str]) -> WindRecord:
     """Wind at the hub from a TurbSim file of either kind; the suffix tells the kind.
 
     Args:
@@ -33,7 +33,7 @@ def read_wind(path: str | os.PathLike) -> WindRecord:
     return readers[suffix](path)
 
 
-def read_hh(path: str | os.PathLike) -> WindRecord:
+def read_hh(path: str | os.PathLike[str]) -> WindRecord:
     r"""Longitudinal wind at the hub from hub-height text, TurbSim's ``.hh`` (``WrADHH``).
 
     Comment lines hold ``!``, ``#`` or ``%``; every other line holds Time [s], HorSpd [m/s], WndDir [deg], VerSpd
@@ -112,7 +112,7 @@ class _FieldHeader(NamedTuple):
 _HEADER = struct.Struct("<h4i12fi")
 
 
-def read_bts(path: str | os.PathLike) -> WindRecord:
+def read_bts(path: str | os.PathLike[str]) -> WindRecord:
     r"""Longitudinal wind at the hub from a binary full field, TurbSim's ``.bts`` (``WrADFF``).
 
     The file is little endian. It holds a header (:class:`_FieldHeader`), a description, and 16-bit integers for every
@@ -153,7 +153,7 @@ def read_bts(path: str | os.PathLike) -> WindRecord:
     return WindRecord(dt * np.arange(header.n_t), (hub - header.u_offset) / header.u_slope, str(path))
 
 
-def _read_header(path: str | os.PathLike) -> _FieldHeader:
+def _read_header(path: str | os.PathLike[str]) -> _FieldHeader:
     with open(path, "rb") as file:
         head = file.read(_HEADER.size)
     if len(head) < _HEADER.size:
@@ -177,7 +177,7 @@ def _read_header(path: str | os.PathLike) -> _FieldHeader:
     return header
 
 
-def _interpolation(path: str | os.PathLike, position: float, n: int, side: str) -> list[tuple[int, float]]:
+def _interpolation(path: str | os.PathLike[str], position: float, n: int, side: str) -> list[tuple[int, float]]:
     """Grid points around a position in grid spacings, with their linear weights."""
     # A hub on the grid's edge may be off by the single precision of the heights.
     if not -1e-3 <= position <= n - 1 + 1e-3:

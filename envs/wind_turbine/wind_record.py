@@ -28,7 +28,7 @@ class WindRecord:
     speed: np.ndarray
     source: str
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for field in ("time", "speed"):
             array = np.array(getattr(self, field), dtype=np.float64)
             array.setflags(write=False)

@@ -26,7 +26,7 @@ def draws(plant: Plant, seed: int) -> Iterator[str]:
     }
     for name, (of, shape, group) in wanted.items():
 
-        def draw(of=of) -> Tensor:
+        def draw(of: Callable[[torch.Generator], Tensor] = of) -> Tensor:
             return of(seeded(seed))
 
         drawn = draw()

@@ -1,38 +1,15 @@
 """Unseen episodes on a real system whose true closure nobody knows."""
 
-from abc import ABC, abstractmethod
-
 import torch
 from jaxtyping import Bool
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
-from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
-
-
-class RealController(nn.Module, ABC):
-    """A controller that can only be flown on the real system.
-
-    Args:
-        plant: physics and control problem of the twin.
-        compiled: whether to compile the parts that can be compiled.
-    """
-
-    def __init__(self, plant: Plant, *, compiled: bool = False):
-        super().__init__()
-        self.plant = plant
-
-    @abstractmethod
-    def fly_real(self, count: int, *, seed: int) -> Trajectory:
-        """Fly the first ``count`` episodes of the sequence that belongs to a seed."""
-
-
-Baseline = ClassicalController | RealController
-"""A controller that policies are compared with: on the plant, or on a real system whose closure is not known."""
 
 
 class RealEpisodes(UnseenEpisodes):
@@ -62,7 +39,17 @@ class RealEpisodes(UnseenEpisodes):
         """J_a of one episode, which is enough because only the magnitude of a random policy's cost matters."""
         return self.judge(self._flown(policy, 1)).control_costs.mean().item()
 
-    def fly_baseline(self, law: RealController) -> Trajectory:
+    def fly_baseline(self, law: Baseline) -> Trajectory:
+        """As many episodes on the real system.
+
+        Raises:
+            ValueError: if the controller is one that is flown on the plant.
+        """
+        if not isinstance(law, RealController):
+            raise ValueError(
+                f"law={type(law).__name__} is flown on the plant under the true closure, which is not known of this "
+                "real system; give a RealController, or the RealSystem its closure."
+            )
         return law.fly_real(self._count, seed=UNSEEN_SEED)
 
     @torch.no_grad()
@@ -71,7 +58,7 @@ class RealEpisodes(UnseenEpisodes):
         kept = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
-            found = torch.cat([self._system.rollout(self.plant.n_steps, actor) for _ in range(count)])
+            found = TensorDict.cat([self._system.rollout(self.plant.n_steps, actor) for _ in range(count)])
         finally:
             self._system.load_state_dict(kept)
         states = torch.cat([found["state"], found["next", "state"][:, -1:]], 1)

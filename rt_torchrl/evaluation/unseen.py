@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Rollout
@@ -53,11 +54,33 @@ class UnseenEpisodes:
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly the episodes with a policy on the real system."""
-        rollout = Rollout(self.plant, self.closure, policy, compiled=self._compiled)
+        rollout = Rollout(self.plant, self.known_closure(), policy, compiled=self._compiled)
         return rollout(self.initial_state, self.exogenous)
 
-    def fly_baseline(self, law: ClassicalController) -> Trajectory:
-        """Fly the episodes with a classical controller on the real system as it is now."""
+    def known_closure(self) -> nn.Module:
+        """The true closure.
+
+        Raises:
+            ValueError: if nobody knows it.
+        """
+        if self.closure is None:
+            raise ValueError(
+                f"the true closure of plant {self.plant.name!r} is not known (closure=None), so no episode can be "
+                "flown in simulation; assign it, or fly on the real system."
+            )
+        return self.closure
+
+    def fly_baseline(self, law: Baseline) -> Trajectory:
+        """Fly the episodes with a classical controller on the real system as it is now.
+
+        Raises:
+            ValueError: if the controller can only be flown on the real system.
+        """
+        if not isinstance(law, ClassicalController):
+            raise ValueError(
+                f"law={type(law).__name__} can only be flown on a real system; give a ClassicalController of plant "
+                f"{self.plant.name!r}."
+            )
         return law.fly(self.initial_state, self.exogenous, self.closure)
 
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
@@ -179,7 +202,7 @@ def exact_optimum(
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
     def descend(policy: nn.Module, count: int, iterations: int) -> float:
-        rollout = Rollout(unseen.plant, unseen.closure, policy, compiled=unseen._compiled)
+        rollout = Rollout(unseen.plant, unseen.known_closure(), policy, compiled=unseen._compiled)
         state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
 
         def cost() -> Tensor:

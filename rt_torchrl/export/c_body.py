@@ -36,7 +36,7 @@ def counted(shape: Sequence[int]) -> Int[Tensor, "*shape"]:
 class CBody:
     """Collects constants and statements; every result is a new array."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.constants: list[str] = []
         self.statements: list[str] = []
         self._taken = {"observation", "action"}
@@ -114,12 +114,12 @@ class CBody:
         if self._layers:
             self.statements.append(f"/* {', '.join(self._layers)} */")
             self._layers.clear()
-        lines = [line.replace("[I]", "[0]" if count == 1 else "[i]") for line in lines]
-        if count == 1 and len(lines) == 1:
-            self.statements += lines
+        written = [line.replace("[I]", "[0]" if count == 1 else "[i]") for line in lines]
+        if count == 1 and len(written) == 1:
+            self.statements += written
             return
         head = "{" if count == 1 else f"for (int i = 0; i < {count}; ++i) {{"
-        self.statements += [head, *(f"    {line}" for line in lines), "}"]
+        self.statements += [head, *(f"    {line}" for line in written), "}"]
 
     def _local(self, shape: Sequence[int]) -> Elements:
         places, name = counted(shape), self._new(f"v_{self._name}")

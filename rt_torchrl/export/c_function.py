@@ -56,28 +56,29 @@ class CFunction:
                 shape = node.args[0][0].meta["val"].shape
                 self.body.finish(self._operand(node.args[0][0], shape), shape.numel())
             else:
-                self._labels[node] = "_".join([*map(self._labels.get, node.all_input_nodes), _name(node)])
+                self._labels[node] = "_".join([*(self._labels[n] for n in node.all_input_nodes), _name(node)])
                 self._values[node] = self._computed(node)
 
     def _computed(self, node: Node) -> Any:
-        args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), self._values.get)
+        operator, inputs, keywords = _call(node)
+        args, kwargs = torch.fx.node.map_arg((inputs, keywords), self._values.get)
         varying = [n for n in node.all_input_nodes if _varies(self._values[n])]
         name, value = _name(node), node.meta.get("val")
         if node.op != "call_function":
             raise self._refusal(node, node.op)
         if not varying or name in CHECKS:
-            return None if name in CHECKS else node.target(*args, **kwargs)
+            return None if name in CHECKS else operator(*args, **kwargs)
         if name in FILLING:
-            return node.target(torch.zeros(args[0].places.shape, dtype=torch.float64), *args[1:], **kwargs)
+            return operator(torch.zeros(args[0].places.shape, dtype=torch.float64), *args[1:], **kwargs)
         if isinstance(value, Tensor) and value.dtype not in (torch.float64, torch.bool):
             raise self._refusal(node, f"{name} in {value.dtype}")
         self.body.begin(node.name, layer_of(node, self.policy).partition(" of policy ")[0])
         if name in ("mm", "bmm", "addmm", "baddbmm"):
-            return self._product(*map(self._as_elements, node.args), **kwargs)
+            return self._product(*map(self._as_elements, inputs), **kwargs)
         if name == "cat":
-            return self.body.join([self._as_elements(part) for part in node.args[0]], *args[1:], **kwargs)
+            return self.body.join([self._as_elements(part) for part in inputs[0]], *args[1:], **kwargs)
         if len(varying) == 1 and (name in MOVING or (name == "_to_copy" and self._keeps_values(node))):
-            return _moved(node, args, kwargs)
+            return _moved(node, *args, **kwargs)
         if name in ("sum", "mean"):
             return self._reduced(name == "mean", *args)
         if name in ELEMENTWISE and not kwargs.get("rounding_mode"):
@@ -99,7 +100,8 @@ class CFunction:
     @staticmethod
     def _keeps_values(node: Node) -> bool:
         """Whether a cast changes no value, because it keeps the type or casts a truth value."""
-        return node.args[0].meta["val"].dtype in (node.meta["val"].dtype, torch.bool)
+        _, (source, *_), _ = _call(node)
+        return source.meta["val"].dtype in (node.meta["val"].dtype, torch.bool)
 
     def _operand(self, argument: Any, shape: torch.Size) -> Any:
         """The i-th element of an operand, broadcast to a shape; other operands than tensors and numbers stay."""
@@ -113,9 +115,9 @@ class CFunction:
         return self.body.read(self._as_elements(argument), shape)
 
     def _elementwise(self, node: Node, name: str) -> Elements:
-        shape = node.meta["val"].shape
-        keywords = {key: self._operand(argument, shape) for key, argument in node.kwargs.items()}
-        expression = ELEMENTWISE[name](*(self._operand(argument, shape) for argument in node.args), **keywords)
+        shape, (_, inputs, given) = node.meta["val"].shape, _call(node)
+        keywords = {key: self._operand(argument, shape) for key, argument in given.items()}
+        expression = ELEMENTWISE[name](*(self._operand(argument, shape) for argument in inputs), **keywords)
         if not self._can_inline(node, shape):
             return self.body.assign(expression, shape)
         whole = name in FUNCTIONS or next(iter(node.users)).op == "output"
@@ -152,6 +154,11 @@ class CFunction:
         return result.moved(result.places.view(places.sum(dims, keepdim=True).shape)) if keepdim else result
 
 
+def _call(node: Node) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
+    """The operator and its arguments; torch declares each as anything that a graph can hold."""
+    return node.target, node.args, node.kwargs
+
+
 def _name(node: Node) -> str:
     """The name of the operator, such as add for aten.add.Tensor."""
     return getattr(node.target, "__name__", str(node.target)).partition(".")[0]
@@ -162,12 +169,12 @@ def _varies(value: Any) -> bool:
     return isinstance(value, Elements) or (isinstance(value, tuple) and any(map(_varies, value)))
 
 
-def _moved(node: Node, args: tuple, kwargs: dict) -> Any:
+def _moved(node: Node, source: Any, *rest: Any, **kwargs: Any) -> Any:
     """The result of an operator that is applied to the places of the elements."""
-    source, *rest = args
-    if isinstance(source, tuple):  # the results of split or unbind, of which one is picked
+    if isinstance(source, tuple):  # of split or unbind, to be picked from
         return source[rest[0]]
     if _name(node) == "_to_copy":
         return source
-    moved = node.target(source.places, *rest, **kwargs)
+    operator, _, _ = _call(node)
+    moved = operator(source.places, *rest, **kwargs)
     return source.moved(moved) if isinstance(moved, Tensor) else tuple(map(source.moved, moved))

@@ -5,9 +5,10 @@ A truth value is 0.0 or 1.0.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
+from torch import Tensor
 
 aten = torch.ops.aten
 
@@ -146,7 +147,9 @@ CHECKS = frozenset(["_assert_tensor_metadata"])
 """Operators that compute nothing but check what held when the policy was traced."""
 
 
-def layer_norm(x, shape, weight, bias, eps):
+def layer_norm(
+    x: Tensor, shape: Sequence[int], weight: Tensor | None, bias: Tensor | None, eps: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Layer normalisation in simpler operators."""
     over = list(range(x.dim() - len(shape), x.dim()))
     mean = x.mean(over, keepdim=True)
@@ -154,15 +157,24 @@ def layer_norm(x, shape, weight, bias, eps):
     return _affine((x - mean) * rate, weight, bias), mean, rate
 
 
-def batch_norm(x, weight, bias, mean, variance, momentum, eps):
+def batch_norm(
+    x: Tensor,
+    weight: Tensor | None,
+    bias: Tensor | None,
+    mean: Tensor,
+    variance: Tensor,
+    momentum: float,
+    eps: float,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Batch normalisation with the statistics of the training, over dimension 1."""
     shape = [-1] + [1] * (x.dim() - 2)
-    weight, bias, mean, variance = (v if v is None else v.view(shape) for v in (weight, bias, mean, variance))
+    weight, bias = (v if v is None else v.view(shape) for v in (weight, bias))
+    rate = (variance.view(shape) + eps).rsqrt()
     empty = x.new_zeros(0)
-    return _affine((x - mean) * (variance + eps).rsqrt(), weight, bias), empty, empty
+    return _affine((x - mean.view(shape)) * rate, weight, bias), empty, empty
 
 
-def _affine(x, weight, bias):
+def _affine(x: Tensor, weight: Tensor | None, bias: Tensor | None) -> Tensor:
     x = x if weight is None else x * weight
     return x if bias is None else x + bias
 

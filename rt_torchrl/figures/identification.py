@@ -23,7 +23,8 @@ def twin_and_log(
 
     The notes give the root mean square errors on the held-out segments.
     """
-    unit, length = time_unit(held_out[-1].start + plant.dt * len(held_out[-1].actions) - training[0].start)
+    begin, last = float(training[0].start), float(held_out[-1].start)
+    unit, length = time_unit(last + plant.dt * len(held_out[-1].actions) - begin)
     figure, axes = panels(len(shown), title="Twin and log", size=(9.0, 1.2 + 2.2 * len(shown)), sharex=True)
     for ax, k in zip(axes.flat, shown, strict=True):
         parts = ((training, found.training), (held_out, found.held_out))

@@ -39,8 +39,8 @@ def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
     M, samples = torch.zeros_like(H), 0
     for replayed in replays:
         scores = output_error.plant.dt * torch.einsum("ki,kiw->kw", replayed.gradient, replayed.sensitivity)
-        index = replayed.index
-        M[index[:, None], index] += newey_west(scores)
+        places = replayed.places
+        M[places[:, None], places] += newey_west(scores)
         samples += len(scores)
     diagonal = H.diagonal().clamp_min(0.0).sqrt()
     unit = torch.where(diagonal > 0.0, diagonal, 1.0)
@@ -87,8 +87,9 @@ def standard_errors(output_error: OutputError) -> dict[str, float]:
 
 def named_values(closure: nn.Module) -> dict[str, Tensor]:
     """``named_coefficients`` of a closure that has them; otherwise every trainable weight by parameter and place."""
-    if hasattr(closure, "named_coefficients"):
-        return closure.named_coefficients()
+    named_coefficients = getattr(closure, "named_coefficients", None)
+    if named_coefficients is not None:
+        return named_coefficients()
     return {
         f"{name}[{','.join(map(str, place))}]": weight[place]
         for name, weight in closure.named_parameters()

@@ -42,7 +42,7 @@ class IdentificationConfig:
     rate: float = 0.1
     initial: Literal["estimated", "measured"] = "estimated"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.iterations < 1:
             raise ValueError(f"iterations={self.iterations} of the identification must be at least 1.")
@@ -116,7 +116,8 @@ class Identification:
             for name, value in coefficients(closure).items()
         }
         autocorrelation = lag_one(self.twin.plant, training, after[0].states)
-        return Identified(weights, *zip(before, after, strict=True), autocorrelation, done)
+        on_training, on_held_out = zip(before, after, strict=True)
+        return Identified(weights, on_training, on_held_out, autocorrelation, done)
 
     def judge(self, segments: Sequence[Trajectory]) -> Judgement:
         """Judge the twin with its present weights.
@@ -185,8 +186,9 @@ def lag_one(plant: Plant, segments: Sequence[Trajectory], states: Sequence[Tenso
     """Correlation of the residuals of neighbouring samples, for each state; nan for a state without residuals."""
     pairs = zip(states, segments, strict=True)
     residuals = [differences(plant.states, found, segment.states) for found, segment in pairs]
-    products = sum((r[1:] * r[:-1]).sum(0) for r in residuals)
-    return products / sum((r**2).sum(0) for r in residuals)
+    none = residuals[0].new_zeros(len(plant.states))
+    products = sum(((r[1:] * r[:-1]).sum(0) for r in residuals), start=none)
+    return products / sum(((r**2).sum(0) for r in residuals), start=none)
 
 
 def held_back(plant: Plant, segments: Sequence[Trajectory]) -> dict[str, float]:

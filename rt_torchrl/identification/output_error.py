@@ -39,6 +39,9 @@ class InitialStates(nn.Module):
         scale: unit of the offset of each state; it is about the noise, so that a step of 1 is neither long nor short.
     """
 
+    measured: Tensor
+    unit: Tensor
+
     def __init__(self, segments: Sequence[Trajectory], free: Sequence[int], scale: Float[Tensor, " n_s"]):
         super().__init__()
         self.register_buffer("measured", torch.stack([segment.states[0] for segment in segments]))
@@ -76,14 +79,14 @@ class Replayed(NamedTuple):
     """A segment as the twin replays it: the states s_0 ... s_n, and the derivatives in every sample.
 
     ``gradient`` and ``curvature`` are derivatives of L_p by the state. ``sensitivity`` is the derivative of the state
-    by the unknowns of this segment; ``index`` holds their places in the vector of all unknowns.
+    by the unknowns of this segment; ``places`` holds their places in the vector of all unknowns.
     """
 
     states: Float[Tensor, "samples n_s"]
     gradient: Float[Tensor, "samples n_s"]
     curvature: Float[Tensor, "samples n_s n_s"]
     sensitivity: Float[Tensor, "samples n_s n_local"]
-    index: Int[Tensor, " n_local"]
+    places: Int[Tensor, " n_local"]
 
 
 class OutputError:
@@ -118,7 +121,7 @@ class OutputError:
 
     def cost(self) -> Tensor:
         """The cost J_p; autograd differentiates it by the adjoint of the twin's engine."""
-        total = 0.0
+        total = self.initial.measured.new_zeros(())
         for (states, actions, exogenous, start), first in zip(self.segments, self.initial(), strict=True):
             flown = self.twin.replay(first[None], exogenous[None], actions[None], start=start)
             total = total + self.plant.dt * self.plant.discrepancy(flown.states[0], states).sum()
@@ -142,7 +145,7 @@ class OutputError:
         S = torch.cat([at_start[None], S[0]])
         by_initial = S[..., self.weight_count :] @ self.initial.unit.T
         g, H = discrepancy_derivatives(self.plant, states[None], measured[None])
-        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._index(number))
+        return Replayed(states, g[0], H[0], torch.cat([S[..., : self._shown], by_initial], -1), self._places(number))
 
     @torch.no_grad()
     def normal_equations(self, replays: Sequence[Replayed] | None = None) -> NormalEquations:
@@ -155,7 +158,7 @@ class OutputError:
         gradient, matrix = self.initial.measured.new_zeros(count), self.initial.measured.new_zeros(count, count)
         cost, dt = self.initial.measured.new_zeros(()), self.plant.dt
         for replayed, segment in zip(replays or self.replays(), self.segments, strict=True):
-            S, i = replayed.sensitivity, replayed.index
+            S, i = replayed.sensitivity, replayed.places
             cost = cost + dt * self.plant.discrepancy(replayed.states, segment.states).sum()
             gradient[i] += dt * torch.einsum("ki,kiw->w", replayed.gradient, S)
             matrix[i[:, None], i] += dt * torch.einsum("kiv,kiw->vw", S, replayed.curvature @ S)
@@ -165,7 +168,7 @@ class OutputError:
         """Estimate the initial states with the present weights; ``weights`` must be False."""
         LevenbergMarquardt(self.initial, tolerance=NOISE_TOLERANCE).run(self.normal_equations, INITIAL_ITERATIONS)
 
-    def _index(self, number: int) -> Int[Tensor, " n_local"]:
+    def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)
         own = self._shown + number * free + torch.arange(free)
         return torch.cat([torch.arange(self._shown), own])

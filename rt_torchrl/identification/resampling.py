@@ -76,7 +76,9 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
     return Resampled(segments, interval, float(within.std() / interval), float(limit), gaps, too_short)
 
 
-def hold_out(segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10) -> tuple[list, list]:
+def hold_out(
+    segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10
+) -> tuple[list[Trajectory], list[Trajectory]]:
     """Split segments into those to train on and later ones to judge by; the segment at the cut is divided.
 
     Args:

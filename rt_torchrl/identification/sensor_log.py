@@ -43,7 +43,7 @@ class Column:
     offset: float = 0.0
     unit: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.unit is not None and (self.factor, self.offset) != (1.0, 0.0):
             raise ValueError(
                 f"column {self.header!r} has unit={self.unit!r}, and factor={self.factor} and offset={self.offset} "
@@ -62,10 +62,11 @@ class Column:
         Raises:
             ValueError: if the text has another form.
         """
-        found = COLUMN.fullmatch(text.strip())
+        match = COLUMN.fullmatch(text.strip())
+        found = match.groupdict() if match else {}
         try:
             factor, offset = (float(found[key] or default) for key, default in (("factor", 1.0), ("offset", 0.0)))
-        except (TypeError, ValueError):
+        except (KeyError, ValueError):
             raise ValueError(
                 f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL[UNIT] or "
                 "HEADER=SIGNAL*FACTOR+OFFSET, such as n=rotor_speed[rpm] or T=wall_temperature*0.5556+255.37."
@@ -93,7 +94,7 @@ class SensorLog:
     times: Float[np.ndarray, " rows"]
     columns: dict[str, Float[np.ndarray, " rows"]]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         t = self.times
         if len(t) < 2 or not np.isfinite(t).all():
             raise ValueError(

@@ -25,12 +25,12 @@ class ClassicalLaw:
     """A classical controller with its memory as a control law for one episode."""
 
     def __init__(self, controller: ClassicalController):
-        self._controller, self._memory = controller, None
+        self._controller = controller
+        self._memory: Tensor | None = None
 
     def __call__(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
-        if self._memory is None:
-            self._memory = self._controller.first_memory(state)
-        command, self._memory = self._controller.act(state, self._memory)
+        memory = self._controller.first_memory(state) if self._memory is None else self._memory
+        command, self._memory = self._controller.act(state, memory)
         return command.clamp(self._controller.low_action, self._controller.high_action)
 
 

@@ -38,7 +38,7 @@ class DescentConfig:
     gradient_limit: float = 1.0
     second_moment: float = 0.9
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self, infinite=("gradient_limit",))
         for argument in ("rate", "gradient_limit"):
             if not getattr(self, argument) > 0:
@@ -66,6 +66,8 @@ class Descent:
         module: module with the weights.
         config: options of the descent.
     """
+
+    _optimiser: torch.optim.Adam | torch.optim.LBFGS
 
     def __init__(self, module: nn.Module, config: DescentConfig):
         self.module, self.config = module, config
@@ -130,7 +132,14 @@ class _Diverged(Exception):
 class _Seen:
     """The function that an optimiser calls for cost and gradient; it remembers the best weights."""
 
-    def __init__(self, module, cost, config, iterations, stop_below):
+    def __init__(
+        self,
+        module: nn.Module,
+        cost: Callable[[], Tensor],
+        config: DescentConfig,
+        iterations: int,
+        stop_below: float,
+    ):
         self._module, self._cost, self._config = module, cost, config
         self._iterations, self._stop_below = iterations, stop_below
         self.start = self.best = float("nan")

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import tyro
 
@@ -24,9 +24,10 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
         arguments: words of the command line; by default those of this process.
     """
     config = tyro.cli(config_class, args=arguments)
-    if isinstance(config, RunConfig):
-        config = tyro.cli(config_class, args=arguments, default=config.defaults())
-    return config
+    if not isinstance(config, RunConfig):
+        return config
+    # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
+    return tyro.cli(config_class, args=arguments, default=cast(Configuration, config.defaults()))
 
 
 def load_recipe(path: Path) -> ModuleType:

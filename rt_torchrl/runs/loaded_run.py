@@ -9,7 +9,7 @@ from torch import nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of
 from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
 from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
@@ -65,20 +65,20 @@ def load_run(
     config_class = class_of(folder, settings) if recipe is None else config_class_of(recipe)
     weights = _read_weights(folder)
     config, plant = _rebuilt(folder, settings, config_class, plant)
-    parts = _parts(config, plant)
-    for role, part in parts.items():
+    policies, closure = _parts(config, plant)
+    for role, part in {**policies, "closure": closure}.items():
         try:
             part.load_state_dict(weights[role])
         except (RuntimeError, KeyError) as error:
             raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
-    return LoadedRun(config=config, plant=plant, closure=parts.pop("closure"), policies=parts)
+    return LoadedRun(config=config, plant=plant, closure=closure, policies=policies)
 
 
 def _rebuilt(
     folder: Path, settings: dict[str, Any], config_class: type[RunConfig], plant: Plant | None
 ) -> tuple[RunConfig, Plant]:
     """The configuration and the plant that a run's settings describe; a given plant is taken as it is."""
-    if plant is None and not hasattr(config_class, "plant"):
+    if plant is None and not issubclass(config_class, MakesPlant):
         raise ValueError(
             f"{config_class.__qualname__} has no method plant() that makes the plant from its options; write one, or "
             "give load_run the plant."
@@ -86,7 +86,7 @@ def _rebuilt(
     options = {key: value for key, value in settings.items() if key not in BESIDE}
     try:
         config = config_of(config_class, options)
-        plant = config.plant() if plant is None else plant
+        plant = plant_of(config) if plant is None else plant
     except (ValueError, TypeError, OSError) as error:
         raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error
     name = settings["plant"]
@@ -108,10 +108,11 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
     return load_recipe(Path(recipe)).Config
 
 
-def _parts(config: RunConfig, plant: Plant) -> dict[str, nn.Module]:
+def _parts(config: RunConfig, plant: Plant) -> tuple[dict[str, nn.Module], nn.Module]:
     """Policies and closure of a run before their training."""
     generator = torch.Generator().manual_seed(config.seed)
-    return {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
+    policies = config.make_policies(plant, generator)
+    return dict(policies.items()), config.make_closure(plant, generator)
 
 
 def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:

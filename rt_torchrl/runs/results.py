@@ -7,8 +7,8 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.closure_error import rms_error, visited_features
-from rt_torchrl.evaluation.real_episodes import Baseline
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -45,7 +45,7 @@ def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: di
         flights: flights of both policies on these episodes.
         baselines: controllers to compare the policies with, by name.
     """
-    judged = {role: unseen.judge(flights[role]) for role in ROLES}
+    judged: dict[str, Judged] = {role: unseen.judge(flights[role]) for role in ROLES}
     return judged | {name: unseen.judge(unseen.fly_baseline(law)) for name, law in baselines.items()}
 
 
@@ -85,7 +85,7 @@ def summarise(
         "better": better,
         "better_chosen_on": chosen_on,
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None},
-        "closure_error": closure_errors(algorithm, laws),
+        "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "seconds": seconds_per_step(episodes),
     }
     if optimum is None:
@@ -140,16 +140,17 @@ def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]
 
 
 def closure_errors(
-    algorithm: ReinforcementTwinning, laws: dict[str, nn.Module | None]
+    algorithm: ReinforcementTwinning, start: nn.Module, true: nn.Module | None
 ) -> dict[str, list[float]] | None:
     """RMS error of every coefficient of the closures ``found`` and ``start`` along the last real episode.
 
     It is None if the real system's closure is not known.
     """
-    if laws["true"] is None:
+    if true is None:
         return None
+    laws = {"found": algorithm.twin.closure, "start": start}
     features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
-    return {name: rms_error(laws[name], laws["true"], features).tolist() for name in ("found", "start")}
+    return {name: rms_error(law, true, features).tolist() for name, law in laws.items()}
 
 
 def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:

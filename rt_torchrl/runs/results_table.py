@@ -60,7 +60,7 @@ def _interval(found: dict[str, Any]) -> str:
 
 def merit_lines(unseen: dict[str, Any]) -> list[str]:
     """Lines with the plant's own quantities under every controller: over all episodes, then over each kind with J_a."""
-    merits = {role: unseen["merit"][role] for role in ROLES}
+    merits: dict[str, dict[str, Any]] = {role: unseen["merit"][role] for role in ROLES}
     merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
     if not merits[ROLES[0]]:
         return []

@@ -14,8 +14,9 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
 from rt_torchrl.contract.check import check_plant
+from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap
-from rt_torchrl.evaluation.real_episodes import Baseline, RealController, RealEpisodes
+from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, exact_optimum, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interruption, safe_point
@@ -117,7 +118,8 @@ class Run:
         self.algorithm = ReinforcementTwinning(
             env,
             DigitalTwin(physics, closure, engine=config.engine, compiled=compiled),
-            **policies,
+            model_free=policies["model_free"],
+            model_based=policies["model_based"],
             config=config.twinning,
             generator=generator,
         )
@@ -215,9 +217,8 @@ class Run:
         optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
         starts = self.config.untrained
         untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
-        initial = self.initial_policies, self.initial_closure
-        found = self.episodes, untrained, optimum
-        summary = results.summarise(self.algorithm, self.unseen, flights, judged, *initial, *found)
+        parts = self.initial_policies, self.initial_closure, self.episodes, untrained, optimum
+        summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
@@ -257,8 +258,8 @@ def main_of(config_class: type, main: Callable[[Any], None]) -> None:
 
 def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:
     """The real system in simulation, with the sensors and the wear of the configuration."""
-    system = {"noise": config.noise, "wear": config.wear(plant)}
-    return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, **system)
+    wear = config.wear(plant)
+    return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, noise=config.noise, wear=wear)
 
 
 def judged_on(

@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import nn
@@ -90,7 +90,7 @@ class RunConfig:
     noise: float = 0.0
     twinning: TwinningConfig = field(default_factory=TwinningConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         known = choices(type(self), "policy")
         if known and self.model_free_policy not in ("same", *known):
@@ -148,7 +148,8 @@ class RunConfig:
         model_based = self.make_policy(plant, generator)
         if self.model_free_policy == "same":
             return {"model_based": model_based, "model_free": copy.deepcopy(model_based)}
-        other = dataclasses.replace(self, policy=self.model_free_policy)
+        choice: dict[str, Any] = {"policy": self.model_free_policy}  # of the recipe's own Literal
+        other = dataclasses.replace(self, **choice)
         return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
 
     def defaults(self) -> "RunConfig":
@@ -182,3 +183,25 @@ class RunConfig:
             figures_every=0,
             twinning=twinning,
         )
+
+
+@runtime_checkable
+class MakesPlant(Protocol):
+    """A configuration whose options say all that its plant needs."""
+
+    def plant(self) -> Plant:
+        """The real system in simulation, new."""
+        ...
+
+
+def plant_of(config: RunConfig) -> Plant:
+    """The real system in simulation, as the configuration makes it.
+
+    Raises:
+        ValueError: if the configuration has no method ``plant()``.
+    """
+    if not isinstance(config, MakesPlant):
+        raise ValueError(
+            f"{type(config).__qualname__} has no method plant() that makes the plant from its options; write one."
+        )
+    return config.plant()

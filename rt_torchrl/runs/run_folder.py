@@ -9,6 +9,7 @@ import filelock
 from rt_torchrl.runs import run_settings
 from rt_torchrl.runs.atomic_file import remove_partials
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.settings import FILE
 
 RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
@@ -91,10 +92,8 @@ class RunFolder:
             )
 
     def _require_resumable(self) -> None:
-        if not (self.path / run_settings.FILE).is_file():
-            raise ValueError(
-                f"log_dir={self.path} holds no run to resume: it has no {run_settings.FILE}. Start without --resume."
-            )
+        if not (self.path / FILE).is_file():
+            raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
         run_settings.require_same(self.path, self._config)
         if not self.checkpoint.is_file() and any((self.path / name).exists() for name in RESULTS):
             raise ValueError(

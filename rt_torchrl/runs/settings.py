@@ -5,10 +5,10 @@ import importlib.util
 import json
 import sys
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from types import ModuleType
+from types import GenericAlias, ModuleType
 from typing import Any, Literal
 
 import cattrs
@@ -78,7 +78,8 @@ def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
         ValueError: if the settings name no class, or the name is not found any more, belongs to no configuration, or
             is defined in the run folder itself.
     """
-    origin, place = settings.get("recipe"), folder / FILE
+    origin: Any = settings.get("recipe")
+    place = folder / FILE
     try:
         name, module, file = (origin[key] for key in ("class", "module", "file"))
     except (TypeError, KeyError):
@@ -110,7 +111,8 @@ def require_config(found: Any, name: str) -> type[RunConfig]:
 
 def _origin(config_class: type) -> dict[str, str | None]:
     module = sys.modules.get(config_class.__module__)
-    file, name = getattr(module, "__file__", None), config_class.__module__
+    file = getattr(module, "__file__", None)
+    name: str | None = config_class.__module__
     if name == "__main__":
         name = getattr(getattr(module, "__spec__", None), "name", None)  # a script has none, python -m has one
     if file and name and name.startswith(PREFIX):
@@ -128,6 +130,8 @@ def _module(name: str | None, file: str | None) -> ModuleType:
             return loaded
     if name and (not file or not Path(file).is_file() or _same(_found(name), file)):
         return importlib.import_module(name)
+    if not file:
+        raise ValueError("neither a module nor a file of it is named.")
     return module_of(Path(file))
 
 
@@ -149,13 +153,22 @@ def _converter() -> cattrs.Converter:
     for kind in (bool, int, float, str):
         converter.register_structure_hook(kind, _primitive)
     converter.register_structure_hook(Path, lambda value, _: Path(_primitive(value, str)))
-    # The class itself refuses a wrong choice, with the better message.
-    converter.register_structure_hook_func(lambda kind: typing.get_origin(kind) is Literal, lambda value, _: value)
-    converter.register_structure_hook_func(
-        lambda kind: typing.get_origin(kind) is Sequence,
-        lambda value, kind: converter.structure(value, tuple[typing.get_args(kind)[0], ...]),
-    )
+    # The class says best itself what it refuses.
+    converter.register_structure_hook_func(_of(Literal), lambda value, _: value)
+    converter.register_structure_hook_func(_of(Sequence), _tuple)
     return converter
+
+
+def _of(origin: Any) -> Callable[[Any], bool]:
+    """Tells whether a type is of this generic one."""
+    return lambda kind: typing.get_origin(kind) is origin
+
+
+def _tuple(value: Any, kind: Any) -> Any:
+    """A sequence of any length."""
+    (entry,) = typing.get_args(kind)
+    wanted: Any = GenericAlias(tuple, (entry, ...))
+    return _converter().structure(value, wanted)
 
 
 def _primitive(value: Any, kind: type) -> Any:

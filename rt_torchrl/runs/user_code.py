@@ -16,7 +16,7 @@ def module_of(file: Path) -> ModuleType:
     """The module in a file, imported only once; as a script does, it can import modules that lie beside the file.
 
     Raises:
-        ValueError: if there is no such file.
+        ValueError: if there is no such file, or it does not end in ``.py``.
     """
     if not file.is_file():
         raise ValueError(f"{file} does not exist; give a file with Python code.")
@@ -31,7 +31,9 @@ def _imported(file: Path) -> ModuleType:
     while name in sys.modules:  # a file of the same name in another folder
         name += "_"
     spec = importlib.util.spec_from_file_location(name, file)
-    # The module is known by its name, because the command line reads the source of its options for their help.
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{file} is no Python code, by its name; give a file that ends in .py.")
+    # Known by its name, because the command line looks up the source of its options for their help.
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)

@@ -12,7 +12,7 @@ from rt_torchrl.study.names import shown
 from rt_torchrl.study.results import Entry, named
 from rt_torchrl.study.training import CHANGED
 
-ARMS = {"twinning": REAL, **ROLES}
+ARMS: dict[str, str] = {"twinning": REAL, **dict(ROLES.items())}
 ARM_SHIFT = {"twinning": -0.2, "model_based": 0.0, "model_free": 0.2}
 POLICIES = ("#7f3c8d", "#a0522d", "#e75480", "#6b8e23")
 """Colours of twinning with other policies, in the order of the policies."""

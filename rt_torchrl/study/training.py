@@ -48,7 +48,7 @@ class Training:
     options: tuple[str, ...] = ()
     figures: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
             raise ValueError(f"variant={self.variant!r} does not exist; choose one of {', '.join(VARIANTS)}.")
 

@@ -13,10 +13,10 @@ from torch import nn
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import RunConfig, plant_of
 from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -69,7 +69,7 @@ def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iteratio
     Returns:
         ``J_a_of_each_start``, per-episode ``costs`` of the best policy and the statistics of :class:`Judged`.
     """
-    episodes = unseen_episodes(configured(recipe, options).plant(), unseen)
+    episodes = unseen_episodes(plant_of(configured(recipe, options)), unseen)
     best = exact_optimum(episodes, episodes.plant.make_policy, starts=starts, iterations=iterations, polish=polish)
     found = episodes.judge(episodes.fly(best.policy))
     return {"costs": found.control_costs.tolist(), "J_a_of_each_start": best.costs} | found.statistics()
@@ -98,7 +98,7 @@ def classical(
         ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`; ``changed`` holds
         ``costs`` and statistics on the system with model error.
     """
-    plant = configured(recipe, options).plant()
+    plant = plant_of(configured(recipe, options))
     judged = unseen_episodes(plant, unseen)
     controller = tuned(kind, plant, episodes=episodes, evaluations=evaluations)
     found = {"gains": controller.named_gains()} | record(judged, controller)
@@ -138,7 +138,7 @@ def cost_along_gain(
     Returns:
         ``name`` and ``unit`` of the gain, its ``values`` and mean ``costs``.
     """
-    plant = configured(recipe, options).plant()
+    plant = plant_of(configured(recipe, options))
     judged, controller = unseen_episodes(plant, unseen), kind(plant, compiled=missing_for_compilation() is None)
     values, costs = [kind.default_gains[0] * multiple for multiple in multiples], []
     for value in values:
@@ -165,7 +165,7 @@ def cost_over_episodes(
     Returns:
         ``name`` and ``unit`` of the abscissa, its ``values`` and mean ``costs`` on the unseen episodes.
     """
-    plant, costs = configured(recipe, options).plant(), []
+    plant, costs = plant_of(configured(recipe, options)), []
     judged, met = unseen_episodes(plant, unseen), unseen_episodes(plant, max(counts), seed=TRAINING_SEED)
     for count in counts:
         best = exact_optimum(met, plant.make_policy, starts=1, iterations=iterations, few=count, polish=0)
@@ -173,10 +173,10 @@ def cost_over_episodes(
     return {"name": "episodes planned on", "unit": "-", "values": list(counts), "costs": costs}
 
 
-def unseen_episodes(plant: Plant, count: int, **seed: int) -> UnseenEpisodes:
+def unseen_episodes(plant: Plant, count: int, *, seed: int = UNSEEN_SEED) -> UnseenEpisodes:
     """The unseen episodes that judge everything, or those of another seed; one thread leaves cores to other workers."""
     torch.set_num_threads(1)
-    return UnseenEpisodes(plant, count, compiled=missing_for_compilation() is None, **seed)
+    return UnseenEpisodes(plant, count, compiled=missing_for_compilation() is None, seed=seed)
 
 
 def changed_closure(system: Plant, recipe: Path, options: Options) -> nn.Module | None:
@@ -187,5 +187,5 @@ def changed_closure(system: Plant, recipe: Path, options: Options) -> nn.Module 
 
 
 def configured(recipe: Path, options: Options) -> RunConfig:
-    """The recipe's configuration under these options; its ``plant()`` is the real system in simulation."""
+    """The recipe's configuration under these options."""
     return from_command_line(load_recipe(recipe).Config, options).effective()

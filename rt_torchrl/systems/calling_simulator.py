@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from queue import SimpleQueue
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Signal, bounds
 
 Report = Mapping[str, np.ndarray | Sequence[float]]
 Controller = Callable[[Report], np.ndarray]
@@ -108,14 +109,14 @@ class CallingSimulator(EnvBase):
         self._conversation: Conversation | None = None
         double = {"dtype": torch.float64}
         self.observation_spec = Composite({name: Unbounded((n,), **double) for name, n in self._sizes.items()})
-        low, high = (torch.tensor([getattr(a, end) for a in actions], **double) for end in ("low", "high"))
+        low, high = bounds(actions)
         self.action_spec = Bounded(low, high, (len(actions),), **double)
         self.reward_spec = Unbounded((1,), **double)
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = self._seed if seed is None else seed
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self.end_episode()
         self._conversation = Conversation(self._simulate, self._seed)
         self._seed += 1
@@ -154,6 +155,6 @@ class CallingSimulator(EnvBase):
             self._conversation.end()
             self._conversation = None
 
-    def close(self, **kwargs) -> None:
+    def close(self, **kwargs: Any) -> None:
         self.end_episode()
         super().close(**kwargs)

@@ -27,6 +27,10 @@ class ExploringInterval(Interval):
         actor: the live policy with its noise.
     """
 
+    policy: nn.Module
+    low: Tensor
+    high: Tensor
+
     def __init__(self, plant: Plant, closure: nn.Module, actor: LivePolicy):
         super().__init__(plant, closure, actor.policy)
         self.register_buffer("low", actor.low)

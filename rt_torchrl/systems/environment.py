@@ -1,7 +1,7 @@
 """The real system in simulation: any plant as a TorchRL environment."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -92,12 +92,12 @@ class PlantEnv(EnvBase):
             self._generator.manual_seed(seed)
             self._sensors.manual_seed(seed + 1)
 
-    def state_dict(self, *args, **kwargs) -> dict:
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Everything that the next reset depends on."""
         generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
         return generators | {"episodes": self._episodes}
 
-    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+    def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self._generator.set_state(state["generator"])
         self._sensors.set_state(state["sensors"])
         self._episodes = state["episodes"]
@@ -117,7 +117,7 @@ class PlantEnv(EnvBase):
         self._draw()
         self.sensor_factor()
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         batch, (state, exogenous) = self.batch_size[0], self._draw()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():

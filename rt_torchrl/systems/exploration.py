@@ -36,7 +36,7 @@ class ExplorationConfig:
     episodes: int = 5
     correlation_time: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for argument in ("spread", "episodes", "correlation_time"):
             if not 0 <= getattr(self, argument) < math.inf:
                 raise ValueError(
@@ -58,12 +58,16 @@ class LivePolicy(nn.Module):
         generator: source of the noise.
     """
 
+    low: Tensor
+    high: Tensor
+
     def __init__(self, plant: Plant, policy: nn.Module, config: ExplorationConfig, *, generator: torch.Generator):
         super().__init__()
         low, high = bounds(plant.actions, device=generator.device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
-        self.policy, self.strength, self._noise = policy, 0.0, None
+        self.policy, self.strength = policy, 0.0
+        self._noise: Tensor | None = None
         self._scale = 0.5 * config.spread * (high - low)
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
         self._generator = generator

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -38,7 +39,7 @@ class Reading:
     scale: float | Sequence[float] = 1.0
     offset: float | Sequence[float] = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_numbers("reading", scale=self.scale, offset=self.offset)
 
     def read(self, reported: TensorDictBase, signals: tuple[Signal, ...], what: str) -> Float[Tensor, "1 n"]:
@@ -98,7 +99,7 @@ class Actuation:
     scale: float | Sequence[float] = 1.0
     offset: float | Sequence[float] = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_numbers("actuation", scale=self.scale, offset=self.offset)
         if not (np.asarray(self.scale) != 0.0).all():
             raise ValueError(f"scale={self.scale} of the actuation must not be zero.")
@@ -128,5 +129,5 @@ def require_numbers(what: str, **values: float | Sequence[float]) -> None:
 
 def in_units(values: Tensor, scale: float | Sequence[float], offset: float | Sequence[float]) -> Tensor:
     """offset + scale·values, in double precision."""
-    like = {"dtype": torch.float64, "device": values.device}
-    return torch.as_tensor(offset, **like) + torch.as_tensor(scale, **like) * values
+    double = partial(torch.as_tensor, dtype=torch.float64, device=values.device)
+    return double(offset) + double(scale) * values

@@ -1,13 +1,14 @@
 """A real system that is not a plant in simulation: any TorchRL or Gymnasium environment in a plant's terms."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
@@ -55,6 +56,8 @@ class RealSystem(EnvBase):
             time limit is shorter than the plant's horizon; in a step, if an entry that is read is not reported, or the
             episode ends before the horizon.
     """
+
+    observation_spec: Composite
 
     def __init__(
         self,
@@ -131,8 +134,8 @@ class RealSystem(EnvBase):
             )
 
     def _require_range(self, spec: Bounded) -> None:
-        ends = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
-        ends = torch.stack([in_units(end, self._actuation.scale, self._actuation.offset) for end in ends])
+        own = (bound.double().reshape(-1) for bound in (spec.space.low, spec.space.high))
+        ends = torch.stack([in_units(end, self._actuation.scale, self._actuation.offset) for end in own])
         for action, low, high in zip(self.plant.actions, ends.amin(0).tolist(), ends.amax(0).tolist(), strict=True):
             slack = 1e-6 * (action.high - action.low)  # bounds in single precision
             if low > action.low + slack or high < action.high - slack:
@@ -156,14 +159,14 @@ class RealSystem(EnvBase):
         if self._seed is not None and seed is not None:
             self._seed, self._episodes = seed, 0
 
-    def state_dict(self, *args, **kwargs) -> dict:
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """All that can be known of the real system's state: its seed and the number of episodes it has flown."""
         return {"seed": self._seed, "episodes": self._episodes}
 
-    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+    def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self._seed, self._episodes = state["seed"], state["episodes"]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if self._seed is not None:
             # The seed counts episodes, not resets: a reset need not be followed by a step.
             self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)

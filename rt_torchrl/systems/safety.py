@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -55,7 +55,7 @@ class SafetyConfig:
     patience: float = math.inf
     log: Path | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 0.0 < self.interval < math.inf:
             raise ValueError(f"interval={self.interval} s must be positive and finite: the system's control interval.")
 
@@ -89,7 +89,7 @@ class SafetyReport:
     """Events of one episode, and the number of intervals in which each reason occurred."""
 
     events: list[SafetyEvent] = field(default_factory=list)
-    counts: Counter = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
 
 
 class SafetyLayer(EnvBase):
@@ -145,7 +145,9 @@ class SafetyLayer(EnvBase):
             )
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config = env, config
-        self._clock, self.reports = clock, []
+        self._clock = clock
+        self.reports: list[SafetyReport] = []
+        self._good: dict[str, Tensor] = {}
         self.watchdog = Watchdog(config.ranges, deadline=config.deadline, hold=config.hold, patience=config.patience)
         self._make_specs()
         self.limits = ActionLimits(
@@ -174,7 +176,7 @@ class SafetyLayer(EnvBase):
         self.done_spec = done
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         """An attribute of the system, such as ``plant``, where the layer has none of that name."""
         try:
             return super().__getattr__(name)
@@ -188,7 +190,7 @@ class SafetyLayer(EnvBase):
         """Report of the present episode; between two episodes, that of the last one."""
         return self.reports[-1]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
         faults = self._faults(found, 0.0, "after its reset")
@@ -285,9 +287,9 @@ class SafetyLayer(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.env.set_seed(seed)
 
-    def state_dict(self, *args, **kwargs) -> dict:
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """State of the system; the layer itself has none that outlives an episode."""
         return self.env.state_dict(*args, **kwargs)
 
-    def load_state_dict(self, state: dict, *args, **kwargs) -> None:
+    def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.env.load_state_dict(state, *args, **kwargs)

@@ -89,7 +89,7 @@ def propagate(A: Tensor, B: Tensor) -> Tensor:
 def propagate_by_scan(A: Tensor, B: Tensor) -> Tensor:
     """The sensitivities of :func:`propagate` by one ``scan``, for the compiler."""
 
-    def body(sensitivity, x):
+    def body(sensitivity: Tensor, x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         transition, source = x
         product = (transition.unsqueeze(-1) * sensitivity.unsqueeze(-3)).sum(-2)
         sensitivity = (product + source).contiguous()

@@ -66,6 +66,6 @@ class DigitalTwin:
 
 def constant(module: nn.Module) -> nn.Module:
     """A copy of the module that shares its weights but asks for no gradient of them."""
-    shared = {id(w): nn.Parameter(w.detach(), requires_grad=False) for w in module.parameters()}
+    shared: dict[int, Tensor] = {id(w): nn.Parameter(w.detach(), requires_grad=False) for w in module.parameters()}
     shared |= {id(buffer): buffer for buffer in module.buffers()}
     return copy.deepcopy(module, shared)

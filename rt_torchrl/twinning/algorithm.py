@@ -71,7 +71,8 @@ class ReinforcementTwinning:
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, first)
-        for part, role in ((self.learner, "model_free"), (self.planner, "model_based")):
+        trained: dict[Role, Learner | Planner] = {"model_free": self.learner, "model_based": self.planner}
+        for role, part in trained.items():
             if part.policy is not self.policies[role]:
                 raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
         self.assimilation = Assimilation(twin, config.assimilation)
@@ -117,7 +118,8 @@ class ReinforcementTwinning:
         Raises:
             ValueError: if several episodes in a row cannot be learned from; no memory holds anything of them.
         """
-        live, strength, refused = self.referee.live, self.config.exploration.strength(self.episodes_done), []
+        live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
+        refused: list[str] = []
         while True:
             self.actor.begin(self.policies[live], strength=strength)
             episode = self.collector.rollout()[0]
@@ -254,8 +256,7 @@ class ReinforcementTwinning:
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
         """Clone the live policy into the idle one, unless the referee finds the clone worse than what it replaces.
 
-        Args:
-            costs: mean J_a of both policies over the virtual episodes ``judged_on``.
+        The costs are those of both policies over the virtual episodes ``judged_on``.
         """
         live, idle = self.referee.live, self.referee.idle
         report = self.cloning.clone(
@@ -287,7 +288,8 @@ class ReinforcementTwinning:
             ValueError: if the state of a component does not fit; it names the component.
         """
         state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
-        parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
+        parts: dict[str, tuple[Any, Any]] = {}
+        parts |= {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
         parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
         load_parts(parts)

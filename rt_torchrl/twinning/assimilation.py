@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -61,7 +60,7 @@ class AssimilationConfig:
     initial: Literal["measured", "estimated"] = "measured"
     descent: DescentConfig = field(default_factory=DescentConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the assimilation (n_G) must not be negative.")
@@ -142,14 +141,15 @@ class Assimilation:
             return self._identification_cost(replayed) + self._prior_cost()
 
         before = self._prior_cost().item()
-        method, function = self.descent, cost
+        iterations, stop_below = self.config.iterations, self.config.stop_ratio
         if self.config.initial == "estimated":
             output_error = self._output_error(replayed)
             method = LevenbergMarquardt(output_error.unknowns, tolerance=NOISE_TOLERANCE)
-            function = partial(self._mean_equations, output_error)
+            found = method.run(lambda: self._mean_equations(output_error), iterations, stop_below=stop_below)
         elif self.config.method == "levenberg_marquardt":
-            method, function = self.second_order, equations
-        found = method.run(function, self.config.iterations, stop_below=self.config.stop_ratio)
+            found = self.second_order.run(equations, iterations, stop_below=stop_below)
+        else:
+            found = self.descent.run(cost, iterations, stop_below=stop_below)
         return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:

@@ -47,7 +47,7 @@ class TwinningConfig:
     referee: RefereeConfig = field(default_factory=RefereeConfig)
     distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         for argument in ("realisations", "records", "virtual_episodes"):
             if getattr(self, argument) < 1:

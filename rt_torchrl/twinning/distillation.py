@@ -41,7 +41,7 @@ class DistillationConfig:
     rounds: int = 2
     samples: int = 5000
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         for argument in ("iterations", "rounds", "samples"):
             if getattr(self, argument) < 1:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ class ExogenousConfig:
     penalty: float = 10.0
     tube: float = 0.05
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.knots < 8:
             raise ValueError(f"knots={self.knots} must be at least 8 for a regression of the large scale.")
@@ -76,15 +77,15 @@ class ExogenousProcess:
         if len(record) < 8:
             raise ValueError(f"record has {len(record)} samples; at least 8 are needed to separate its scales.")
         config = config or ExogenousConfig()
-        like = {"dtype": record.dtype, "device": record.device}
-        self._low, self._high = bounds(signals, **like)
-        # Columns are written in place, because a plant without inputs has no columns to stack.
+        like = partial(torch.as_tensor, dtype=record.dtype, device=record.device)
+        self._low, self._high = bounds(signals, dtype=record.dtype, device=record.device)
+        # Columns are written in place: a plant without inputs has none to stack.
         values = record.cpu().numpy()
         large = np.empty_like(values)
         for k, column in enumerate(values.T):
             large[:, k] = _large_scale(column, config)
-        self.mean: Float[Tensor, "n n_z"] = torch.as_tensor(large, **like)
-        covariance = torch.as_tensor(_windowed_covariance(values - large), **like)
+        self.mean: Float[Tensor, "n n_z"] = like(large)
+        covariance = like(_windowed_covariance(values - large))
         self.covariance: Float[Tensor, "n n_z n_z"] = covariance
         """Covariances Γ at the lags 0 to n − 1; Γ at a negative lag is the transpose of Γ at the positive lag."""
         self._root = _spectral_root(covariance)

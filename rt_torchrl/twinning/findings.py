@@ -1,5 +1,7 @@
 """The report of an episode: scalars by name, the event, and the reasons for refusals."""
 
+from functools import partial
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -13,8 +15,8 @@ def findings(*reasons: str, **values: float | Tensor) -> TensorDict:
         values: the scalars, by name.
     """
     # A report is on the CPU, because it is read there and its numbers come from any device.
-    like = {"dtype": torch.float64, "device": "cpu"}
-    report = TensorDict({key: torch.as_tensor(value, **like).detach() for key, value in values.items()})
+    double = partial(torch.as_tensor, dtype=torch.float64, device="cpu")
+    report = TensorDict({key: double(value).detach() for key, value in values.items()})
     return report.set_non_tensor("reason", "; ".join(reasons)) if reasons else report
 
 

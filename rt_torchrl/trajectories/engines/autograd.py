@@ -1,5 +1,7 @@
 """Engine ``autograd``: plain backpropagation through the steps, the exact gradient of the discrete trajectory."""
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if
@@ -14,8 +16,8 @@ class Autograd:
         compiled: run the recurrence and its reverse as one compiled scan.
     """
 
-    own_scheme = True
-    start_per_realisation = True
+    own_scheme: ClassVar[bool] = True
+    start_per_realisation: ClassVar[bool] = True
 
     def __init__(self, *, compiled: bool):
         self._march = compiled_if(compiled, march_by_scan, march)

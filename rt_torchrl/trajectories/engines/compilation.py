@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from hoptorch.scan import ensure_scan_backward
 from torch import Tensor
+from torch._dynamo.callback import callback_handler
 from torch._dynamo.types import GuardFilterEntry
 from torch._inductor import config as inductor_config
 
@@ -28,7 +30,9 @@ def raised_limits() -> AbstractContextManager[None]:
     return torch._dynamo.config.patch(LIMITS)
 
 
-def compiled_if(compiled: bool, function: Callable, eager: Callable | None = None) -> Callable:
+def compiled_if(
+    compiled: bool, function: Callable[..., Any], eager: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
     """``torch.compile(function)`` if ``compiled``, otherwise ``eager`` (by default ``function`` itself).
 
     Raises:
@@ -73,18 +77,17 @@ def missing_for_compilation() -> str | None:
 @contextmanager
 def watched_compilation(tell: Callable[[bool], None]) -> Iterator[None]:
     """A context that calls ``tell(True)`` when the compiler begins and ``tell(False)`` when it ends."""
-    handler = torch._dynamo.callback_handler
-    begun = handler.register_start_callback(lambda arguments: tell(True))
-    ended = handler.register_end_callback(lambda arguments: tell(False))
+    begun = callback_handler.register_start_callback(lambda arguments: tell(True))
+    ended = callback_handler.register_end_callback(lambda arguments: tell(False))
     try:
         yield
     finally:
-        handler.remove_start_callback(begun)
-        handler.remove_end_callback(ended)
+        callback_handler.remove_start_callback(begun)
+        callback_handler.remove_end_callback(ended)
 
 
 @cache
-def _compile(function: Callable) -> Callable:
+def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     # Cached, so that every user of a function shares its graphs.
     _prepare()
     return torch.compile(function, fullgraph=True, options={"guard_filter_fn": _lasting})

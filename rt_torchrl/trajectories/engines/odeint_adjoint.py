@@ -1,5 +1,7 @@
 """Engine ``odeint_adjoint``: the paper's continuous adjoint (eqs. lambda_p and lambda_a), solved by torchdiffeq."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 from torchdiffeq import odeint_adjoint
@@ -20,8 +22,8 @@ class OdeintAdjoint:
         compiled: compile the vector field; the solver's loop stays in Python.
     """
 
-    own_scheme = False  # it integrates the vector field
-    start_per_realisation = False  # torchdiffeq integrates the whole batch over one span
+    own_scheme: ClassVar[bool] = False  # it integrates the vector field
+    start_per_realisation: ClassVar[bool] = False  # torchdiffeq integrates the whole batch over one span
 
     def __init__(self, *, compiled: bool):
         self._compiled = compiled

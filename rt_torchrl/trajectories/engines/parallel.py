@@ -14,6 +14,7 @@ of all intervals of all trajectories, and another one the sum over k; both are c
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
+from typing import Any, ClassVar
 
 import torch
 from hoptorch.scan import scan
@@ -33,8 +34,8 @@ class Parallel:
         compiled: compile the two recurrences, the Jacobians and the final product.
     """
 
-    own_scheme = True
-    start_per_realisation = True
+    own_scheme: ClassVar[bool] = True
+    start_per_realisation: ClassVar[bool] = True
 
     def __init__(self, *, compiled: bool):
         self.march = compiled_if(compiled, march_by_scan, march)
@@ -52,7 +53,16 @@ class _DiscreteAdjoint(torch.autograd.Function):
     """Maps (s_0, t, z, a, w) to s_1 ... s_n; the engine and the interval are passed along for their maps."""
 
     @staticmethod
-    def forward(ctx, engine, interval, initial_state, t, exogenous, command, *weights):
+    def forward(
+        ctx: Any,
+        engine: Parallel,
+        interval: Interval,
+        initial_state: Tensor,
+        t: Tensor,
+        exogenous: Tensor,
+        command: Tensor,
+        *weights: Tensor,
+    ) -> Tensor:
         ends = engine.march(interval, initial_state, Drive(t, exogenous, command))
         ctx.engine, ctx.interval = engine, interval
         # Saving the weights lets autograd notice when one is changed between forward and backward.
@@ -61,7 +71,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, cost_gradient):
+    def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
         initial_state, t, exogenous, command, ends, *weights = ctx.saved_tensors
         starts, drive = torch.cat([initial_state.unsqueeze(0), ends[:-1]]), Drive(t, exogenous, command)
         jacobians = over_all(partial(ctx.engine.linearise, ctx.interval, ()), starts, drive)
@@ -107,13 +117,18 @@ def _products(
 
 def _of_rows(parts: Sequence[Tensor | None], shape: torch.Size, drive: Tensor) -> Tensor | None:
     """The gradients of all rows in the shape of the drive, where t may be the same for all realisations."""
-    if parts[0] is None:
-        return None
-    return torch.cat(parts).unflatten(0, shape).sum_to_size(drive.shape)
+    found = _known(parts)
+    return torch.cat(found).unflatten(0, shape).sum_to_size(drive.shape) if found else None
 
 
 def _summed(parts: Sequence[Tensor | None]) -> Tensor | None:
-    return None if parts[0] is None else reduce(torch.add, parts)
+    found = _known(parts)
+    return reduce(torch.add, found) if found else None
+
+
+def _known(parts: Sequence[Tensor | None]) -> list[Tensor]:
+    """Gradients of the pieces: all of them, or none for an input that the intervals do not depend on."""
+    return [part for part in parts if part is not None]
 
 
 def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
@@ -134,7 +149,7 @@ def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
 def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
     """The co-states of :func:`costates` by one ``scan``, for the compiler."""
 
-    def body(costate, x):
+    def body(costate: Tensor, x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         transition, source = x
         costate = ((transition * costate.unsqueeze(-1)).sum(-2) + source).contiguous()
         return costate, costate.clone()

@@ -20,7 +20,7 @@ def march(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
 def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
     """The states of :func:`march` by one ``scan``, for the compiler."""
 
-    def body(state, x):
+    def body(state: Tensor, x: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         # The scan wants a carry that keeps its strides and an output that does not alias it.
         state = interval(state, Drive(*x)).contiguous()
         return state, state.clone()

@@ -33,6 +33,9 @@ class Critic(nn.Module):
         generator: source of the initial weights.
     """
 
+    middle: Tensor
+    half_range: Tensor
+
     def __init__(self, plant: Plant, hidden: Sequence[int], *, generator: torch.Generator):
         super().__init__()
         low, high = bounds(plant.actions)
@@ -158,7 +161,7 @@ class ActorCritic(ABC):
         loss, td_error = self.critic_loss(batch)
         self.critic_optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        norm = nn.utils.get_total_norm([w.grad for w in self.critic_weights()])
+        norm = nn.utils.get_total_norm([w.grad for w in self.critic_weights() if w.grad is not None])
         self.critic_optimiser.step()
         self.memory.refresh(batch["index"], td_error)
         return loss.detach() / scale**2, td_error.mean() / scale, norm
@@ -189,10 +192,10 @@ CRITIC_FINDINGS, ACTOR_FINDINGS = ("critic_loss", "td_error", "critic_gradient")
 COMPONENTS = ("loss", "critic_optimiser", "actor_optimiser", "memory")
 
 
-def means(critic: list[tuple[Tensor, ...]], actor: list[tuple[Tensor, ...]]) -> TensorDict:
+def means(critic: Sequence[tuple[Tensor, ...]], actor: Sequence[tuple[Tensor, ...]]) -> TensorDict:
     """Means of the results of :meth:`ActorCritic.critic_step` and :meth:`ActorCritic.actor_step` over iterations."""
     names = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")
-    found = {}
+    found: dict[str, Tensor] = {}
     for keys, iterations in zip(names, (critic, actor), strict=True):
         found |= {
             key: torch.stack(values).mean() for key, values in zip(keys, zip(*iterations, strict=True), strict=False)

@@ -65,7 +65,7 @@ class TD3Config:
     smoothing: float = 0.2
     smoothing_limit: float = 0.5
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.delay < 1:
             raise ValueError(f"delay={self.delay} of TD3 must be at least 1 critic iteration.")
@@ -115,7 +115,7 @@ class LearnerConfig:
     memory: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
     td3: TD3Config = field(default_factory=TD3Config)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self, infinite=("gradient_limit",))
         require_widths("critic_hidden", self.critic_hidden)
         for argument in ("critic_iterations", "actor_iterations"):

@@ -32,7 +32,7 @@ class LongTermMemoryConfig:
     correction: float = 0.4
     offset: float = 1e-3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.capacity < 1:
             raise ValueError(f"capacity={self.capacity} of the long-term memory must be at least 1.")
@@ -184,10 +184,10 @@ class LeastPriorityWriter(Writer):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore nothing, because the writer has no state; see :meth:`_empty`."""
 
-    def dumps(self, path) -> None:
+    def dumps(self, path: str) -> None:
         """Write nothing, because the writer has no state; see :meth:`_empty`."""
 
-    def loads(self, path) -> None:
+    def loads(self, path: str) -> None:
         """Read nothing, because the writer has no state; see :meth:`_empty`."""
 
 

@@ -67,7 +67,7 @@ class ShortHorizonConfig:
     policy_rate: float = 5e-3
     critic_rate: float = 2e-3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         require_widths("critic_hidden", self.critic_hidden)
         for argument, least in (("window", 0), ("critic_iterations", 1)):
@@ -105,7 +105,7 @@ class PlannerConfig:
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")

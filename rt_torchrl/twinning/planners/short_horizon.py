@@ -53,20 +53,20 @@ class ShortHorizon:
     moments = (0.7, 0.95)  # Adam's decay rates, which are short because the cost changes with every window
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *, generator: torch.Generator):
-        self.iterations, config = config.iterations, config.short_horizon
-        if config.window < 1:
-            raise ValueError(f"window={config.window} of a short horizon must be at least 1 control interval.")
-        if config.window > twin.plant.n_steps:
+        short = config.short_horizon
+        if short.window < 1:
+            raise ValueError(f"window={short.window} of a short horizon must be at least 1 control interval.")
+        if short.window > twin.plant.n_steps:
             raise ValueError(
-                f"window={config.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
+                f"window={short.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
                 f"{twin.plant.name!r}; 0 plans over whole episodes."
             )
-        self.twin, self.policy, self.config = twin, policy, config
+        self.twin, self.policy, self.iterations, self.config = twin, policy, config.iterations, short
         n_o = len(twin.plant.observations)
-        critic = mlp(n_o, config.critic_hidden, 1, generator=generator, activation=nn.SiLU)
+        critic = mlp(n_o, short.critic_hidden, 1, generator=generator, activation=nn.SiLU)
         self.critic = critic.to(generator.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self._critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_rate, betas=self.moments)
+        self._critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=short.critic_rate, betas=self.moments)
         self.reference = 0.0
         self.restart()
 

@@ -35,7 +35,7 @@ class RefereeConfig:
     stall: float = 0.5
     band: tuple[float, float] = (0.0, 40.0)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_options(self)
         for argument in ("patience", "clone_patience"):
             if getattr(self, argument) < 0:
@@ -69,7 +69,7 @@ class Evidence:
     real_costs: tuple[float, ...] = ()
     predicted_costs: Callable[[], tuple[float, ...]] = tuple
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for argument in ("live_cost", "idle_cost", "idle_weight_change"):
             if math.isnan(getattr(self, argument)):
                 raise ValueError(f"{argument} of step 6 is NaN; look at the virtual episodes it was computed from.")
