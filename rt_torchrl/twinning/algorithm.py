@@ -24,7 +24,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.findings import findings, merged, weight_vector
+from rt_torchrl.twinning.findings import findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
@@ -112,8 +112,7 @@ class ReinforcementTwinning:
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
 
-        An episode that cannot be learned from is flown again; the report gives the number of such episodes and the
-        reasons.
+        An episode that cannot be learned from is flown again; the report gives their number and the reasons.
 
         Raises:
             ValueError: if several episodes in a row cannot be learned from; no memory holds anything of them.
@@ -215,8 +214,7 @@ class ReinforcementTwinning:
         judged_on = self.virtual.draw(self.config.virtual_episodes)
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
-        now = weight_vector(self.policies[idle])
-        change = (now - self._earlier_weights[idle]).norm() / now.norm()
+        change = weight_change(self.policies[idle], self._earlier_weights[idle])
         evidence = Evidence(
             live_cost=costs[live].item(),
             idle_cost=costs[idle].item(),

@@ -30,3 +30,9 @@ def merged(report: TensorDict, other: TensorDict) -> TensorDict:
 def weight_vector(module: nn.Module) -> Tensor:
     """All weights of a module in one vector, detached."""
     return torch.cat([weight.detach().flatten() for weight in module.parameters()]).clone()
+
+
+def weight_change(module: nn.Module, earlier: Tensor) -> Tensor:
+    """The relative change ‖w − w_earlier‖/‖w‖ of a module's weights since they were the vector ``earlier``."""
+    now = weight_vector(module)
+    return (now - earlier).norm() / now.norm()
