@@ -194,4 +194,4 @@ class RecordedWind:
             start = part * max(0.0, record.duration - needed)
             # The even grid, not the printed times, which a text file rounds to a millisecond.
             row[:] = np.interp(start + elapsed, record.step * np.arange(len(record.speed)), record.speed)
-        return torch.from_numpy(wind).to(device).clamp_min(self.floor)
+        return torch.as_tensor(wind, device=device).clamp_min(self.floor)
