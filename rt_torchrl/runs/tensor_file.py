@@ -17,6 +17,8 @@ from rt_torchrl.runs.atomic_file import write_atomically
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     """Write tensors, numbers and strings in dicts, lists and tuples, as ``torch.load`` reads them too.
 
+    The tensors of the file are on the CPU, so that a machine without the device of the run reads it.
+
     Raises:
         ValueError: if there is anything else in them; it names the place.
         OSError: see :func:`write_atomically`.
@@ -63,7 +65,7 @@ def first_line(error: Exception) -> str:
 
 
 def plain(value: Any, place: str = "") -> Any:
-    """The same in the containers and numbers of Python alone.
+    """The same in the containers and numbers of Python alone, with the tensors on the CPU.
 
     Raises:
         ValueError: if a value is no tensor, number or string; it names the place.
@@ -71,7 +73,7 @@ def plain(value: Any, place: str = "") -> Any:
     if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, torch.Tensor):
-        return value.detach().as_subclass(torch.Tensor)
+        return value.detach().cpu().as_subclass(torch.Tensor)
     if isinstance(value, np.generic | float | int | str):
         return plain(value.item() if isinstance(value, np.generic) else _base(value), place)
     if isinstance(value, Mapping):
