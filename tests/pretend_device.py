@@ -31,6 +31,7 @@ aten = torch.ops.aten
 MOVES = (aten._to_copy.default, aten.copy_.default)
 INDEXING = (aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default)
 FROM_DATA = (torch.tensor, torch.as_tensor, torch.asarray)
+READ = (torch.Tensor.tolist, torch.Tensor.__format__)
 PLACES = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
 
 
@@ -94,8 +95,8 @@ class PretendFunctions(TorchFunctionMode):
             return func(*args, **kwargs | {"device": None}).to(kwargs["device"])
         if func is torch.Tensor.new_tensor:
             return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(args[0].device)
-        if func is torch.Tensor.tolist:
-            args = (args[0].cpu(),)
+        if func in READ:
+            args = (args[0].cpu(), *args[1:])
         if func is torch.Tensor.numpy and isinstance(args[0], PretendTensor):
             raise TypeError(f"numpy cannot read a tensor on {DEVICE}; copy it to the CPU first.")
         if func in PLACES and isinstance(args[0], PretendTensor):
