@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
 from torch import nn
 
 from rt_torchrl import (
@@ -110,7 +109,8 @@ class Config(RunConfig):
         def fouled(episode: int) -> ConstantCoefficients:
             # The weights change in place, because a new module for each episode would be compiled anew.
             U_s, U_HX, K_JT = ConstantCoefficients.true_coefficients
-            worn.log_coefficients.copy_(torch.tensor([U_s, 0.98**episode * U_HX, K_JT]).log())
+            fresh = worn.log_coefficients.new_tensor([U_s, 0.98**episode * U_HX, K_JT])
+            worn.log_coefficients.copy_(fresh.log())
             return worn
 
         return fouled

@@ -49,7 +49,8 @@ def coefficients(snapshot: Snapshot) -> Figure:
         low, high = seen[:, column].min(), seen[:, column].max()
         reach = 0.5 * (high - low).clamp(min=1e-6)
         points = seen.mean(0).repeat(121, 1)
-        points[:, column] = torch.linspace((low - reach).item(), (high + reach).item(), 121, dtype=seen.dtype)
+        ends = (low - reach).item(), (high + reach).item()
+        points[:, column] = torch.linspace(*ends, 121, dtype=seen.dtype, device=seen.device)
         x, inside = unit * points[:, column], (points[:, column] >= low) & (points[:, column] <= high)
         for name, closure in closures(snapshot).items():
             look = {"color": CLOSURE_COLOURS[name], "linestyle": CLOSURE_LINES[name], "linewidth": 1.8, "label": name}

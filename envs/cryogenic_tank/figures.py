@@ -133,9 +133,9 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     visited. Curves are pale outside the range of those drops.
     """
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
+    like: dict[str, Any] = {"dtype": torch.float64, "device": record.states.device}
     # The drops are denser towards the shut valve, where the flow is proportional to their root.
-    drop = plant.actions[0].high * torch.linspace(0.0, 1.0, 201, dtype=torch.float64) ** 2
-    drop = drop.to(record.states.device)
+    drop = plant.actions[0].high * torch.linspace(0.0, 1.0, 201, **like) ** 2
     state = plant.state_at(torch.full_like(drop, plant.set_point))
     title = f"Heat exchanger at the set point, {1e-3 * plant.set_point:g} kPa"
     figure, axes = panels(3, title=title, size=(7.5, 8.0), sharex=True, height_ratios=(2.0, 2.0, 1.0))

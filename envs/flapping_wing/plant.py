@@ -168,14 +168,14 @@ class FlappingWing(Plant):
 
     def damping_rate(self) -> float:
         """Fastest decay rate [1/s] of the body's velocity over a beat at the largest stroke, from hover in calm air."""
-        t = torch.arange(100, dtype=torch.float64) / (100 * self.frequency)
-        action = torch.tensor([[self.actions[0].high, 0.0]], dtype=torch.float64).expand(len(t), 2)
+        t = torch.arange(100, dtype=torch.float64, device=self.mass.device) / (100 * self.frequency)
+        action = t.new_tensor([[self.actions[0].high, 0.0]]).expand(len(t), 2)
 
         def acceleration(velocity: Tensor) -> Tensor:
             return self.force(t, velocity, action, self.closure) / self.mass
 
-        at_rest = torch.zeros(len(t), 2, dtype=torch.float64)
-        basis = torch.eye(2, dtype=torch.float64)
+        at_rest = t.new_zeros(len(t), 2)
+        basis = torch.eye(2, dtype=t.dtype, device=t.device)
         columns = [torch.func.jvp(acceleration, (at_rest,), (e.expand_as(at_rest),))[1] for e in basis]
         return max(0.0, -torch.linalg.eigvals(torch.stack(columns, -1)).real.min().item())
 

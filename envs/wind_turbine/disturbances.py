@@ -195,4 +195,4 @@ class RecordedWind:
             start = part * max(0.0, record.duration - needed)
             # The record's times are an even grid, because a text file rounds the printed times to a millisecond.
             row[:] = np.interp(start + elapsed, record.step * np.arange(len(record.speed)), record.speed)
-        return torch.from_numpy(wind).to(device).clamp_min(self.floor)
+        return torch.as_tensor(wind, device=device).clamp_min(self.floor)

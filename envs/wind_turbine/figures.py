@@ -146,8 +146,8 @@ def _evaluate(closure: nn.Module, lam: Tensor, beta: Tensor) -> np.ndarray:
 
 
 def _draw_curves(ax: Axes, snapshot: Snapshot, visited: _Visited) -> None:
-    lam = torch.linspace(2.0, max(13.0, visited.lam.max()), 200, dtype=torch.float64)
-    lam = lam.to(snapshot.record.states.device)
+    like: dict[str, Any] = {"dtype": torch.float64, "device": snapshot.record.states.device}
+    lam = torch.linspace(2.0, max(13.0, visited.lam.max()), 200, **like)
     for k, (pitch, colour) in enumerate(zip(PITCHES, PITCH_COLOURS, strict=True)):
         near = visited.lam[np.abs(visited.beta - pitch) <= 2.5]
         inside = (array(lam) >= near.min(initial=np.inf)) & (array(lam) <= near.max(initial=-np.inf))

@@ -135,8 +135,8 @@ class WindTurbine(Plant):
 
     def time_constant(self, wind_speed: float, pitch: float = 0.0) -> float:
         r"""Time constant −1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and a pitch [deg]."""
-        omega_r = torch.tensor(self.rated_rotor_speed, dtype=torch.float64, requires_grad=True)
-        u, beta = torch.tensor(wind_speed, dtype=torch.float64), torch.tensor(pitch, dtype=torch.float64)
+        given = self.greatest_increment.new_tensor([self.rated_rotor_speed, pitch, wind_speed])
+        omega_r, beta, u = given.requires_grad_().unbind()
         torque = self.aerodynamic_torque(omega_r, beta, u, self.closure)
         (slope,) = torch.autograd.grad(torque, omega_r)
         return -self.inertia / slope.item()

@@ -210,7 +210,7 @@ def _origins(knots: Float[np.ndarray, " n"]) -> Float[np.ndarray, " cells"]:
 
 def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
     """The axis with each interval cut into equal parts."""
-    steps = torch.arange(parts, dtype=axis.dtype) / parts
+    steps = torch.arange(parts, dtype=axis.dtype, device=axis.device) / parts
     return torch.cat([(axis[:-1, None] + steps * axis.diff()[:, None]).flatten(), axis[-1:]])
 
 

@@ -5,6 +5,7 @@ https://github.com/NREL/ROSCO, Apache License 2.0.
 """
 
 import contextlib
+import copy
 import math
 import os
 import sys
@@ -212,13 +213,14 @@ def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | s
     """
     every = steps_of(plant)
     rosco()
+    machine = copy.deepcopy(plant).cpu()  # the simulator's side, wherever the twin's is
 
     def run(seed: int, controller: Controller) -> None:
         def decide(state: Tensor, wind: float, told: Mapping[str, Any]) -> Tensor:
             command = controller({"state": state.numpy(), "wind": [wind]})
-            return plant.actuate(state, torch.from_numpy(command))
+            return machine.actuate(state, torch.from_numpy(command))
 
-        simulate(plant, seed, lambda start, wind: Answer(plant, start, wind, decide, every))
+        simulate(machine, seed, lambda start, wind: Answer(machine, start, wind, decide, every))
 
     env = CallingSimulator(run, {"state": len(plant.states), "wind": 1}, plant.actions)
     wind = Reading(keys=("wind",))
@@ -237,12 +239,14 @@ class RoscoController(RealController):
     def fly_real(self, count: int, *, seed: int) -> Trajectory:
         """The episodes that :func:`rosco_turbine` runs from the same seed."""
         found = [self._episode(episode_seed(seed, number)) for number in range(count)]
-        states, applied, wind = (torch.stack(part) for part in zip(*found, strict=True))
+        device = self.plant.greatest_increment.device
+        states, applied, wind = (torch.stack(part).to(device) for part in zip(*found, strict=True))
         return Trajectory(states, applied, wind.unsqueeze(-1))
 
     def _episode(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
         """States, applied actions and wind at every control interval."""
-        every = steps_of(self.plant)
+        plant = copy.deepcopy(self.plant).cpu()
+        every = steps_of(plant)
         states, applied, winds = [], [], []
         with tempfile.TemporaryDirectory() as folder:
             interface = controller_interface(Path(folder))
@@ -255,7 +259,7 @@ class RoscoController(RealController):
                 return applied[-1]
 
             with silenced():
-                simulate(self.plant, seed, lambda start, wind: Answer(self.plant, start, wind.repeat(every), decide, 1))
+                simulate(plant, seed, lambda start, wind: Answer(plant, start, wind.repeat(every), decide, 1))
                 # The Fortran runtime would otherwise write its buffers to the terminal after this context.
                 if hasattr(interface.discon, "_gfortran_flush_i4"):
                     interface.discon._gfortran_flush_i4(None)

@@ -48,7 +48,7 @@ def tune(
 
     @torch.no_grad()
     def cost(log_gains: np.ndarray) -> float:
-        controller.log_gains.copy_(torch.from_numpy(log_gains))
+        controller.log_gains.copy_(torch.as_tensor(log_gains, device=controller.log_gains.device))
         value = control_cost(controller.plant, controller.fly(initial_state, exogenous)).mean().item()
         # A flight that leaves the finite numbers is worse than any other.
         return value if np.isfinite(value) else np.inf
@@ -59,5 +59,5 @@ def tune(
     start = cost(first)
     found = minimize(cost, first, method="Nelder-Mead", options=options)
     with torch.no_grad():
-        controller.log_gains.copy_(torch.from_numpy(found.x))
+        controller.log_gains.copy_(torch.as_tensor(found.x, device=controller.log_gains.device))
     return Tuned(start=start, best=float(found.fun), evaluations=int(found.nfev) + 1)

@@ -1,8 +1,11 @@
 """One call that finds what is wrong with a plant, before a training does."""
 
+import copy
 import inspect
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
+
+from torch import nn
 
 from rt_torchrl.contract.calls import Calls
 from rt_torchrl.contract.costs import costs
@@ -73,7 +76,8 @@ def check_plant(
     an earlier violation makes it impossible.
 
     Args:
-        plant: the plant, with the time step of its training.
+        plant: the plant, with the time step of its training. A plant on another device is checked by a copy on the
+            CPU.
         episodes: number of flights, at least 2.
         steps: number of control intervals of each flight, at least 2 and at most that of an episode.
         seed: seed of the draws and of the random commands.
@@ -91,6 +95,7 @@ def check_plant(
     for argument, value in (("episodes", episodes), ("steps", steps)):
         if value < 2:
             raise ValueError(f"{argument}={value} of the check must be at least 2.")
+    plant = _on_cpu(plant)
     found = list(signals(plant)) or list(attempt(draws, plant, seed)) + list(attempt(modules, plant, seed))
     checks = ON_FLIGHTS if traced else {name: check for name, check in ON_FLIGHTS.items() if check is not tracing}
     steps = min(steps, plant.n_steps)
@@ -99,6 +104,12 @@ def check_plant(
     if found:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
     return ContractReport(plant.name, ("signals", "draws", "closures and policy", *checks), episodes, steps, plant.dt)
+
+
+def _on_cpu(plant: Plant) -> Plant:
+    """The plant, or a copy of one that has tensors on another device."""
+    tensors = (*plant.parameters(), *plant.buffers()) if isinstance(plant, nn.Module) else ()
+    return plant if all(tensor.device.type == "cpu" for tensor in tensors) else copy.deepcopy(plant).cpu()
 
 
 def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iterable[Check]) -> list[str]:

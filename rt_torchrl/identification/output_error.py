@@ -141,7 +141,9 @@ class OutputError:
         ends, S = self._sensitivities(first[None], exogenous[None], actions[None], start=start, initial=True)
         require_finite(self.plant, ends[0, :, None], first[None], [self.twin.closure], start=start, remedy=REMEDY)
         states = torch.cat([first[None], ends[0]])
-        at_start = torch.cat([S.new_zeros(len(first), self.weight_count), torch.eye(len(first)).to(S)], -1)
+        at_start = torch.cat(
+            [S.new_zeros(len(first), self.weight_count), torch.eye(len(first), dtype=S.dtype, device=S.device)], -1
+        )
         S = torch.cat([at_start[None], S[0]])
         by_initial = S[..., self.weight_count :] @ self.initial.unit.T
         g, H = discrepancy_derivatives(self.plant, states[None], measured[None])
@@ -170,8 +172,8 @@ class OutputError:
 
     def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)
-        own = self._shown + number * free + torch.arange(free)
-        return torch.cat([torch.arange(self._shown), own])
+        shown, own = (torch.arange(n, device=self.initial.measured.device) for n in (self._shown, free))
+        return torch.cat([shown, self._shown + number * free + own])
 
 
 def discrepancy_derivatives(

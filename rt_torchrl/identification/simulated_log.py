@@ -68,9 +68,9 @@ def recorded(
         )
     n = plant.n_steps
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64) - 0.5)
+    offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64, device=generator.device) - 0.5)
     offsets[0] = 0.0
-    times = plant.dt * (torch.arange(n + 1) + offsets)
+    times = plant.dt * (torch.arange(n + 1, device=generator.device) + offsets)
     rows = []
     for k in range(n + 1):
         z = exogenous[:, min(k, n - 1)]
@@ -92,10 +92,10 @@ def _held(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, le
 
 def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, noise: float) -> SensorLog:
     n_s = len(plant.states)
-    errors = torch.randn(len(rows), n_s, generator=generator, dtype=torch.float64)
-    values = torch.cat([rows[:, :n_s] * (1.0 + noise * errors), rows[:, n_s:]], -1).numpy()
+    errors = torch.randn(len(rows), n_s, generator=generator, dtype=torch.float64, device=generator.device)
+    values = torch.cat([rows[:, :n_s] * (1.0 + noise * errors), rows[:, n_s:]], -1).cpu().numpy()
     own = {signal.name for signal in logged_states(plant)}
     signals = (*plant.states, *plant.actions, *plant.inputs)
     chosen = {s.name: k for k, s in enumerate(signals) if k >= n_s or s.name in own}
     columns = {name: np.ascontiguousarray(signals[k].wrapped(values[:, k])) for name, k in chosen.items()}
-    return SensorLog(times=times.numpy(), columns=columns)
+    return SensorLog(times=times.cpu().numpy(), columns=columns)

@@ -174,7 +174,7 @@ class _Seen:
             # Where a slope is NaN, torch's line search halves its bracket instead of interpolating.
             for weight in self._weights:
                 weight.grad = torch.full_like(weight, float("nan"))
-            return torch.tensor(float("inf"), dtype=torch.float64)
+            return torch.tensor(float("inf"), dtype=torch.float64, device=self._weights[0].device)
 
     @torch.no_grad()
     def halve_step(self) -> None:

@@ -17,6 +17,8 @@ from rt_torchrl.runs.atomic_file import write_atomically
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     """Write tensors, numbers and strings in dicts, lists and tuples; ``torch.load`` can read the file too.
 
+    The tensors of the file are on the CPU, so that a machine without the device of the run reads it.
+
     Raises:
         ValueError: if ``content`` holds anything else; it names the place.
         OSError: if the file cannot be written, see :func:`write_atomically`.
@@ -63,11 +65,7 @@ def first_line(error: Exception) -> str:
 
 
 def plain(value: Any, place: str = "") -> Any:
-    """The value with only Python's own containers and numbers, and with plain tensors.
-
-    Args:
-        value: value to convert.
-        place: place of the value in the whole content, which an error names.
+    """The value with only Python's own containers and numbers, and with plain tensors on the CPU.
 
     Raises:
         ValueError: if it holds anything but tensors, numbers and strings; it names the place.
@@ -75,7 +73,7 @@ def plain(value: Any, place: str = "") -> Any:
     if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, torch.Tensor):
-        return value.detach().as_subclass(torch.Tensor)
+        return value.detach().cpu().as_subclass(torch.Tensor)
     if isinstance(value, np.generic | float | int | str):
         return plain(value.item() if isinstance(value, np.generic) else _base(value), place)
     if isinstance(value, Mapping):

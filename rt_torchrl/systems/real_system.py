@@ -152,7 +152,7 @@ class RealSystem(EnvBase):
         if len(self._exogenous) != len(inputs):
             names = [signal.name for signal in inputs]
             raise ValueError(f"exogenous={self._exogenous} must be a Reading, or a constant for each input of {names}.")
-        return torch.tensor([list(self._exogenous)], dtype=torch.float64).reshape(1, len(inputs))
+        return torch.tensor([list(self._exogenous)], dtype=torch.float64, device=self.device).reshape(1, len(inputs))
 
     def _set_seed(self, seed: int | None) -> None:
         """Start the sequence of episodes that belongs to a seed; a system that takes no seed ignores it."""
@@ -171,7 +171,7 @@ class RealSystem(EnvBase):
             # The seed counts episodes, not resets: a reset need not be followed by a step.
             self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
         self._reported, self._step_count = self.env.reset(), 0
-        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64)
+        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
         return self._entries(applied, ended=False)
 
     @torch.no_grad()
@@ -208,7 +208,7 @@ class RealSystem(EnvBase):
         state = self._state.read(self._reported, self.plant.states, "state").to(self.device)
         exogenous = self._input(self._reported).to(self.device)
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
-        flag = torch.full((1, 1), ended, dtype=torch.bool)
+        flag = torch.full((1, 1), ended, dtype=torch.bool, device=self.device)
         found = {"observation": self.plant.observe(t, state, exogenous), "state": state, "exogenous": exogenous}
         found |= {"done": flag, "truncated": flag.clone(), "terminated": torch.zeros_like(flag)}
         found |= {} if applied is None else {"applied": applied}

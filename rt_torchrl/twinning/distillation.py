@@ -112,9 +112,10 @@ def match_actions(
         RMS difference between the actions as a share of their ranges.
     """
     with torch.no_grad():
-        wanted = ShareOfRange(plant, teacher)(observations)
+        wanted = ShareOfRange(plant, teacher, device=observations.device)(observations)
     expert = TensorDict({"observation": observations, "action": wanted}, batch_size=observations.shape[:1])
-    actor = TensorDictModule(ShareOfRange(plant, student), in_keys=["observation"], out_keys=["action"])
+    imitator = ShareOfRange(plant, student, device=observations.device)
+    actor = TensorDictModule(imitator, in_keys=["observation"], out_keys=["action"])
     with warnings.catch_warnings():
         # BCLoss has no target network; TorchRL warns that its class does not declare one.
         warnings.filterwarnings("ignore", message="The name target_actor_network_params", category=UserWarning)
@@ -127,13 +128,14 @@ class ShareOfRange(nn.Module):
     """A policy whose actions are shares of their ranges, 0 at the low and 1 at the high end.
 
     Args:
-        plant: plant that gives the ranges of the actions.
-        policy: policy whose actions are in physical units.
+        plant: gives the ranges.
+        policy: in physical units.
+        device: where it is called; torch's default if None.
     """
 
-    def __init__(self, plant: Plant, policy: nn.Module):
+    def __init__(self, plant: Plant, policy: nn.Module, *, device: torch.device | None = None):
         super().__init__()
-        low, high = bounds(plant.actions)
+        low, high = bounds(plant.actions, device=device)
         self.policy = policy
         self.register_buffer("low", low)
         self.register_buffer("range", high - low)
