@@ -128,9 +128,9 @@ class ShareOfRange(nn.Module):
     """A policy whose actions are shares of their ranges, 0 at the low and 1 at the high end.
 
     Args:
-        plant: gives the ranges.
-        policy: in physical units.
-        device: where it is called; torch's default if None.
+        plant: plant that gives the ranges of the actions.
+        policy: policy whose actions are in physical units.
+        device: device of the observations; torch's default if None.
     """
 
     def __init__(self, plant: Plant, policy: nn.Module, *, device: torch.device | None = None):
