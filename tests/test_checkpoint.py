@@ -86,7 +86,7 @@ def test_a_plant_that_is_made_otherwise_does_not_fit(tmp_path):
     config = json.loads((tmp_path / "config.json").read_text())
 
     class Observant(LinearQuadratic):
-        observations = (*LinearQuadratic.observations, Signal("e", "again", "m"))
+        observations = (*LinearQuadratic.observations, Signal(symbol="e", name="again", unit="m"))
 
         def observe(self, t, state, exogenous):
             return torch.cat([state, state[..., :1]], -1)
