@@ -92,7 +92,7 @@ class FlightCollector:
         env = self.env
         pass_over(env)
         env.reset()
-        closure, (initial_state, exogenous, factor) = env.begin_episode(), env.drawn
+        closure, ((initial_state, exogenous), factor) = env.begin_episode(), env.drawn
         n, plant = exogenous.shape[1], env.plant
         noise = torch.stack([self.actor.draw_noise((len(initial_state), len(plant.actions))) for _ in range(n)], 1)
         factors = torch.stack([factor, *(env.sensor_factor() for _ in range(n))], 1)

@@ -1,7 +1,7 @@
 """The real system in simulation: any plant as a TorchRL environment."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,14 +14,7 @@ from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.compilation import compiled_if
 from rt_torchrl.trajectories.rollout import DivergenceError
-
-
-class Draw(NamedTuple):
-    """Initial states and exogenous inputs of episodes, and the sensors' factors on the first state."""
-
-    initial_state: Float[Tensor, "batch n_s"]
-    exogenous: Float[Tensor, "batch n n_z"]
-    sensor_factor: Float[Tensor, "batch n_s"]
+from rt_torchrl.trajectories.trajectory import Scenario
 
 
 class PlantEnv(EnvBase):
@@ -141,9 +134,9 @@ class PlantEnv(EnvBase):
         return self.closure
 
     @property
-    def drawn(self) -> "Draw":
-        """Initial states, exogenous inputs and sensor factors of the last reset."""
-        return Draw(self._state, self._exogenous, self._factor)
+    def drawn(self) -> tuple[Scenario, Float[Tensor, "batch n_s"]]:
+        """Initial states and exogenous inputs of the last reset, and the sensors' factors on the first state."""
+        return Scenario(self._state, self._exogenous), self._factor
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
