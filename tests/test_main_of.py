@@ -8,7 +8,7 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.runs.run import main_of
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.trajectories.trajectory import DivergenceError
+from rt_torchrl.trajectories.rollout import DivergenceError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -208,6 +209,13 @@ def test_compiled_gradients_of_several_shapes_are_the_eager_ones():
     assert done.stdout.strip() == "compared", done.stderr[-3000:]
 
 
+def require_quiet(done):
+    """Nothing is on the terminal but what the run itself says: on the error stream its bar alone."""
+    lines = [line for line in done.stderr.replace("\r", "\n").splitlines() if line.strip()]
+    assert lines and all("episode" in line and "|" in line for line in lines), done.stderr[:3000]
+    assert not re.search(r"torch\.jit|CUDA_HOME|\[torchrl\]|Warning", done.stdout), done.stdout
+
+
 def test_the_recipe_trains_on_gymnasium(tmp_path):
     small = ["--episodes", "1", "--unseen", "2", "--horizon", "2.0", "--compiled", "False", "--figures-every", "0"]
     small += ["--twinning.learner.critic-iterations", "2", "--twinning.learner.actor-iterations", "2"]
@@ -215,6 +223,7 @@ def test_the_recipe_trains_on_gymnasium(tmp_path):
     command = [sys.executable, str(RECIPE), *small, "--log-dir", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
+    require_quiet(done)
     found = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]["found"]
     # One record of 40 intervals in single precision.
     assert found == pytest.approx({"mass": 1.0, "length": 1.0}, rel=1e-4)

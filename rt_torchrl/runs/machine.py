@@ -15,7 +15,7 @@ def quieten_libraries() -> None:
     """Keep off the terminal what libraries say of themselves, of which nothing is the user's to mend."""
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Of TorchRL's own code, and only with new versions of PyTorch.
+    # Of the code of PyTorch and TorchRL themselves, and only with new versions of PyTorch.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*is deprecated", category=FutureWarning)
 
 
