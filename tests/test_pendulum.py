@@ -3,10 +3,9 @@
 import json
 import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import fresh_process
 import gymnasium
 import numpy as np
 import pytest
@@ -204,8 +203,7 @@ print("compared")
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_compiled_gradients_of_several_shapes_are_the_eager_ones():
     """In a process of its own, because annotations that are checked at run time cannot be compiled."""
-    root = Path(__file__).parent.parent
-    done = subprocess.run([sys.executable, "-c", COMPILED], cwd=root, capture_output=True, text=True)
+    done = fresh_process.run(COMPILED)
     assert done.stdout.strip() == "compared", done.stderr[-3000:]
 
 
@@ -220,8 +218,7 @@ def test_the_recipe_trains_on_gymnasium(tmp_path):
     small = ["--episodes", "1", "--unseen", "2", "--horizon", "2.0", "--compiled", "False", "--figures-every", "0"]
     small += ["--twinning.learner.critic-iterations", "2", "--twinning.learner.actor-iterations", "2"]
     small += ["--twinning.planner.iterations", "1", "--twinning.virtual-episodes", "2"]
-    command = [sys.executable, str(RECIPE), *small, "--log-dir", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = fresh_process.run(RECIPE, *small, "--log-dir", str(tmp_path))
     assert done.returncode == 0, done.stderr[-3000:]
     require_quiet(done)
     found = json.loads((tmp_path / "metrics.json").read_text())["summary"]["closure"]["found"]
@@ -232,8 +229,7 @@ def test_the_recipe_trains_on_gymnasium(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_it_swings_up_within_ten_real_episodes(tmp_path, seed):
-    command = [sys.executable, str(RECIPE), "--seed", str(seed), "--log-dir", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = fresh_process.run(RECIPE, "--seed", str(seed), "--log-dir", str(tmp_path))
     assert done.returncode == 0, done.stderr[-3000:]
     summary = json.loads((tmp_path / "metrics.json").read_text())["summary"]
     better = summary["unseen"]["merit"][summary["better"]]

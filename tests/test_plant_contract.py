@@ -1,9 +1,6 @@
 """What every plant fulfils: each folder under rt_torchrl.envs, found by itself, and the linear-quadratic oracle."""
 
-import subprocess
-import sys
-from pathlib import Path
-
+import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -147,8 +144,7 @@ for name, kind in CLASSES.items():
 @pytest.fixture(scope="module")
 def checking():
     """In a process of its own: the run-time checks of this one cannot be traced."""
-    root = Path(__file__).parent.parent
-    return subprocess.run([sys.executable, "-c", CHECK], cwd=root, capture_output=True, text=True)
+    return fresh_process.run(CHECK)
 
 
 def test_fulfils_the_contract_and_is_one_graph(plant, checking):

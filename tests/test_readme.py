@@ -1,11 +1,9 @@
 """What the README shows is true."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import fresh_process
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,9 +34,7 @@ def test_the_tutorial_runs(tmp_path):
     assert len(lines) < 80
     small = code.replace("episodes=4, unseen=10", "episodes=1, unseen=2")
     assert small != code
-    command = [sys.executable, "-c", small]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    done = fresh_process.run(small, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     upper, lower = map(float, re.findall(r"outlet': ([\d.e-]+)", done.stdout)[:2])
     # The inflow is measured without noise: to rounding.

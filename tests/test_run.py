@@ -22,7 +22,7 @@ from rt_torchrl.twinning.assimilation import AssimilationConfig
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):
-    metrics = small_run(tmp_path).train()
+    metrics = small_run(tmp_path, figures=True).train()
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert [record["episode"] for record in metrics["episodes"]] == [0, 1, 2]
     promised = {"J_p", "J_a_model_based", "J_a_model_free", "live", "real_cost", "event", "seconds"}
@@ -42,8 +42,9 @@ def test_a_run_leaves_its_results_readable(tmp_path):
 
 
 def test_a_run_without_figures_has_the_same_results(tmp_path):
-    drawn = small_run(tmp_path / "drawn", episodes=1).train()
+    drawn = small_run(tmp_path / "drawn", episodes=1, figures=True).train()
     bare = small_run(tmp_path / "bare", episodes=1, figures=False).train()
+    assert (tmp_path / "drawn" / "figures").exists()
     assert not (tmp_path / "bare" / "figures").exists()
     for metrics in (drawn, bare):
         del metrics["summary"]["seconds"], metrics["episodes"][0]["seconds"]
@@ -129,7 +130,7 @@ class Worn(RunConfig):
 def test_the_twin_follows_a_system_that_wears(tmp_path):
     assimilation = AssimilationConfig(method="levenberg_marquardt", inputs="record")
     twinning = dataclasses.replace(SMALL, assimilation=assimilation)
-    options = {"compiled": False, "unseen": 3, "figures_every": 0, "twinning": twinning, "episodes": 3}
+    options = {"compiled": False, "unseen": 3, "figures": False, "twinning": twinning, "episodes": 3}
     run = Run(Worn(log_dir=tmp_path, **options), LinearQuadratic(horizon=4.0))
     found = run.train()
     closures = [torch.tensor(record["closure"]["matrix"]) for record in found["episodes"]]
@@ -153,7 +154,7 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     class Heavier(LinearQuadratic):
         B = ((0.0,), (0.75,))
 
-    config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures_every=0, twinning=SMALL, episodes=1)
+    config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures=False, twinning=SMALL, episodes=1)
     run = Run(config, Heavier(horizon=2.0), believed=LinearQuadratic(horizon=2.0))
     found = run.train()["summary"]
     assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
