@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -202,8 +203,16 @@ def test_quick_is_a_small_run(tmp_path):
     assert RunConfig(quick=True, episodes=2).effective().episodes == 2
 
 
-def test_a_taken_folder_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished run; to be copied by who changes it."""
+    folder = tmp_path_factory.mktemp("finished")
+    small_run(folder, episodes=1).train()
+    return folder
+
+
+def test_a_taken_folder_is_refused(tmp_path, finished):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
     with pytest.raises(ValueError, match="holds a run already.*--resume.*--overwrite"):
         small_run(tmp_path)
     small_run(tmp_path, episodes=1, overwrite=True).train()
@@ -215,22 +224,20 @@ def test_an_unwritable_folder_is_refused(tmp_path):
         small_run(tmp_path / "file" / "run")
 
 
-def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
+def test_a_checkpoint_of_another_plant_is_refused(finished):
 
     class Other(LinearQuadratic):
         name = "other"
 
-    config = RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=SMALL)
+    config = RunConfig(log_dir=finished, resume=True, compiled=False, twinning=SMALL)
     with pytest.raises(ValueError, match="checkpoint is of plant 'linear_quadratic', this training of 'other'"):
         Run(config, Other(horizon=2.0))
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
+def test_a_checkpoint_of_another_architecture_is_refused(finished):
     wider = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, critic_hidden=(9,)))
     with pytest.raises(ValueError, match=r"critic_hidden is \[9\] here and was \[8\] in the run"):
-        Run(RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
+        Run(RunConfig(log_dir=finished, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
 
 
 @pytest.mark.parametrize(
