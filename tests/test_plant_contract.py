@@ -13,7 +13,7 @@ from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 CLASSES = {"linear_quadratic": LinearQuadratic} | shipped_plants()
-GREATEST_EPISODE = 2000
+GREATEST_EPISODE = 500
 
 
 def shortened(kind, steps):
