@@ -26,8 +26,15 @@ SMALL = TwinningConfig(
 )
 
 
-def small_run(folder, episodes=3, **options):
+def small_run(folder, episodes=3, *, figures=False, **options):
     config = RunConfig(
-        episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options
+        episodes=episodes,
+        log_dir=folder,
+        compiled=False,
+        unseen=3,
+        figures=figures,
+        figures_every=0,
+        twinning=SMALL,
+        **options,
     )
     return Run(config, LinearQuadratic(horizon=2.0))

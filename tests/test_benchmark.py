@@ -2,10 +2,9 @@
 
 import json
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
+import fresh_process
 import pytest
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
@@ -14,8 +13,7 @@ RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 def compared(tmp_path, *options):
     """Output of the benchmark, which runs in a process of its own."""
     output = tmp_path / "result.json"
-    command = [sys.executable, str(RECIPE), "--repeats", "1", "--output", str(output), *options]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = fresh_process.run(RECIPE, "--repeats", "1", "--output", str(output), *options)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(output.read_text())
 

@@ -2,10 +2,8 @@
 
 import math
 import re
-import subprocess
-import sys
-from pathlib import Path
 
+import fresh_process
 import pytest
 import torch
 from broken_plants import BROKEN, TRACED, PartlyDetached
@@ -117,8 +115,7 @@ for kind in TRACED:
 
 def test_what_is_not_one_graph_is_found():
     """The check runs in a process of its own, because the run-time checks of this one cannot be traced."""
-    root = Path(__file__).parent.parent
-    done = subprocess.run([sys.executable, "-c", TRACE], cwd=root, capture_output=True, text=True)
+    done = fresh_process.run(TRACE)
     found = {name: violations for name, *violations in (line.split("\t") for line in done.stdout.splitlines())}
     for kind, message in TRACED.items():
         assert any(re.match(message, text) for text in found[kind.__name__]), (found, done.stderr[-2000:])

@@ -1,9 +1,6 @@
 """Classical controllers: their laws, their flights against the plant's own step, and the search for their gains."""
 
-import subprocess
-import sys
-from pathlib import Path
-
+import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
@@ -84,8 +81,7 @@ print("compared")
 @pytest.mark.slow
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_a_compiled_flight_is_the_eager_one():
-    root = Path(__file__).parent.parent
-    done = subprocess.run([sys.executable, "-c", COMPARISON], cwd=root, capture_output=True, text=True)
+    done = fresh_process.run(COMPARISON)
     assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]
 
 

@@ -160,6 +160,7 @@ def test_control_surfaces_are_the_policies_with_the_other_errors_at_zero(snapsho
         assert distance.min() < 1e-9
 
 
+@pytest.mark.slow
 def test_animation_has_all_frames(snapshot, tmp_path):
     path = save_animation(snapshot, tmp_path / "flight.gif")
     with Image.open(path) as animation:

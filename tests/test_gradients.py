@@ -1,9 +1,6 @@
 """The three gradient engines against each other and against central differences."""
 
-import subprocess
-import sys
-from pathlib import Path
-
+import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -237,6 +234,5 @@ print("compared")
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_compiled_equals_eager():
     """The test runs in a process of its own, because the run-time checks of this one cannot be compiled."""
-    root = Path(__file__).parent.parent
-    done = subprocess.run([sys.executable, "-c", COMPARISON], cwd=root, capture_output=True, text=True)
+    done = fresh_process.run(COMPARISON)
     assert done.returncode == 0 and "compared" in done.stdout, done.stderr[-3000:]

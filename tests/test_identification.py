@@ -1,10 +1,8 @@
 """Identification from a log: derivatives against backpropagation, fits against linear regression."""
 
 import math
-import subprocess
-import sys
-from pathlib import Path
 
+import fresh_process
 import numpy as np
 import pytest
 import torch
@@ -208,6 +206,5 @@ print("equal")
 @pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
 def test_a_compiled_interval_gives_the_same_for_every_length():
     """The test runs in a process of its own, because annotations that are checked at run time cannot be compiled."""
-    root = Path(__file__).parent.parent
-    done = subprocess.run([sys.executable, "-c", COMPARISON], cwd=root, capture_output=True, text=True)
+    done = fresh_process.run(COMPARISON)
     assert done.stdout.strip() == "equal", done.stderr[-3000:]

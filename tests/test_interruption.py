@@ -116,7 +116,7 @@ def test_an_interrupt_loses_nothing_but_the_episode_under_way(tmp_path, trained,
 @pytest.mark.slow
 def test_an_interrupt_at_any_moment_loses_nothing_but_the_episode_under_way(tmp_path, trained):
     whole, seconds = trained
-    moments = [k / 40 for k in range(40)]
+    moments = [k / 20 for k in range(20)]
     done = {require_nothing_lost(tmp_path / str(share), whole, max(share * seconds, 1e-3)) for share in moments}
     # The moments were of all kinds: before the first episode, between any two, and after the last.
     assert len(done & set(range(1, EPISODES + 1))) >= 3

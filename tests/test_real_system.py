@@ -117,8 +117,9 @@ def test_a_system_without_seeds_goes_on_as_it_is():
     assert not torch.equal(*starts)
 
 
-def run_on(env, folder, **options):
-    config = RunConfig(log_dir=folder, compiled=False, unseen=3, figures_every=0, twinning=SMALL, **options)
+def run_on(env, folder, *, figures=False, **options):
+    own = {"compiled": False, "unseen": 3, "figures": figures, "figures_every": 0, "twinning": SMALL}
+    config = RunConfig(log_dir=folder, **own, **options)
     return Run(config, LinearQuadratic(horizon=2.0), env=env)
 
 
@@ -137,7 +138,7 @@ def test_a_run_on_it_is_resumed_to_the_bit(tmp_path):
 
 def test_one_of_unknown_closure_is_judged_itself(tmp_path):
     system = connected(LinearQuadratic(horizon=2.0))
-    run = run_on(system, tmp_path, episodes=2, unseen_every=1)
+    run = run_on(system, tmp_path, episodes=2, unseen_every=1, figures=True)
     assert isinstance(run.unseen, RealEpisodes)
     metrics = run.train()
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
@@ -165,6 +166,7 @@ def test_the_twin_of_it_finds_the_truth(tmp_path):
         compiled=False,
         unseen=2,
         episodes=1,
+        figures=False,
         twinning=dataclasses.replace(SMALL, assimilation=assimilation),
     )
     plant = LinearQuadratic(horizon=4.0)

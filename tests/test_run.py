@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from rt_torchrl.twinning.assimilation import AssimilationConfig
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):
-    metrics = small_run(tmp_path).train()
+    metrics = small_run(tmp_path, figures=True).train()
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert [record["episode"] for record in metrics["episodes"]] == [0, 1, 2]
     promised = {"J_p", "J_a_model_based", "J_a_model_free", "live", "real_cost", "event", "seconds"}
@@ -42,8 +43,9 @@ def test_a_run_leaves_its_results_readable(tmp_path):
 
 
 def test_a_run_without_figures_has_the_same_results(tmp_path):
-    drawn = small_run(tmp_path / "drawn", episodes=1).train()
+    drawn = small_run(tmp_path / "drawn", episodes=1, figures=True).train()
     bare = small_run(tmp_path / "bare", episodes=1, figures=False).train()
+    assert (tmp_path / "drawn" / "figures").exists()
     assert not (tmp_path / "bare" / "figures").exists()
     for metrics in (drawn, bare):
         del metrics["summary"]["seconds"], metrics["episodes"][0]["seconds"]
@@ -129,7 +131,7 @@ class Worn(RunConfig):
 def test_the_twin_follows_a_system_that_wears(tmp_path):
     assimilation = AssimilationConfig(method="levenberg_marquardt", inputs="record")
     twinning = dataclasses.replace(SMALL, assimilation=assimilation)
-    options = {"compiled": False, "unseen": 3, "figures_every": 0, "twinning": twinning, "episodes": 3}
+    options = {"compiled": False, "unseen": 3, "figures": False, "twinning": twinning, "episodes": 3}
     run = Run(Worn(log_dir=tmp_path, **options), LinearQuadratic(horizon=4.0))
     found = run.train()
     closures = [torch.tensor(record["closure"]["matrix"]) for record in found["episodes"]]
@@ -153,7 +155,7 @@ def test_a_twin_may_believe_in_another_plant(tmp_path):
     class Heavier(LinearQuadratic):
         B = ((0.0,), (0.75,))
 
-    config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures_every=0, twinning=SMALL, episodes=1)
+    config = RunConfig(log_dir=tmp_path, compiled=False, unseen=3, figures=False, twinning=SMALL, episodes=1)
     run = Run(config, Heavier(horizon=2.0), believed=LinearQuadratic(horizon=2.0))
     found = run.train()["summary"]
     assert isinstance(run.algorithm.env.plant, Heavier) and not isinstance(run.algorithm.twin.plant, Heavier)
@@ -201,8 +203,16 @@ def test_quick_is_a_small_run(tmp_path):
     assert RunConfig(quick=True, episodes=2).effective().episodes == 2
 
 
-def test_a_taken_folder_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished run; to be copied by who changes it."""
+    folder = tmp_path_factory.mktemp("finished")
+    small_run(folder, episodes=1).train()
+    return folder
+
+
+def test_a_taken_folder_is_refused(tmp_path, finished):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
     with pytest.raises(ValueError, match="holds a run already.*--resume.*--overwrite"):
         small_run(tmp_path)
     small_run(tmp_path, episodes=1, overwrite=True).train()
@@ -214,22 +224,20 @@ def test_an_unwritable_folder_is_refused(tmp_path):
         small_run(tmp_path / "file" / "run")
 
 
-def test_a_checkpoint_of_another_plant_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
+def test_a_checkpoint_of_another_plant_is_refused(finished):
 
     class Other(LinearQuadratic):
         name = "other"
 
-    config = RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=SMALL)
+    config = RunConfig(log_dir=finished, resume=True, compiled=False, twinning=SMALL)
     with pytest.raises(ValueError, match="checkpoint is of plant 'linear_quadratic', this training of 'other'"):
         Run(config, Other(horizon=2.0))
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
-    small_run(tmp_path, episodes=1).train()
+def test_a_checkpoint_of_another_architecture_is_refused(finished):
     wider = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, critic_hidden=(9,)))
     with pytest.raises(ValueError, match=r"critic_hidden is \[9\] here and was \[8\] in the run"):
-        Run(RunConfig(log_dir=tmp_path, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
+        Run(RunConfig(log_dir=finished, resume=True, compiled=False, twinning=wider), LinearQuadratic(horizon=2.0))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ def quieten_libraries() -> None:
     """Keep log lines and warnings off the terminal that concern the libraries' own code, which a user cannot mend."""
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.ERROR)
-    # TorchRL's own code causes this warning, with new versions of PyTorch.
+    # Code of PyTorch and TorchRL themselves causes this warning, with new versions of PyTorch.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*is deprecated", category=FutureWarning)
 
 

@@ -82,6 +82,7 @@ class Run:
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
+        quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
         device = require_device(config.device)
@@ -91,7 +92,6 @@ class Run:
             check_plant(physics, steps=CHECKED_STEPS, traced=False)
         if config.threads:
             torch.set_num_threads(config.threads)
-        quieten_libraries()
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:
@@ -248,6 +248,7 @@ class Run:
 
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     """Run a recipe's main on its command line; an error that the user can mend is one line, without a traceback."""
+    quieten_libraries()  # recipes check plants and make real systems before they make a run, or make none
     try:
         main(from_command_line(config_class))
     except (ValueError, OSError, DivergenceError) as error:

@@ -1,0 +1,32 @@
+"""The commands and code that README and documentation print, as they stand there."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "recipes" / "own_plant.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = {page.name: page.read_text(encoding="utf-8") for page in PAGES}
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The code blocks of a page in one language."""
+    return [code for kind, code in BLOCK.findall(TEXTS[page]) if kind == language]
+
+
+def spans(page: str) -> list[str]:
+    """The code in the sentences and tables of a page, each in one line."""
+    return [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", BLOCK.sub("", TEXTS[page]))]
+
+
+def commands() -> list[str]:
+    """Every command line that begins with ``uv run``, once, without its comment."""
+    lines = [line for page in TEXTS for block in blocks(page, "sh") for line in block.splitlines()]
+    lines += [span for page in TEXTS for span in spans(page)]
+    found = (re.sub(r"\s+#.*", "", line) for line in lines if line.startswith("uv run "))
+    return list(dict.fromkeys(found))
+
+
+def options() -> list[str]:
+    """Every group of options that a sentence or a table names on its own, once."""
+    return list(dict.fromkeys(span for page in TEXTS for span in spans(page) if span.startswith("--")))

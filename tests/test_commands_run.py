@@ -1,0 +1,143 @@
+"""The commands that README and documentation print, run as they are printed in a copy of the repository."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from printed_commands import ROOT, commands
+from test_pendulum import require_quiet
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("uv") is None, reason="the printed commands are run by uv"),
+]
+TRAININGS = [
+    command
+    for command in commands()
+    if re.search(r"recipes/(wind_turbine|pendulum)\.py", command) and "--help" not in command
+]
+LAST = "uv run recipes/wind_turbine.py --episodes 1 --unseen 2 --quick --horizon 20 --compiled False --log-dir "
+PATIENCE = 300.0  # [s] for what takes seconds on a quiet machine
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory):
+    """What a fresh clone has, without the history."""
+    folder = tmp_path_factory.mktemp("clone")
+    for name in ("README.md", "LICENSE", "pyproject.toml", ".pre-commit-config.yaml"):
+        shutil.copy(ROOT / name, folder / name)
+    for name in ("rt_torchrl", "envs", "recipes"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def started(command, clone, **options):
+    """The command as printed, in a shell; uv takes the environment of this process instead of making one."""
+    environment = {
+        **os.environ,
+        "UV_NO_SYNC": "1",
+        "UV_PROJECT_ENVIRONMENT": sys.prefix,
+        "PYTHONPATH": str(clone),  # before what that environment has installed
+    }
+    return subprocess.Popen(
+        ["bash", "-c", command], cwd=clone, env=environment, text=True, start_new_session=True, **options
+    )
+
+
+def done(command, clone):
+    """The command run to its end."""
+    process = started(command, clone, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        out, err = process.communicate(timeout=PATIENCE)
+    finally:
+        end(process)
+    assert process.returncode == 0, f"{command}\n{out[-2000:]}\n{err[-3000:]}"
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+
+def end(process):
+    """End a command with all that it has started."""
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def require_begun(command, clone, tmp_path, sign):
+    """The command says what it says once it is at work; it is ended then."""
+    with open(tmp_path / "said", "w+b") as said:
+        process = started(command, clone, stdout=said, stderr=said)
+        begin = time.monotonic()
+        try:
+            while not re.search(sign, text := Path(said.name).read_text(encoding="utf-8", errors="replace")):
+                assert process.poll() is None, f"{command}\n{text[-3000:]}"
+                assert time.monotonic() - begin < PATIENCE, f"{command}\n{text[-3000:]}"
+                time.sleep(0.5)
+        finally:
+            end(process)
+
+
+@pytest.mark.parametrize("command", TRAININGS)
+def test_a_printed_training_begins(command, clone, tmp_path):
+    """Up to its first real episode; the tests of the algorithm train on."""
+    if "rosco" in command:
+        pytest.importorskip("rosco")
+    require_begun(command, clone, tmp_path, r"real episode \d")
+
+
+def test_a_quick_training_of_the_pendulum_compiles_and_is_quiet(clone):
+    """From its first second on nothing of PyTorch or TorchRL stands on the terminal."""
+    assert "uv run --extra gym recipes/pendulum.py" in commands()
+    shown = done("uv run --extra gym recipes/pendulum.py --quick", clone)
+    require_quiet(shown)
+    assert "results in" in shown.stdout
+
+
+def test_help_is_printed(clone):
+    assert "--twinning.arm" in done("uv run recipes/wind_turbine.py --help", clone).stdout
+
+
+def test_a_log_is_recorded_and_identified(clone):
+    record, identify = (next(c for c in commands() if name in c) for name in ("record_log", "identify"))
+    assert "log.csv" in record and '"rpm=rotor_speed[rpm]"' in identify
+    done(record, clone)
+    header, rest = (clone / "log.csv").read_text(encoding="utf-8").split("\n", 1)
+    assert "rotor_speed" in header
+    # The log of the documentation has a sensor of another name and unit.
+    speed = header.split(",").index("rotor_speed")
+    rows = [line.split(",") for line in rest.splitlines()]
+    for row in rows:
+        row[speed] = str(float(row[speed]) * 9.549296585513721) if row[speed] else ""
+    lines = [header.replace("rotor_speed", "rpm"), *(",".join(row) for row in rows)]
+    (clone / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assert "rotor_speed" in done(identify, clone).stdout
+
+
+def test_a_policy_is_exported(clone):
+    (command,) = (c for c in commands() if "recipes/export.py" in c)
+    folder = re.search(r"runs/\S+", command).group()
+    done(LAST + folder, clone)
+    done(command, clone)
+    kinds = {path.suffix for path in (clone / folder / "exported").iterdir()}
+    assert {".c", ".h", ".onnx", ".pt2"} <= kinds
+
+
+def test_the_dashboard_opens(clone, tmp_path):
+    require_begun("uv run tensorboard --logdir runs", clone, tmp_path, r"http://\S+")
+
+
+def test_the_hooks_are_installed(clone):
+    pytest.importorskip("pre_commit")
+    subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
+    done("uv run pre-commit install", clone)
+    assert (clone / ".git" / "hooks" / "pre-commit").exists()
+
+
+def test_the_study_begins(clone, tmp_path):
+    (command,) = (c for c in commands() if "recipes/study.py" in c)
+    require_begun(command, clone, tmp_path, r"study: .*\d+/\d+")
