@@ -11,8 +11,8 @@ from pretend_device import NAME, pretend_device
 from small_runs import SMALL
 from torch.utils._pytree import tree_leaves
 
-from envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.contract.check import check_plant
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
