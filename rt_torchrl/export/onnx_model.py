@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -38,8 +39,17 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     """
     require_packages()
     policy = detached(policy, plant)
-    program = trace(policy, plant)
     name = type(policy).__name__
+    model = _converted(trace(policy, plant), name)
+    entry = model.metadata_props.add()
+    entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
+    difference = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
+    Path(path).write_bytes(model.SerializeToString())
+    return difference
+
+
+def _converted(program: torch.export.ExportedProgram, name: str) -> Any:
+    """The ONNX model of a traced policy of that name."""
     try:
         with _quiet():
             exported = torch.onnx.export(
@@ -56,12 +66,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
             f"policy {name} has no ONNX form: {str(error).strip()}. Use the .pt2 program or C instead."
         ) from error
     assert exported is not None  # the exporter of dynamo gives a program; only the older one gives none
-    model = exported.model_proto
-    entry = model.metadata_props.add()
-    entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
-    difference = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
-    Path(path).write_bytes(model.SerializeToString())
-    return difference
+    return exported.model_proto
 
 
 def require_packages() -> None:

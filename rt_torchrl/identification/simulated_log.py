@@ -57,15 +57,7 @@ def recorded(
     Raises:
         ValueError: if an argument is out of its range, or there is jitter and the plant has a scheme of its own.
     """
-    if not 0.0 <= jitter < 1.0:
-        raise ValueError(f"jitter={jitter} must lie in [0, 1), a share of the control interval.")
-    if not 0.0 <= noise < 1.0:
-        raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
-    if jitter and plant.own_scheme:
-        raise ValueError(
-            f"jitter={jitter}: plant {plant.name!r} steps by a scheme of its own, which knows no interval but dt="
-            f"{plant.dt:g} s; record it with jitter=0."
-        )
+    _require_recordable(plant, jitter, noise)
     n = plant.n_steps
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64, device=generator.device) - 0.5)
@@ -82,6 +74,18 @@ def recorded(
         elif k < n:
             state = _held(plant, times[k], state, applied, z, (times[k + 1] - times[k]).item())
     return _log(plant, times, torch.cat(rows), generator, noise)
+
+
+def _require_recordable(plant: Plant, jitter: float, noise: float) -> None:
+    if not 0.0 <= jitter < 1.0:
+        raise ValueError(f"jitter={jitter} must lie in [0, 1), a share of the control interval.")
+    if not 0.0 <= noise < 1.0:
+        raise ValueError(f"noise={noise} of the sensors is a share of what they read; it must lie in [0, 1).")
+    if jitter and plant.own_scheme:
+        raise ValueError(
+            f"jitter={jitter}: plant {plant.name!r} steps by a scheme of its own, which knows no interval but dt="
+            f"{plant.dt:g} s; record it with jitter=0."
+        )
 
 
 def _held(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, length: float) -> Tensor:

@@ -88,10 +88,16 @@ def summarise(
         "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "seconds": seconds_per_step(episodes),
     }
-    if optimum is None:
-        return found
-    reference = {"J_a": optimum.cost, "J_a_of_each_start": optimum.costs}
-    return found | {"reference": reference | {"better_over_reference": after[better] / optimum.cost}}
+    return found if optimum is None else found | {"reference": against(optimum, after[better])}
+
+
+def against(optimum: Optimum, cost: float) -> dict[str, Any]:
+    """The entry ``reference``: the best that the class of policies can do, and a cost over it."""
+    return {
+        "J_a": optimum.cost,
+        "J_a_of_each_start": optimum.costs,
+        "better_over_reference": cost / optimum.cost,
+    }
 
 
 @torch.no_grad()
