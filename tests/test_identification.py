@@ -189,6 +189,7 @@ COMPARISON = """
 import sys, torch
 sys.path.insert(0, "tests")
 from test_identification import *
+from rt_torchrl.trajectories.sensitivity import Sensitivities
 plant = LinearQuadratic(horizon=5.0)
 segments = flown(plant, torch.Generator().manual_seed(0), (30, 20))
 twin = DigitalTwin(plant, plant.make_closure(torch.Generator().manual_seed(1)))

@@ -141,7 +141,9 @@ class Run:
         try:
             return self._train()
         except KeyboardInterrupt:
-            print(f"ended at once: {len(self.episodes)} episodes done are in {self.folder}; --resume goes on with them")
+            if self._held.begun():
+                done = len(self.episodes)
+                print(f"ended at once: {done} episodes done are in {self.folder}; --resume goes on with them")
             raise
         finally:
             self._held.release()

@@ -92,7 +92,7 @@ class RunFolder:
             )
 
     def _require_resumable(self) -> None:
-        if not (self.path / FILE).is_file():
+        if not self.begun():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
         run_settings.require_same(self.path, self._config)
         if not self.checkpoint.is_file() and any((self.path / name).exists() for name in RESULTS):
@@ -111,6 +111,10 @@ class RunFolder:
         if self._config.resume and not self.checkpoint.is_file():
             print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
         return self._config.resume and self.checkpoint.is_file()
+
+    def begun(self) -> bool:
+        """Whether the folder holds a run: its options are written when it begins."""
+        return (self.path / FILE).is_file()
 
     def begin(self, effective: RunConfig) -> None:
         """Remove the files that are to be overwritten, then write ``config.json``.
