@@ -188,16 +188,15 @@ class ActorCritic(ABC):
         self.generator.set_state(state["generator"].cpu())
 
 
-CRITIC_FINDINGS, ACTOR_FINDINGS = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")
+CRITIC_FINDINGS = "critic_loss", "td_error", "critic_gradient"
+ACTOR_FINDINGS = "value", "actor_gradient"
 COMPONENTS = ("loss", "critic_optimiser", "actor_optimiser", "memory")
 
 
 def means(critic: Sequence[tuple[Tensor, ...]], actor: Sequence[tuple[Tensor, ...]]) -> TensorDict:
     """Means of the results of :meth:`ActorCritic.critic_step` and :meth:`ActorCritic.actor_step` over iterations."""
-    names = ("critic_loss", "td_error", "critic_gradient"), ("value", "actor_gradient")
     found: dict[str, Tensor] = {}
-    for keys, iterations in zip(names, (critic, actor), strict=True):
-        found |= {
-            key: torch.stack(values).mean() for key, values in zip(keys, zip(*iterations, strict=True), strict=False)
-        }
+    for names, iterations in ((CRITIC_FINDINGS, critic), (ACTOR_FINDINGS, actor)):
+        for name, values in zip(names, zip(*iterations, strict=True), strict=bool(iterations)):
+            found[name] = torch.stack(values).mean()
     return TensorDict(found)
