@@ -15,12 +15,10 @@ from rt_torchrl import (
     LearnerConfig,
     PlannerConfig,
     RefereeConfig,
-    Run,
     RunConfig,
     TwinningConfig,
     main_of,
 )
-from rt_torchrl.envs.cryogenic_tank import figures
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
@@ -117,6 +115,10 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
+    # Here, because --help need not wait for TorchRL and Matplotlib.
+    from rt_torchrl import Run
+    from rt_torchrl.envs.cryogenic_tank import figures
+
     baselines = {"on-off": OnOffValve, "PI": PIValve}
     Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines).train()
 

@@ -12,13 +12,10 @@ from rt_torchrl import (
     LearnerConfig,
     PlannerConfig,
     RefereeConfig,
-    Run,
     RunConfig,
     TwinningConfig,
     main_of,
 )
-from rt_torchrl.envs.flapping_wing import figures
-from rt_torchrl.envs.flapping_wing.animation import save_animation
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -105,6 +102,11 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
+    # Here, because --help need not wait for TorchRL and Matplotlib.
+    from rt_torchrl import Run
+    from rt_torchrl.envs.flapping_wing import figures
+    from rt_torchrl.envs.flapping_wing.animation import save_animation
+
     Run(
         config,
         config.plant(),

@@ -12,12 +12,11 @@ import torch
 import tyro
 
 from rt_torchrl import Identification, IdentificationConfig, Plant, check_options, main_of, read_log
-from rt_torchrl.figures import identification as charts
 from rt_torchrl.identification.identification import Identified, held_back, measured_states
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, checked
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.run import can_compile
+from rt_torchrl.runs.machine import can_compile
 from rt_torchrl.runs.shipped_plants import plant_class
 
 
@@ -102,6 +101,8 @@ class Config:
 
 
 def main(config: Config) -> None:
+    from rt_torchrl.figures import identification as charts  # here, because --help need not wait for Matplotlib
+
     plant = config.make_plant()
     log = checked(read_log(config.log, plant, [Column.parse(text) for text in config.columns]), plant, drop=config.drop)
     parts = resample(log, plant, gap=config.gap, shortest=config.shortest)

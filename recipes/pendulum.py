@@ -8,7 +8,6 @@ from rt_torchrl import (
     ExplorationConfig,
     LearnerConfig,
     PlannerConfig,
-    Run,
     RunConfig,
     ShortHorizonConfig,
     TwinningConfig,
@@ -16,7 +15,6 @@ from rt_torchrl import (
     require_device,
 )
 from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 
 SWING_UP = TwinningConfig(
     # The noise has half of the torque's range and lasts about a swing, because white noise hardly moves the rod.
@@ -55,6 +53,10 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
+    # Here, because --help need not wait for TorchRL.
+    from rt_torchrl import Run
+    from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
+
     plant = config.plant()
     known = plant.closure if config.judged_on == "plant" else None
     device = require_device(config.device)

@@ -14,18 +14,15 @@ from rt_torchrl import (
     DescentConfig,
     LearnerConfig,
     PlannerConfig,
-    Run,
     RunConfig,
     TwinningConfig,
     main_of,
     require_device,
 )
-from rt_torchrl.envs.wind_turbine import figures
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
 from rt_torchrl.envs.wind_turbine.wear import worn_table
 
@@ -128,6 +125,11 @@ class Config(RunConfig):
 
 
 def main(config: Config) -> None:
+    # Here, because --help need not wait for TorchRL and Matplotlib.
+    from rt_torchrl import Run
+    from rt_torchrl.envs.wind_turbine import figures
+    from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
+
     plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
     if config.real == "rosco":
         env = rosco_turbine(plant, seed=config.seed, device=require_device(config.device))

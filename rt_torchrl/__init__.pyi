@@ -33,16 +33,16 @@ from .twinning.assimilation import AssimilationConfig
 from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
-from .twinning.learners import DDPG, TD3, ActorCritic, Learner, LearnerConfig, TD3Config
-from .twinning.learners.long_term_memory import LongTermMemoryConfig
+from .twinning.learners import DDPG, TD3, ActorCritic, Learner, LearnerConfig, LongTermMemoryConfig, TD3Config
 from .twinning.planners import Planner, PlannerConfig, ShortHorizon, ShortHorizonConfig, WholeEpisodes
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
 
 # Trainings from the command line, and their results
 from .options import check_options
+from .runs.command_line import main_of
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.machine import require_device
-from .runs.run import Run, main_of
+from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot

@@ -7,7 +7,7 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
+from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
 from rt_torchrl.twinning.referees import RefereeConfig
 
 SMALL = TwinningConfig(

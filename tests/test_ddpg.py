@@ -11,7 +11,8 @@ from tensordict import TensorDict
 
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig
-from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory, LongTermMemoryConfig
+from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
+from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory
 
 GAMMA = 0.9
 GAMMA_IN_TORCHRL = torch.tensor(GAMMA, dtype=torch.float32).item()  # DDPGLoss keeps it in single precision

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.runs.run import main_of
+from rt_torchrl.runs.command_line import main_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 

@@ -7,7 +7,8 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from rt_torchrl.twinning.learners.long_term_memory import AT_ONCE, LongTermMemory, LongTermMemoryConfig
+from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
+from rt_torchrl.twinning.learners.long_term_memory import AT_ONCE, LongTermMemory
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 
 

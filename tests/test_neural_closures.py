@@ -16,7 +16,7 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
-from rt_torchrl.runs.run import main_of
+from rt_torchrl.runs.command_line import main_of
 from rt_torchrl.trajectories.engines.interval import Interval
 from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, linearise_by_rows
 from rt_torchrl.trajectories.rollout import drive_of

@@ -16,7 +16,7 @@ from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
+from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.twinning.referees import RefereeConfig
 

@@ -14,7 +14,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.learners import DDPG, TD3, Learner, LearnerConfig
-from rt_torchrl.twinning.learners.learner import TD3Config
+from rt_torchrl.twinning.learners.config import TD3Config
 from rt_torchrl.twinning.planners import (
     Planner,
     PlannerConfig,

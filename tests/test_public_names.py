@@ -85,3 +85,21 @@ def test_the_import_waits_for_nothing():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_the_help_of_a_recipe_waits_for_pytorch_alone():
+    """The study is left out, because its help loads what it judges trainings with."""
+    code = (
+        "import contextlib, runpy, sys\n"
+        "for path in sys.argv[1:]:\n"
+        "    sys.argv = [path, '--help']\n"
+        "    with contextlib.suppress(SystemExit):\n"
+        "        runpy.run_path(path, run_name='__main__')\n"
+        "late = ('matplotlib', 'scipy', 'sklearn', 'pandas', 'torch._dynamo', 'torch._inductor', 'tensordict',\n"
+        "        'torchrl', 'torchdiffeq')\n"
+        "print([name for name in late if name in sys.modules])"
+    )
+    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem != "study"]
+    done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
+    helped = [line for line in done.stdout.splitlines() if line.startswith("usage: ")]
+    assert (len(helped), done.stdout.splitlines()[-1]) == (len(recipes), "[]"), done.stdout + done.stderr

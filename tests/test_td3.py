@@ -9,7 +9,7 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from test_ddpg import GAMMA, GAMMA_IN_TORCHRL, discounted_cost, explored, filled, optimal_gain, seeded
 
 from rt_torchrl.twinning.learners import TD3, LearnerConfig
-from rt_torchrl.twinning.learners.learner import TD3Config
+from rt_torchrl.twinning.learners.config import TD3Config
 
 
 def learner(seed=0, td3=None, **options):

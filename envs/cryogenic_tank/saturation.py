@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from platformdirs import user_cache_path
-from scipy.interpolate import make_interp_spline
 from torch import Tensor, nn
 
 CELLS = 128
@@ -163,6 +162,8 @@ def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
     Raises:
         ValueError: as in :class:`Saturation`, or if the fit misses ``TOLERANCE``.
     """
+    from scipy.interpolate import make_interp_spline  # here, because it takes a second to load
+
     fluid_state = _open_fluid(fluid, low, high)
     nodes = np.linspace(math.log(low), math.log(high), CELLS + 1)
     pressures = np.exp(nodes)

@@ -1,12 +1,11 @@
 """The data of a blade: its elements, and lift and drag of their sections over all angles of attack."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
 
 from rt_torchrl.envs.wind_turbine.power_coefficient import csv_rows
 
@@ -31,9 +30,11 @@ class Polar:
     alpha: np.ndarray
     cl: np.ndarray
     cd: np.ndarray
-    _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
+    _curve: Callable[..., np.ndarray] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        from scipy.interpolate import PchipInterpolator  # here, because it takes a second to load
+
         columns = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("alpha", "cl", "cd")}
         shapes = {name: column.shape for name, column in columns.items()}
         if len(set(shapes.values())) > 1 or columns["alpha"].ndim != 1 or columns["alpha"].size < 2:

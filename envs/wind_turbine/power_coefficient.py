@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 Axis = Sequence[float] | np.ndarray
@@ -182,6 +181,8 @@ def _spline_cells(
 
     Each cell's origin is its left knot; the cell to the left of all knots takes the first knot.
     """
+    from scipy.interpolate import CubicSpline  # here, because it takes a second to load
+
     spline = CubicSpline(knots, values, axis=0, bc_type="not-a-knot")
     inner = np.moveaxis(spline.c[::-1], 0, 1)
     ends = [np.stack([spline(k), spline(k, 1), 0 * spline(k), 0 * spline(k)]) for k in (knots[0], knots[-1])]

@@ -1,16 +1,30 @@
 """Recipes, which are files with a ``Config`` and a ``main``, and their command lines."""
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import tyro
 
+from rt_torchrl.runs.machine import quieten_libraries
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
+from rt_torchrl.trajectories.rollout import DivergenceError
 
 Configuration = TypeVar("Configuration")
+
+
+def main_of(config_class: type, main: Callable[[Any], None]) -> None:
+    """Run a recipe's main on its command line; an error that the user can mend is one line, without a traceback."""
+    quieten_libraries()  # recipes check plants and make real systems before they make a run, or make none
+    try:
+        main(from_command_line(config_class))
+    except (ValueError, OSError, DivergenceError) as error:
+        raise SystemExit(f"error: {error}") from error
+    except KeyboardInterrupt:
+        sys.exit(130)  # as shells report Ctrl-C
 
 
 def from_command_line(config_class: type[Configuration], arguments: Sequence[str] | None = None) -> Configuration:

@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +23,6 @@ from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, results
 from rt_torchrl.runs.atomic_file import finite, write_json
-from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.progress import Progress
@@ -34,7 +32,6 @@ from rt_torchrl.runs.run_folder import RunFolder
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -246,17 +243,6 @@ class Run:
         dashboard.figures(drawn, len(self.episodes) - 1)
         if self.animate:
             self.animate(snapshot, self.folder / "figures" / "animation.gif")
-
-
-def main_of(config_class: type, main: Callable[[Any], None]) -> None:
-    """Run a recipe's main on its command line; an error that the user can mend is one line, without a traceback."""
-    quieten_libraries()  # recipes check plants and make real systems before they make a run, or make none
-    try:
-        main(from_command_line(config_class))
-    except (ValueError, OSError, DivergenceError) as error:
-        raise SystemExit(f"error: {error}") from error
-    except KeyboardInterrupt:
-        sys.exit(130)  # as shells report Ctrl-C
 
 
 def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:

@@ -12,7 +12,6 @@ grows with the number of weights, unlike that of an adjoint: they are for closur
 from functools import partial
 
 import torch
-from hoptorch.scan import scan
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -88,6 +87,7 @@ def propagate(A: Tensor, B: Tensor) -> Tensor:
 
 def propagate_by_scan(A: Tensor, B: Tensor) -> Tensor:
     """The sensitivities of :func:`propagate` by one ``scan``, for the compiler."""
+    from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
 
     def body(sensitivity: Tensor, x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         transition, source = x

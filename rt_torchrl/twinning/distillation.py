@@ -12,10 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.objectives import BCLoss
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.options import check_options
@@ -111,6 +108,11 @@ def match_actions(
     Returns:
         RMS difference between the actions as a share of their ranges.
     """
+    # Here, because they take seconds to load, and a command line reads only the parameters above.
+    from tensordict import TensorDict
+    from tensordict.nn import TensorDictModule
+    from torchrl.objectives import BCLoss
+
     with torch.no_grad():
         wanted = ShareOfRange(plant, teacher, device=observations.device)(observations)
     expert = TensorDict({"observation": observations, "action": wanted}, batch_size=observations.shape[:1])

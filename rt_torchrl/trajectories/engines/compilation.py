@@ -1,4 +1,7 @@
-"""The choice between compiled and eager functions, and the settings of the compiler."""
+"""The choice between compiled and eager functions, and the settings of the compiler.
+
+PyTorch's compiler takes seconds to load. The functions below import it, so that a command line need not.
+"""
 
 import shutil
 import sysconfig
@@ -9,11 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hoptorch.scan import ensure_scan_backward
 from torch import Tensor
-from torch._dynamo.callback import callback_handler
-from torch._dynamo.types import GuardFilterEntry
-from torch._inductor import config as inductor_config
 
 LIMITS = {
     # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
@@ -66,6 +65,8 @@ def plain(tensor: Tensor) -> Tensor:
 
 def missing_for_compilation() -> str | None:
     """The name of what torch.compile lacks on this machine's CPU; None if it lacks nothing."""
+    from torch._inductor import config as inductor_config
+
     candidates = [c for c in inductor_config.cpp.cxx if c] if isinstance(inductor_config.cpp.cxx, tuple) else ["g++"]
     if not any(shutil.which(str(candidate)) for candidate in candidates):
         return "a C++ compiler"
@@ -77,6 +78,8 @@ def missing_for_compilation() -> str | None:
 @contextmanager
 def watched_compilation(tell: Callable[[bool], None]) -> Iterator[None]:
     """A context that calls ``tell(True)`` when the compiler begins and ``tell(False)`` when it ends."""
+    from torch._dynamo.callback import callback_handler
+
     begun = callback_handler.register_start_callback(lambda arguments: tell(True))
     ended = callback_handler.register_end_callback(lambda arguments: tell(False))
     try:
@@ -93,7 +96,7 @@ def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     return torch.compile(function, fullgraph=True, options={"guard_filter_fn": _lasting})
 
 
-def _lasting(guards: Sequence[GuardFilterEntry]) -> list[bool]:
+def _lasting(guards: Sequence[Any]) -> list[bool]:
     """Leave out the one guard that fails again and again although nothing has changed.
 
     TensorDict takes part in every vmap and remembers there which classes are its own. This memory grows as a program
@@ -104,6 +107,8 @@ def _lasting(guards: Sequence[GuardFilterEntry]) -> list[bool]:
 
 @cache
 def _prepare() -> None:
+    from hoptorch.scan import ensure_scan_backward
+
     # The scan's backward must have been probed before it is traced.
     ensure_scan_backward("cuda" if torch.cuda.is_available() else "cpu")
     for name, value in LIMITS.items():

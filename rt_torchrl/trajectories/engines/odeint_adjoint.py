@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torchdiffeq import odeint_adjoint
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
@@ -30,6 +29,8 @@ class OdeintAdjoint:
 
     def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
+        from torchdiffeq import odeint_adjoint  # here, because it takes a second to load and only this engine needs it
+
         field = _HeldField(interval, initial_state.shape[-1], compiled=self._compiled)
         weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
         interval_span = torch.tensor([0.0, interval.plant.dt], dtype=torch.float64, device=drive.t.device)

@@ -17,7 +17,6 @@ from functools import partial, reduce
 from typing import Any, ClassVar
 
 import torch
-from hoptorch.scan import scan
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -148,6 +147,7 @@ def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
 
 def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
     """The co-states of :func:`costates` by one ``scan``, for the compiler."""
+    from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
 
     def body(costate: Tensor, x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         transition, source = x

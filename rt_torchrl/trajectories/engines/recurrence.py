@@ -1,7 +1,6 @@
 """The recurrence s_{k+1} = Φ(s_k, x_k) itself, as a Python loop or as one compiled scan."""
 
 import torch
-from hoptorch.scan import scan
 from torch import Tensor
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if, plain
@@ -19,6 +18,7 @@ def march(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
 
 def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
     """The states of :func:`march` by one ``scan``, for the compiler."""
+    from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
 
     def body(state: Tensor, x: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         # The scan wants a carry that keeps its strides and an output that does not alias it.

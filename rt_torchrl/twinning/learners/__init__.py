@@ -1,20 +1,5 @@
-"""Model-free methods for step 2."""
+"""Model-free methods for step 2. A name is imported when it is first used, so that configurations need no TorchRL."""
 
-import torch
-from torch import nn
+import lazy_loader
 
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.twinning.learners.actor_critic import ActorCritic
-from rt_torchrl.twinning.learners.ddpg import DDPG
-from rt_torchrl.twinning.learners.learner import Learner, LearnerConfig, LearnerName, TD3Config
-from rt_torchrl.twinning.learners.td3 import TD3
-
-LEARNERS: dict[LearnerName, type[DDPG] | type[TD3]] = {"ddpg": DDPG, "td3": TD3}
-
-
-def make_learner(plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator) -> Learner:
-    """The learner that a configuration names; :class:`ActorCritic` describes the arguments."""
-    return LEARNERS[config.algorithm](plant, policy, config, generator=generator)
-
-
-__all__ = ["DDPG", "TD3", "ActorCritic", "Learner", "LearnerConfig", "TD3Config", "make_learner"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,7 +18,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.systems.refusal import finite_errors
-from rt_torchrl.twinning.learners.learner import LearnerConfig
+from rt_torchrl.twinning.learners.config import LearnerConfig
 from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory
 
 TRANSITION = ("observation", "action", *(("next", key) for key in ("observation", "reward", "done", "terminated")))

@@ -1,17 +1,10 @@
-"""The protocol of a learner, the model-free method of step 2, and its parameters."""
+"""The protocol of a learner, the model-free method of step 2."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-
-from rt_torchrl.options import check_options, require_widths
-from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
-
-LearnerName = Literal["ddpg", "td3"]
 
 
 @runtime_checkable
@@ -49,83 +42,3 @@ class Learner(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of a learner with the same configuration."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TD3Config:
-    """Parameters of TD3 that DDPG does not have.
-
-    Args:
-        delay: number of critic iterations for each iteration of the policy and of the targets.
-        smoothing: standard deviation of the noise on the target's actions, as a share of half their range.
-        smoothing_limit: greatest noise on the target's actions, as a share of half their range.
-    """
-
-    delay: int = 2
-    smoothing: float = 0.2
-    smoothing_limit: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.delay < 1:
-            raise ValueError(f"delay={self.delay} of TD3 must be at least 1 critic iteration.")
-        for argument in ("smoothing", "smoothing_limit"):
-            if not 0.0 <= getattr(self, argument) <= 2.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of TD3 must lie in [0, 2] halves of the range.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LearnerConfig:
-    """Parameters of step 2.
-
-    Args:
-        algorithm: model-free method: ``ddpg``, as in the paper, or ``td3``, which takes the lower value of two critics,
-            delays the policy and smooths the targets.
-        critic_iterations: number n_Q of critic iterations per episode.
-        actor_iterations: number n_A of DDPG's policy iterations per episode; TD3 makes one for every ``td3.delay``
-            critic iterations instead.
-        batch_size: number n_b of transitions in a batch; it is at most the number n_t of control intervals.
-        discount: discount factor γ per control interval.
-        return_steps: number of control intervals whose rewards a target sums before it bootstraps; 1 as in the paper.
-            Where a control interval is short beside the dynamics, one action matters less than the critic's error; a
-            sum over more intervals mends that.
-        reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
-            scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
-        target_rate: rate τ at which the target critic, and TD3's target policy, follow.
-        critic_rate: learning rate of the critic (Adam).
-        actor_rate: learning rate of the policy (Adam).
-        gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
-        critic_hidden: widths of the critic's hidden layers.
-        memory: parameters of the long-term memory D_L.
-        td3: parameters of TD3 that DDPG does not have.
-    """
-
-    algorithm: LearnerName = "ddpg"
-    critic_iterations: int = 500
-    actor_iterations: int = 1000
-    batch_size: int = 128
-    discount: float = 0.98
-    return_steps: int = 1
-    reward_scale: float = 1.0
-    target_rate: float = 0.01
-    critic_rate: float = 1e-3
-    actor_rate: float = 2e-3
-    gradient_limit: float = 1.0
-    critic_hidden: Sequence[int] = field(default=(64, 64))
-    memory: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
-    td3: TD3Config = field(default_factory=TD3Config)
-
-    def __post_init__(self) -> None:
-        check_options(self, infinite=("gradient_limit",))
-        require_widths("critic_hidden", self.critic_hidden)
-        for argument in ("critic_iterations", "actor_iterations"):
-            if getattr(self, argument) < 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        for argument in ("batch_size", "return_steps"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
-        if not 0.0 <= self.discount < 1.0:
-            raise ValueError(f"discount={self.discount} must lie in [0, 1); the critic bootstraps through truncation.")
-        for argument in ("reward_scale", "target_rate", "critic_rate", "actor_rate", "gradient_limit"):
-            if not getattr(self, argument) > 0.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")

@@ -1,7 +1,6 @@
 """The long-term memory D_L: the transitions that critics learn from, sampled by priority."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,37 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplayBuffer, Writer
 
-from rt_torchrl.options import check_options
+from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
 
 AT_ONCE = 100
 """Number of batches drawn in one call: with as many its overhead does not matter, and their copies are still small."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LongTermMemoryConfig:
-    """Parameters of D_L.
-
-    Args:
-        capacity: number n_L of transitions that the memory keeps.
-        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
-        correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
-        offset: number tol that is added to every |δ|.
-    """
-
-    capacity: int = 100_000
-    prioritisation: float = 0.6
-    correction: float = 0.4
-    offset: float = 1e-3
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.capacity < 1:
-            raise ValueError(f"capacity={self.capacity} of the long-term memory must be at least 1.")
-        for argument in ("prioritisation", "correction"):
-            if not 0.0 <= getattr(self, argument) <= 1.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must lie in [0, 1].")
-        if not self.offset > 0:
-            raise ValueError(f"offset={self.offset} must be positive, or a transition could never be sampled.")
 
 
 class LongTermMemory:
