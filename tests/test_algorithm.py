@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from test_ddpg import optimal_gain
+from test_optimal_gain import optimal_gain
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
@@ -71,6 +71,22 @@ def test_steps_come_in_order(arm, expected):
     assert calls == expected and list(report["seconds"].keys()) == expected
     assert found.episodes_done == 1
     assert ("J_p" in report) == (arm != "model_free") and ("critic_loss" in report) == (arm != "model_based")
+
+
+def test_a_printed_report_shows_costs_roles_and_event():
+    report = twinning().episode()
+    numbers = {
+        key: f"{report[key].item():.4g}"
+        for key in ("real_cost", "J_p", "J_p_before", "J_a_model_based", "J_a_model_free")
+    }
+    assert str(report).splitlines() == [
+        f"real episode: J_a {numbers['real_cost']}, flown by model_free",
+        f"twin: J_p {numbers['J_p']}, {numbers['J_p_before']} before assimilation",
+        f"J_a on the twin: model_based {numbers['J_a_model_based']}, model_free {numbers['J_a_model_free']}",
+        f"event: {report['event']}",
+    ]
+    alone = str(twinning(arm="model_based").episode()).splitlines()
+    assert alone[0].endswith("flown by model_based") and len(alone) == 2
 
 
 def test_arms_touch_their_own_half_alone():

@@ -4,7 +4,7 @@ import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
-from test_ddpg import optimal_gain
+from test_optimal_gain import optimal_gain
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune

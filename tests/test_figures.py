@@ -45,8 +45,7 @@ def trained(plant, *, arm="twinning", episodes=2) -> Snapshot:
     policies = {"model_free": policy, "model_based": copy.deepcopy(policy)}
     twinning = ReinforcementTwinning(PlantEnv(plant), twin, **policies, config=config, generator=generator)
     for _ in range(episodes):
-        live = twinning.referee.live
-        reports.append(episode_record(twinning.episode(), episode=len(reports), live=live))
+        reports.append(episode_record(twinning.episode(), episode=len(reports)))
     return Snapshot.take(twinning, initial, reports)
 
 
@@ -196,6 +195,9 @@ def test_learning_curves_timeline_and_events(oscillator):
     control, identification, strip = figure.axes
     assert list(line(control, "real system, live").get_ydata()) == [4.0, 3.0, 2.0, 1.0]
     assert control.get_yscale() == identification.get_yscale() == "log"
+    # J_a spans less than a decade and J_p spans three.
+    assert control.yaxis.get_minor_formatter()(3.0) == control.yaxis.get_major_formatter()(3.0) == "3"
+    assert "10^" in identification.yaxis.get_major_formatter()(0.01)
     # An event closes its episode.
     assert [line(control, event).get_xdata()[0] for event in ("swap", "clone")] == [1.5, 2.5]
     spans = [

@@ -161,7 +161,7 @@ def test_evidence_predicts_the_cost_of_the_flight_itself():
     found.interact()
     found.policies["model_free"].load_state_dict({"gain": torch.tensor([[0.9, 1.2]], dtype=torch.float64)})
     found.interact()
-    real, predicted = found.track_record.real_costs, found.track_record.predicted_costs(found.twin)
+    real, predicted = found.track_record.real_costs, found.track_record.predicted_costs(found.virtual)
     assert len(real) == 2 and real[0] != real[1]
     assert predicted == pytest.approx(real, rel=1e-12)
     evidence = Evidence(

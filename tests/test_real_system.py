@@ -285,9 +285,3 @@ def test_units_that_are_no_numbers_are_refused(kind, argument, value):
 def test_a_constant_input_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match=r"exogenous=\(nan,\)"):
         connected(LinearQuadratic(), exogenous=(float("nan"),))
-
-
-@pytest.mark.parametrize("options", [{"noise": 0.1}, {"reference": True}])
-def test_options_of_a_simulation_are_refused(options, tmp_path):
-    with pytest.raises(ValueError, match="real system"):
-        run_on(connected(LinearQuadratic(horizon=2.0)), tmp_path, **options)

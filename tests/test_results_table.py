@@ -1,5 +1,10 @@
 """The closure's weights on the terminal."""
 
+import pytest
+import torch
+
+from rt_torchrl.envs.pendulum.models import UniformRod
+from rt_torchrl.plants.closures import described_weights
 from rt_torchrl.runs.results_table import closure_lines
 
 
@@ -11,3 +16,20 @@ def test_true_weights_are_shown_where_they_are_known():
         assert shown == [["closure", "weight", "start", "found"], *bare]
     shown = [line.split() for line in closure_lines(closure | {"true": {"a": 1.25}})]
     assert shown[0][-1] == "true" and [line[-1] for line in shown[1:]] == ["1.25", "-"]
+
+
+def test_units_and_meanings_are_shown_where_the_closure_states_them():
+    described = described_weights(UniformRod.guess(0.5))
+    closure = {"start": {"mass": 0.5, "length": 0.5}, "found": {"mass": 1.0, "length": 0.75}, "described": described}
+    shown = closure_lines(closure)
+    assert shown[1].split() == ["mass", "[kg]", "0.5", "1", "mass", "of", "the", "rod"]
+    assert shown[2].split() == ["length", "[m]", "0.5", "0.75", "length", "of", "the", "rod"]
+    assert described_weights(torch.nn.Linear(1, 1)) == {}
+
+
+def test_a_meaning_without_a_coefficient_is_refused():
+    class Misspelt(UniformRod):
+        meanings = {"mas": "mass of the rod"}
+
+    with pytest.raises(ValueError, match="meanings of Misspelt describes mas, which names lacks"):
+        Misspelt.guess(1.0)

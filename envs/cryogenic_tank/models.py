@@ -25,6 +25,11 @@ class ConstantCoefficients(PositiveCoefficients):
     """
 
     names = {"U_s": "W/(m² K)", "U_HX": "W/(m² K)", "K_JT": "Pa s²/kg²"}
+    meanings = {
+        "U_s": "heat transfer from wall to fluid",
+        "U_HX": "heat transfer in the exchanger",
+        "K_JT": "pressure drop of the valve over flow²",
+    }
     true_coefficients = (50.0, 75.0, 500e9)  # paper, section 5.3
     guessed_coefficients = (1.0, 1.0, 10e9)  # where the paper's twin starts, w_p⁰ = [1, 1, 10]
 

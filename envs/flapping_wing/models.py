@@ -33,6 +33,7 @@ class QuasiSteadyPolar(PositiveCoefficients):
     """
 
     names = {"a": "-", "b": "-", "c": "-"}
+    meanings = {"a": "C_L at 45 deg", "b": "C_D at 0 deg", "c": "C_D at 45 deg, less b"}
     true_coefficients = (1.71, 0.043, 1.595)
 
     @classmethod

@@ -23,6 +23,7 @@ class UniformRod(PositiveCoefficients):
     """
 
     names = {"mass": "kg", "length": "m"}
+    meanings = {"mass": "mass of the rod", "length": "length of the rod"}
     true_coefficients = (1.0, 1.0)
 
     @classmethod

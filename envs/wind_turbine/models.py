@@ -8,7 +8,20 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 DATA = Path(__file__).parent / "data"
-NAMES = ("c1", "c2", "c3", "c4", "c5", "c6", "c7", "c8", "c9", "c10", "x")
+MEANINGS = {
+    "c1": "factor of the exponential term of C_p",
+    "c2": "factor of 1/ξ in this term",
+    "c3": "factor of β in this term",
+    "c4": "factor of ξβ in this term",
+    "c5": "factor of β^x in this term",
+    "c6": "constant in this term",
+    "c7": "factor of 1/ξ in the exponent",
+    "c8": "factor of λ in C_p",
+    "c9": "factor of β in 1/ξ",
+    "c10": "factor of 1/(β³ + 1) in 1/ξ",
+    "x": "exponent of β",
+}
+NAMES = tuple(MEANINGS)
 
 
 class SaintDrenan(nn.Module):
@@ -36,6 +49,9 @@ class SaintDrenan(nn.Module):
     # Typical sizes of c1 ... c10: steps of this size change C_p by some hundredths near the optimum.
     scales = (0.1, 10.0, 0.1, 0.01, 0.01, 1.0, 2.0, 0.01, 0.05, 0.01)
     smallest_pitch = 0.01  # ε [deg]
+    # In 1/ξ the law adds numbers and β in degrees, so that the units of the other coefficients are those of the fit.
+    names = dict.fromkeys(NAMES, "-") | {"c3": "1/deg", "c4": "1/deg", "c5": "1/deg^x", "c9": "1/deg"}
+    meanings = MEANINGS
 
     scale: Tensor
     fixed: Tensor

@@ -23,7 +23,7 @@ from rt_torchrl.figures.style import (
     panels,
     role_name,
 )
-from rt_torchrl.plants.closures import named_weights
+from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.twinning.referees import Role
 
 CONTROL: dict[str, dict[str, Any]] = {
@@ -103,17 +103,18 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
     Args:
         snapshot: snapshot whose episodes report ``closure``, see :func:`tracked_weights`.
         labels: label with unit, and factor from the coefficient to that unit, by the coefficient's name; by default the
-            name is the label.
+            name with the unit that the closure states is the label.
     """
     columns = tracked_weights(snapshot.episodes)
     true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
     true = true if snapshot.known else {}
+    units = {name: about["unit"] for name, about in described_weights(snapshot.initial_closure).items()}
     wide = min(3, len(columns))
     rows = -(-len(columns) // wide)
     size = (0.6 + 3.6 * wide, 1.3 + 2.6 * rows)
     figure, axes = panels(rows, wide, title="Closure weights of the twin over the episodes", size=size, sharex=True)
     for ax, (name, found) in zip(axes.flat, columns.items(), strict=False):
-        label, factor = (labels or {}).get(name, (name.replace("_", " "), 1.0))
+        label, factor = (labels or {}).get(name, (_label(name, units.get(name)), 1.0))
         ax.plot(np.arange(len(found)), factor * found, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
         if name in start:
             ax.axhline(factor * start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
@@ -133,6 +134,12 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
     axes[0, 0].set_xlim(-0.5, len(snapshot.episodes) - 0.5)
     legend_below(figure, axes.flat[: len(columns)].tolist())
     return figure
+
+
+def _label(name: str, unit: str | None) -> str:
+    """The label of a panel: the name of a weight, with its unit if there is one."""
+    words = name.replace("_", " ")
+    return words if unit in (None, "-") else f"{words} [{unit}]"
 
 
 def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarray, " episodes"]]:
@@ -179,8 +186,13 @@ def _logarithmic(ax: Axes, least_range: float = 1.0) -> bool:
     if values.size == 0 or values.min() <= 0.0 or values.max() < least_range * values.min():
         return False
     ax.set_yscale("log")
-    # An axis of about a decade needs numbers between the powers of ten.
-    ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
+    if values.max() < 10.0 * values.min():
+        # Within a decade 4, 5, 6 read better than multiples of a power of ten.
+        for set_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+            set_formatter(StrMethodFormatter("{x:g}"))
+    else:
+        # An axis of about a decade needs numbers between the powers of ten.
+        ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.4)))
     ax.grid(True, which="minor", axis="y", color="0.95", linewidth=0.5)
     ax.tick_params(which="minor", labelsize=8)
     return True

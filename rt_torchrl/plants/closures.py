@@ -1,7 +1,7 @@
 """Closures of general use: any ``closure(features) -> coefficients`` can replace a plant's own."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -20,11 +20,14 @@ class PositiveCoefficients(nn.Module):
         coefficients: values of the coefficients, in the order and the units of ``names``.
 
     Raises:
-        ValueError: if the number of coefficients is wrong, or one of them is not positive and finite.
+        ValueError: if the number of coefficients is wrong, one of them is not positive and finite, or a meaning is
+            given for a coefficient that does not exist.
     """
 
     names: dict[str, str]
     """Unit of each coefficient, by name."""
+    meanings: dict[str, str] = {}
+    """What each coefficient is, in a few words, by name; tables of results show it."""
     true_coefficients: tuple[float, ...]
     """Coefficients of the real system."""
 
@@ -37,6 +40,12 @@ class PositiveCoefficients(nn.Module):
             raise ValueError(
                 f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and finite; "
                 f"those of the real system are {self.true_coefficients}."
+            )
+        unknown = self.meanings.keys() - self.names.keys()
+        if unknown:
+            raise ValueError(
+                f"meanings of {type(self).__name__} describes {', '.join(sorted(unknown))}, which names lacks; its "
+                f"coefficients are {', '.join(self.names)}."
             )
         self.log_coefficients = nn.Parameter(coefficients.log())
 
@@ -98,6 +107,23 @@ class BoundedPerceptron(nn.Module):
 
     def forward(self, features: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         return self.bound * torch.tanh(self.network((features - self.middle) / self.half_range))
+
+
+@runtime_checkable
+class DescribedCoefficients(Protocol):
+    """A closure that says what its coefficients are."""
+
+    names: dict[str, str]
+    """Unit of each coefficient, by name."""
+    meanings: dict[str, str]
+    """What each coefficient is, in a few words, by name; some may be missing."""
+
+
+def described_weights(closure: nn.Module) -> dict[str, dict[str, str]]:
+    """``unit`` and ``meaning`` of each coefficient, by name; none of a closure that does not say what they are."""
+    if not isinstance(closure, DescribedCoefficients):
+        return {}
+    return {name: {"unit": unit, "meaning": closure.meanings.get(name, "")} for name, unit in closure.names.items()}
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, mean_with_confidence
-from rt_torchrl.plants.closures import named_weights
+from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.referees import Role
@@ -18,15 +18,14 @@ from rt_torchrl.twinning.referees import Role
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
 
-def episode_record(found: TensorDict, *, episode: int, live: str) -> dict[str, Any]:
+def episode_record(found: TensorDict, *, episode: int) -> dict[str, Any]:
     """One entry of ``episodes`` in ``metrics.json``, in plain numbers.
 
     Args:
         found: return value of :meth:`ReinforcementTwinning.episode`.
         episode: number of the episode, from 0.
-        live: role that acted on the real system in this episode.
     """
-    record: dict[str, Any] = {"episode": episode, "live": live, "event": "keep"}
+    record: dict[str, Any] = {"episode": episode, "event": "keep"}
     for key in found.keys():  # noqa: SIM118  (a TensorDict iterates over its batch; items() wraps what is no tensor)
         value = found[key]
         if key == "seconds":
@@ -84,7 +83,8 @@ def summarise(
         "live": live,
         "better": better,
         "better_chosen_on": chosen_on,
-        "closure": {name: named_weights(law) for name, law in laws.items() if law is not None},
+        "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
+        | {"described": described_weights(closure)},
         "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "seconds": seconds_per_step(episodes),
     }

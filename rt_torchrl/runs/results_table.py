@@ -85,12 +85,19 @@ def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def closure_lines(closure: dict[str, Any]) -> list[str]:
-    """Lines with the closure's weights at the start and as found, and the true weights of the same names, if any."""
+    """Lines with the closure's weights at the start and as found, with units and meanings that the closure states.
+
+    The true weights of the same names are shown, if there are any.
+    """
     if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
         return []
     true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
+    described = closure.get("described", {})  # runs of 0.1.0 have none
     lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'true':>12}" if true else "")]
     for name, value in closure["found"].items():
         weights = [closure["start"][name], value, *([true.get(name)] if true else [])]
-        lines.append(f"  {name:<22}" + "".join(f"{_number(weight, '.5g'):>12}" for weight in weights))
+        about = described.get(name, {"unit": "", "meaning": ""})
+        label = f"{name} [{about['unit']}]" if about["unit"] else name
+        shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)
+        lines.append(f"  {label:<22}{shown}   {about['meaning']}".rstrip())
     return lines

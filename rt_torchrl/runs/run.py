@@ -186,8 +186,7 @@ class Run:
                 bar.write(f"interrupted: going on with the {len(self.episodes)} episodes done (again to end at once)")
 
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
-        live = self.algorithm.referee.live
-        record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes), live=live)
+        record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
         record["closure"] = named_weights(self.algorithm.twin.closure)
         every = self.config.unseen_every
         if every and (len(self.episodes) + 1) % every == 0:
@@ -263,17 +262,21 @@ def judged_on(
 def require_simulation(
     config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
 ) -> None:
-    """Refuse options that only a plant in simulation can carry out, if there is a real system.
+    """Refuse options that only a plant in simulation can carry out, and controllers that need the other kind of system.
 
     Raises:
-        ValueError: if there is such an option; it names it.
+        ValueError: if there is such an option or controller; it names it.
     """
-    if env is None:
-        return
-    if config.noise or config.wear(plant) is not None:
+    if env is not None and (config.noise or config.wear(plant) is not None):
         raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
-    on_the_plant = [name for name, law in (baselines or {}).items() if not issubclass(law, RealController)]
-    if env.closure is None and (config.reference or on_the_plant):
+    real = [name for name, law in (baselines or {}).items() if issubclass(law, RealController)]
+    on_the_plant = [name for name in baselines or {} if name not in real]
+    if real and (env is None or env.closure is not None):
+        raise ValueError(
+            f"baselines {real} can only be flown on a real system, and this run judges on the plant in simulation. "
+            "Give ClassicalController classes, or a RealSystem without its closure."
+        )
+    if env is not None and env.closure is None and (config.reference or on_the_plant):
         raise ValueError(
             f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "
             "and the real system's is not known; leave them out, or give the RealSystem its closure."

@@ -24,7 +24,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.findings import findings, merged, weight_change, weight_vector
+from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
@@ -86,14 +86,14 @@ class ReinforcementTwinning:
         self.episodes_done = 0
         self._earlier_closure: dict[str, Any] | None = None
 
-    def episode(self, tell: Callable[[str], None] = lambda step: None) -> TensorDict:
+    def episode(self, tell: Callable[[str], None] = lambda step: None) -> EpisodeReport:
         """Fly one real episode and learn from it: the six steps of the paper, in order.
 
         Args:
             tell: function that is called with the name of every step when the step begins.
 
         Returns:
-            ``real_cost``, the reports of the steps of this arm, and the ``seconds`` of each step.
+            ``real_cost``, ``live``, what the steps of this arm report, and the ``seconds`` of each step.
         """
         arm, report, seconds = self.config.arm, findings(), {}
         steps = [self.interact]
@@ -107,7 +107,7 @@ class ReinforcementTwinning:
             merged(report, self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
-        return report.update({"seconds": findings(**seconds)})
+        return EpisodeReport(report.update({"seconds": findings(**seconds)}))
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
@@ -132,7 +132,9 @@ class ReinforcementTwinning:
         reward = episode["next", "reward"].mean()
         self.short_term.append(record)
         self.track_record.append(record, live, -reward.item())
-        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength).set_non_tensor(
+            "live", live
+        )
         if refused:
             report.update(findings(episodes_refused=float(len(refused)))).set_non_tensor("refusal", "; ".join(refused))
         return report
@@ -220,7 +222,7 @@ class ReinforcementTwinning:
             idle_cost=costs[idle].item(),
             idle_weight_change=change.item(),
             real_costs=self.track_record.real_costs,
-            predicted_costs=lambda: self.track_record.predicted_costs(self.twin),
+            predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
         )
         event = self.referee.decide(evidence)
         diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]

@@ -18,9 +18,9 @@ class Cloning:
     """Copies weights between policies of the same architecture, and distils one into another architecture.
 
     Args:
-        virtual: flies the policies.
-        config: of the distillation.
-        count: virtual episodes that a distillation draws at a time.
+        virtual: virtual episodes, on which clones are trained and judged.
+        config: parameters of the distillation.
+        count: number of virtual episodes that a distillation draws at a time.
     """
 
     def __init__(self, virtual: VirtualEpisodes, config: DistillationConfig, count: int):
@@ -42,14 +42,14 @@ class Cloning:
         Args:
             live: the policy that is cloned; it is not changed.
             idle: the policy that becomes the clone.
-            seen: gives the observations of the real system.
-            costs: mean J_a of ``live`` and of ``idle`` over ``judged_on``.
+            seen: function that gives observations of the real system; a copy of weights does not call it.
+            costs: mean J_a of ``live`` and of ``idle`` over the episodes of ``judged_on``.
             judged_on: virtual episodes on which the clone is judged.
-            worse: the referee's question.
+            worse: function that says whether the first of two mean J_a is worse than the second one.
 
         Returns:
-            Nothing of a copy; ``distillation_error`` and ``distillation_cost_ratio`` of a distillation. A clone that is
-            refused is the event ``keep`` with its ``reason``.
+            A report, which is empty after a copy of weights. After a distillation it holds ``distillation_error`` and
+            ``distillation_cost_ratio``; if the clone is refused, the event is ``keep``, and ``reason`` says why.
         """
         if same_architecture(live, idle):
             idle.load_state_dict(live.state_dict())

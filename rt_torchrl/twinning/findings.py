@@ -1,4 +1,4 @@
-"""The report of an episode: scalars by name, the event, and the reasons for refusals."""
+"""The report of an episode: scalars by name, the policy that acted, the event, and the reasons for refusals."""
 
 from functools import partial
 
@@ -25,6 +25,20 @@ def merged(report: TensorDict, other: TensorDict) -> TensorDict:
     reasons = [part["reason"] for part in (report, other) if "reason" in part]
     report.update(other)
     return report.set_non_tensor("reason", "; ".join(reasons)) if reasons else report
+
+
+class EpisodeReport(TensorDict):
+    """The report of a whole episode; printed, it is a few lines about costs, the live policy and the event."""
+
+    def __repr__(self) -> str:
+        real = f"J_a {self['real_cost']:.4g}" if "real_cost" in self else "no real episode"
+        lines = [f"real episode: {real}" + (f", flown by {self['live']}" if "live" in self else "")]
+        if "J_p" in self:
+            lines.append(f"twin: J_p {self['J_p']:.4g}, {self['J_p_before']:.4g} before assimilation")
+        costs = [f"{key[4:]} {self[key]:.4g}" for key in ("J_a_model_based", "J_a_model_free") if key in self]
+        lines += [f"J_a on the twin: {', '.join(costs)}"] if costs else []
+        lines += [f"{key}: {self[key]}" for key in ("event", "reason", "refusal") if key in self]
+        return "\n".join(lines)
 
 
 def weight_vector(module: nn.Module) -> Tensor:

@@ -5,13 +5,11 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor, nn
 
-from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.referees import Role
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 COMPARED = 2
 """Number of episodes that are kept; a change of the cost takes two."""
@@ -47,12 +45,14 @@ class TrackRecord:
         """J_a of the episodes, as measured."""
         return tuple(flown.cost for flown in self._flown)
 
-    def predicted_costs(self, twin: DigitalTwin) -> tuple[float, ...]:
+    def predicted_costs(self, virtual: VirtualEpisodes) -> tuple[float, ...]:
         """J_a of the same episodes on the twin, flown with the same weights from the same state under the same inputs.
 
         It is infinite for an episode in which the twin diverges.
         """
-        return tuple(self._predicted(twin, flown) for flown in self._flown)
+        starts = (Scenario(flown.trajectory.states[:1], flown.trajectory.exogenous[None]) for flown in self._flown)
+        pairs = zip(self._flown, starts, strict=True)
+        return tuple(virtual.cost(self._policy(flown), start).item() for flown, start in pairs)
 
     def policy_flown(self) -> nn.Module:
         """The policy that has flown the latest episode, with the weights that it had in it."""
@@ -62,14 +62,6 @@ class TrackRecord:
         policy = copy.deepcopy(self._policies[flown.role])
         policy.load_state_dict(flown.weights)
         return policy
-
-    @torch.no_grad()
-    def _predicted(self, twin: DigitalTwin, flown: Flown) -> float:
-        trajectory = flown.trajectory
-        try:
-            return twin.cost(self._policy(flown), trajectory.states[:1], trajectory.exogenous[None]).item()
-        except DivergenceError:
-            return float("inf")
 
     def state_dict(self) -> dict[str, Any]:
         return {"flown": [flown._asdict() | {"trajectory": flown.trajectory._asdict()} for flown in self._flown]}
