@@ -223,7 +223,7 @@ def polars(snapshot: Snapshot) -> Figure:
 def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     """(sin α_e, cos α_e) in the last real flight, at the blade element nearest to ``SPAN_SHARE`` of the span."""
     plant = cast(FlappingWing, snapshot.plant)
-    element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
+    element = (plant.wings.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
     return features_of(plant, snapshot.record)[:, element]
 
 

@@ -3,7 +3,6 @@ r"""The flapping-wing micro air vehicle as a plant: a point mass under two beati
 import math
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -12,6 +11,7 @@ from rt_torchrl.envs.flapping_wing import merit as judgement
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
+from rt_torchrl.envs.flapping_wing.wings import Wings
 from rt_torchrl.plants.plant import Plant, require_stable_step
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
@@ -103,8 +103,6 @@ class FlappingWing(Plant):
     error_scale: Tensor
     mass: Tensor
     weight: Tensor
-    radius: Tensor
-    strip_mass: Tensor
 
     def __init__(
         self,
@@ -135,21 +133,15 @@ class FlappingWing(Plant):
         self.register_buffer("error_scale", torch.tensor(self.observation_scale, dtype=torch.float64))
         self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor([0.0, -mass * self.gravity], dtype=torch.float64))
-        self._place_blade_elements()
+        self.wings = Wings(
+            root=self.wing_root,
+            length=self.wing_length,
+            mean_chord=self.mean_chord,
+            nodes=self.span_nodes,
+            air_density=self.air_density,
+            smallest_airspeed=self.smallest_airspeed,
+        )
         self._require_resolved_step()
-
-    def _place_blade_elements(self) -> None:
-        r"""Nodes r_j and weights ρ c(r_j) dr_j of both wings.
-
-        With r = R_0 + R sin θ the quarter ellipse c(r) = (4c̄/π)√(1 − ((r − R_0)/R)²) is (4c̄/π) cos θ, and c dr is
-        (4c̄R/π) cos²θ dθ. It is smooth up to the tip, where c(r) itself has an infinite slope: six Gauss nodes suffice.
-        """
-        nodes, weights = np.polynomial.legendre.leggauss(self.span_nodes)
-        theta = torch.from_numpy(0.25 * math.pi * (nodes + 1.0))
-        area = 4.0 * self.mean_chord * self.wing_length / math.pi * theta.cos() ** 2
-        self.register_buffer("radius", self.wing_root + self.wing_length * theta.sin())  # r_j [m]
-        # The two wings have ½ρ c dr each.
-        self.register_buffer("strip_mass", self.air_density * area * 0.25 * math.pi * torch.from_numpy(weights))
 
     def _require_resolved_step(self) -> None:
         longest = 1.0 / (self.least_steps_per_beat * self.frequency)
@@ -214,7 +206,7 @@ class FlappingWing(Plant):
         r"""Forces F_x and F_z [N] of wings and body, which move at ``relative`` [m/s] to the air.
 
         R_2(β_w) turns the velocity into the stroke frame and R_3(φ) into the flapping frame; their transposes turn the
-        force back. The lateral forces of the two wings cancel.
+        force back. The lateral forces of the two :class:`Wings` cancel.
 
         Note: the paper turns [ẋ, ẏ, 0]; here it is [ẋ + u_∞, 0, ż], because the motion is in the plane (x, z).
         """
@@ -227,37 +219,10 @@ class FlappingWing(Plant):
         sin_beta, cos_beta = torch.sin(beta_w), torch.cos(beta_w)
         v_x, v_z = relative.unbind(-1)
         stroke_x, stroke_z = cos_beta * v_x + sin_beta * v_z, cos_beta * v_z - sin_beta * v_x
-        F_x, F_z = self._wing_force(cos_phi * stroke_x, stroke_z, phi_dot, alpha, closure)
+        F_x, F_z = self.wings.force(cos_phi * stroke_x, stroke_z, phi_dot, alpha, closure)
         wings = torch.stack([cos_beta * cos_phi * F_x - sin_beta * F_z, sin_beta * cos_phi * F_x + cos_beta * F_z], -1)
         speed = torch.sqrt(v_x**2 + v_z**2 + self.smallest_airspeed**2).unsqueeze(-1)
         return wings - 0.5 * self.air_density * self.body_drag_area * speed * relative
-
-    def _wing_force(
-        self, v_x: Tensor, v_z: Tensor, phi_dot: Tensor, alpha: Tensor, closure: nn.Module
-    ) -> tuple[Tensor, Tensor]:
-        r"""Forces F_x and F_z [N] of both wings in the flapping frame, paper eqs. (drone_eq_lift) to (drone_eq_Cdrag).
-
-        .. math::
-            \begin{pmatrix}F_x\\F_z\end{pmatrix} = \int\rho\,c(r)\,|U|\left[-C_D\begin{pmatrix}U_x\\U_z\end{pmatrix}
-            + C_L\begin{pmatrix}-U_z\\U_x\end{pmatrix}\right]dr, \quad U_x = v_x - \dot\phi r,\; U_z = v_z
-
-        Only the coefficients need the wing frame, (U_ξ, U_ζ) = R_2(α)(U_x, U_z): in every frame drag lies along the
-        velocity and lift a quarter turn ahead of it. The flow along the span carries no force and is dropped.
-
-        Note: the paper prints R_2(α) with the sign of R_2(β_w); here it has the opposite sign, [[cos, −sin], [sin,
-        cos]] in (x, z), because with the printed sign the lift points downwards on both half-strokes.
-        Note: |U| is √(U_x² + U_z² + ε²), which keeps direction and slope finite where the wing meets still air.
-        """
-        U_x, U_z = v_x.unsqueeze(-1) - phi_dot.unsqueeze(-1) * self.radius, v_z.unsqueeze(-1)
-        sin_alpha, cos_alpha = torch.sin(alpha).unsqueeze(-1), torch.cos(alpha).unsqueeze(-1)
-        U_xi, U_zeta = cos_alpha * U_x - sin_alpha * U_z, sin_alpha * U_x + cos_alpha * U_z
-        speed = torch.sqrt(U_x**2 + U_z**2 + self.smallest_airspeed**2)
-        C_L, C_D = closure(torch.stack([U_xi / speed, U_zeta / speed], -1)).unbind(-1)
-        pressure = self.strip_mass * speed
-        return (
-            -(pressure * (C_D * U_x + C_L * U_z)).sum(-1),
-            (pressure * (C_L * U_x - C_D * U_z)).sum(-1),
-        )
 
     # The control problem
 

@@ -99,8 +99,7 @@ def check_plant(
     found = list(signals(plant)) or list(attempt(draws, plant, seed)) + list(attempt(modules, plant, seed))
     checks = ON_FLIGHTS if traced else {name: check for name, check in ON_FLIGHTS.items() if check is not tracing}
     steps = min(steps, plant.n_steps)
-    if not found:
-        found = _on_flights(plant, episodes, steps, seed, checks.values())
+    found = found or _on_flights(plant, episodes, steps, seed, checks.values())
     if found:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
     return ContractReport(plant.name, ("signals", "draws", "closures and policy", *checks), episodes, steps, plant.dt)
