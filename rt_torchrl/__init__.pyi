@@ -16,7 +16,8 @@ from .systems.environment import PlantEnv
 from .systems.exploration import ExplorationConfig
 from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
-from .systems.safety import SafetyConfig, SafetyEvent, SafetyLayer, SafetyReport
+from .systems.safety import SafetyConfig, SafetyLayer
+from .systems.safety_report import SafetyEvent, SafetyReport
 from .evaluation.baseline import RealController
 
 # Trajectories and the twin

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from rt_torchrl.identification.identification import IdentificationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.systems.safety import SafetyConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
@@ -95,6 +98,9 @@ CONFIGS = {
         "reward_scale": math.inf,
     },
     ShortHorizonConfig: {"window": math.nan, "policy_rate": math.inf, "critic_hidden": (0,), "critic_iterations": 0.5},
+    ExplorationConfig: {"spread": "0.2", "episodes": 2.5, "correlation_time": math.inf},
+    SafetyConfig: {"interval": "0.5"},
+    partial(SafetyConfig, interval=0.5): {"deadline": "0.4", "hold": math.nan, "patience": True},
     TwinningConfig: {"arm": "modelfree", "records": math.nan, "realisations": math.inf, "virtual_episodes": 2.5},
 }
 

@@ -250,10 +250,10 @@ def test_what_the_layer_does_not_have_is_the_systems():
         ({"rest": (0.0, 0.0)}, "rest"),
         ({"rest": (9.0,), "rates": (10.0,)}, r"rest=\(9.0,\) .*-2.0.* to .*2.0"),
         ({"rest": (1.5,), "high": (1.0,)}, r"rest=\(1.5,\)"),
-        ({"rest": (float("inf"),)}, r"rest=\(inf,\)"),
+        ({"rest": (float("inf"),)}, r"rest\[0\]=inf must be a finite number"),
         ({"fallback": (-2.5,)}, r"fallback=\(-2.5,\)"),
-        ({"low": (float("nan"),)}, r"low=\(nan,\)"),
-        ({"rates": (float("nan"),)}, r"rates=\(nan,\)"),
+        ({"low": (float("nan"),)}, r"low\[0\]=nan must be a number or infinite"),
+        ({"rates": (float("nan"),)}, r"rates\[0\]=nan must be a number or infinite"),
         ({"deadline": 0.0}, "deadline=0.0"),
         ({"deadline": float("nan")}, "deadline=nan"),
         ({"hold": -1.0}, "hold=-1.0"),
@@ -268,6 +268,13 @@ def test_what_the_layer_does_not_have_is_the_systems():
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         layer(**options)
+
+
+@pytest.mark.parametrize("option", ["low", "high", "rates"])
+def test_infinity_leaves_a_limit_out(option):
+    limit = (-float("inf"),) if option == "low" else (float("inf"),)
+    given = {option: limit, "deadline": float("inf"), "hold": float("inf"), "patience": float("inf")}
+    assert applied(fly(layer(**given), [1.5, -1.5] * 10)) == [1.5, -1.5] * 10
 
 
 def test_what_cannot_be_guarded_is_refused():

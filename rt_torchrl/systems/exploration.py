@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 
@@ -29,7 +30,7 @@ class ExplorationConfig:
             the paper.
 
     Raises:
-        ValueError: if a number is negative or not finite.
+        ValueError: if an option is not a number of its type, is negative or not finite.
     """
 
     spread: float = 0.2
@@ -37,11 +38,10 @@ class ExplorationConfig:
     correlation_time: float = 0.0
 
     def __post_init__(self) -> None:
+        check_options(self)
         for argument in ("spread", "episodes", "correlation_time"):
-            if not 0 <= getattr(self, argument) < math.inf:
-                raise ValueError(
-                    f"{argument}={getattr(self, argument)} of the exploration must be finite and not negative."
-                )
+            if not getattr(self, argument) >= 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the exploration must not be negative.")
 
     def strength(self, episode: int) -> float:
         """ξ of an episode, counted from 0."""

@@ -214,3 +214,8 @@ class RealSystem(EnvBase):
         found |= {} if applied is None else {"applied": applied}
         found |= {"refused": self._reported["refused"].reshape(1, 1)} if self._judged else {}
         return TensorDict(found, batch_size=self.batch_size, device=self.device)
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the environment too, such as its simulator or its connection."""
+        self.env.close(**kwargs)
+        super().close(**kwargs)

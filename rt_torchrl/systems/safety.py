@@ -1,13 +1,11 @@
 """A safety layer between a policy and a real system: limits on what is sent, a watchdog on what comes back."""
 
-import json
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +13,9 @@ from torch import Tensor
 from torchrl.data import Binary, Unbounded
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import check_options
 from rt_torchrl.systems.action_limits import ActionLimits
+from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
 from rt_torchrl.systems.watchdog import Range, Watchdog
 
 WRONG = frozenset({"not finite", "out of range"})
@@ -42,6 +42,9 @@ class SafetyConfig:
             same episode.
         patience: time of uninterrupted fallback after which the episode is truncated [s].
         log: file to which every event is appended, as one JSON object per line.
+
+    Raises:
+        ValueError: if an option is not a number of its type, or the interval is not positive and finite.
     """
 
     interval: float
@@ -56,40 +59,9 @@ class SafetyConfig:
     log: Path | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.interval < math.inf:
-            raise ValueError(f"interval={self.interval} s must be positive and finite: the system's control interval.")
-
-
-class SafetyEvent(NamedTuple):
-    """One control interval in which the layer acted or saw a fault.
-
-    ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
-    policy's action was not finite, and ``fallback`` that the fallback acted. ``not finite``, ``out of range`` and
-    ``late`` are faults of the observation at the end of the interval. ``truncated`` says that the layer ended the
-    episode.
-    """
-
-    episode: int
-    step: int
-    time: float  # start of the interval, counted from the start of the episode [s]
-    reasons: dict[str, str]
-    asked: list[float]
-    applied: list[float]
-
-    def line(self) -> str:
-        """The event as one line of JSON, with null for every number that is not finite."""
-        entry = self._asdict()
-        for key in ("asked", "applied"):
-            entry[key] = [value if math.isfinite(value) else None for value in entry[key]]
-        return json.dumps(entry)
-
-
-@dataclass
-class SafetyReport:
-    """Events of one episode, and the number of intervals in which each reason occurred."""
-
-    events: list[SafetyEvent] = field(default_factory=list)
-    counts: Counter[str] = field(default_factory=Counter)
+        check_options(self, infinite=("low", "high", "rates", "deadline", "hold", "patience"))
+        if not self.interval > 0.0:
+            raise ValueError(f"interval={self.interval} s must be positive: the system's control interval.")
 
 
 class SafetyLayer(EnvBase):
@@ -293,3 +265,8 @@ class SafetyLayer(EnvBase):
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.env.load_state_dict(state, *args, **kwargs)
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the system too, such as its connection or its window."""
+        self.env.close(**kwargs)
+        super().close(**kwargs)

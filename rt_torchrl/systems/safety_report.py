@@ -1,0 +1,39 @@
+"""What a safety layer did, interval by interval."""
+
+import json
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+
+class SafetyEvent(NamedTuple):
+    """One control interval in which the layer acted or saw a fault.
+
+    ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
+    policy's action was not finite, and ``fallback`` that the fallback acted. ``not finite``, ``out of range`` and
+    ``late`` are faults of the observation at the end of the interval. ``truncated`` says that the layer ended the
+    episode.
+    """
+
+    episode: int
+    step: int
+    time: float  # start of the interval, counted from the start of the episode [s]
+    reasons: dict[str, str]
+    asked: list[float]
+    applied: list[float]
+
+    def line(self) -> str:
+        """The event as one line of JSON, with null for every number that is not finite."""
+        entry = self._asdict()
+        for key in ("asked", "applied"):
+            entry[key] = [value if math.isfinite(value) else None for value in entry[key]]
+        return json.dumps(entry)
+
+
+@dataclass
+class SafetyReport:
+    """Events of one episode, and the number of intervals in which each reason occurred."""
+
+    events: list[SafetyEvent] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
