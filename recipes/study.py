@@ -1,6 +1,5 @@
 """The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
 
-import os
 import shutil
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +16,8 @@ from rt_torchrl.study import figures as charts
 from rt_torchrl.study.names import title
 from rt_torchrl.study.report import CaptionedFigure
 from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
-from rt_torchrl.study.scheduling import Task, side_by_side
+from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.task import Task
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
 from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, cost_over_episodes, oracle
 
@@ -67,8 +67,10 @@ class Config:
         plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
         seeds: number of trainings of every arm.
         variant_seeds: number of trainings of every arm under each sensor noise and model error; 0 leaves them out.
-        jobs: number of trainings side by side, one thread each; 0 means one for every core.
-        backend: backend of joblib; ray uses a Ray cluster and needs the extra ``ray``.
+        jobs: number of trainings side by side, one thread each; 0 means one for every core of the machine or cluster.
+        backend: loky trains on this machine; ray trains on a Ray cluster and needs the extra ``ray``.
+        ray_address: address of the Ray cluster, such as 10.0.0.1:6379. By default that of RAY_ADDRESS if it is set, or
+            else a cluster on this machine alone.
         unseen: number of unseen episodes that judge everything.
         folder: folder of the report and of all runs.
         quick: make the same report from one seed of short trainings, and mark it as quick.
@@ -79,6 +81,7 @@ class Config:
     variant_seeds: int = 1
     jobs: int = 0
     backend: Literal["loky", "ray"] = "loky"
+    ray_address: str | None = None
     unseen: int = 100
     folder: Path = Path("runs/study")
     quick: bool = False
@@ -169,7 +172,7 @@ def recipe_of(plant: str) -> Path:
 def compute(config: Config) -> None:
     """Compute everything that is not done yet, side by side, with one progress bar."""
     batches = short_batches(config) if config.quick else [[task] for task in ordered_tasks(config)]
-    side_by_side(batches, backend=config.backend, jobs=config.jobs or os.cpu_count() or 1)
+    side_by_side(batches, backend=config.backend, jobs=config.jobs, ray_address=config.ray_address)
 
 
 def ordered_tasks(config: Config) -> list[Task]:

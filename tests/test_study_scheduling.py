@@ -1,6 +1,7 @@
 """The study's tasks side by side: processes, progress and failures."""
 
 import os
+import sys
 import time
 
 import pytest
@@ -10,16 +11,11 @@ from rt_torchrl.study import scheduling
 from rt_torchrl.study.scheduling import side_by_side
 
 
-def computed(tmp_path, backend, jobs=2):
-    """What the study computes side by side from two trainings of a recipe that only writes results."""
+def test_trainings_run_side_by_side(tmp_path):
     script = written(tmp_path / "tiny.py", WRITE_RESULTS)
     trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
-    side_by_side([[task] for task in trainings], backend=backend, jobs=jobs)
-    return [t.metrics()["process"] for t in trainings]
-
-
-def test_trainings_run_side_by_side(tmp_path):
-    assert os.getpid() not in computed(tmp_path, "loky")
+    side_by_side([[task] for task in trainings], backend="loky", jobs=2)
+    assert os.getpid() not in [t.metrics()["process"] for t in trainings]
 
 
 class Counted:
@@ -69,10 +65,34 @@ def test_a_task_that_fails_stops_no_other(tmp_path):
     assert all(task.done() for task in others)
 
 
-def test_trainings_spread_over_ray(tmp_path):
-    ray = pytest.importorskip("ray")
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
-    try:
-        assert os.getpid() not in computed(tmp_path, "ray")
-    finally:
-        ray.shutdown()
+class Leaving(Counted):
+    """A task that ends the process, as a command line with an unknown option does."""
+
+    def run(self):
+        raise SystemExit(2)
+
+
+def test_a_task_that_leaves_stops_no_other(tmp_path):
+    other = Counted(tmp_path / "other")
+    with pytest.raises(RuntimeError, match=r"1 failed, the others are kept:\nSystemExit: 2"):
+        side_by_side([[Leaving(tmp_path / "leaving"), other]], backend="loky", jobs=1)
+    assert other.done()
+
+
+def test_a_backend_that_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match="backend='dask' does not exist; choose loky or ray"):
+        side_by_side([], backend="dask")
+
+
+def test_an_address_needs_the_backend_that_reads_it():
+    with pytest.raises(ValueError, match=r"ray_address='10.0.0.1:6379' needs backend='ray'; the backend is 'loky'"):
+        side_by_side([], backend="loky", ray_address="10.0.0.1:6379")
+
+
+def test_without_ray_its_extra_is_named(monkeypatch):
+    monkeypatch.delitem(sys.modules, "rt_torchrl.study.ray_workers", raising=False)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(
+        ValueError, match=r"backend='ray' needs Ray: install the extra, pip install 'rt_torchrl\[ray\]'"
+    ):
+        side_by_side([], backend="ray")

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import io
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +23,7 @@ from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, results
-from rt_torchrl.runs.atomic_file import finite, write_json
+from rt_torchrl.runs.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.progress import Progress
@@ -238,7 +239,9 @@ class Run:
         drawn = self._figures(snapshot) | {"unseen": figures.unseen(judged, self.unseen.categories())}
         (self.folder / "figures").mkdir(exist_ok=True)
         for name, figure in drawn.items():
-            figure.savefig(self.folder / "figures" / f"{name}.png", dpi=120)
+            drawing = io.BytesIO()
+            figure.savefig(drawing, dpi=120)
+            write_atomically(self.folder / "figures" / f"{name}.png", drawing.getvalue())
         dashboard.figures(drawn, len(self.episodes) - 1)
         if self.animate:
             self.animate(snapshot, self.folder / "figures" / "animation.gif")

@@ -77,6 +77,7 @@ class RunFolder:
         except OSError as error:
             raise ValueError(f"log_dir={self.path} cannot be locked ({error}); choose another folder.") from error
         remove_partials(self.path)
+        remove_partials(self.path / "figures")
 
     def release(self) -> None:
         """Let other trainings use the folder."""

@@ -1,72 +1,77 @@
 """The study's tasks side by side, with one progress bar."""
 
+import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, runtime_checkable
 
 from joblib import Parallel, delayed
 from tqdm import tqdm
+
+from rt_torchrl.study.task import Task, failure_of
 
 GLANCE = 1.0
 """Time between two looks at what is done [s]."""
 
 
-@runtime_checkable
-class Task(Protocol):
-    """A computation whose result is kept in a file."""
-
-    def run(self) -> Any:
-        """Compute the result, unless it is there."""
-
-    def done(self) -> bool:
-        """Whether the result is there."""
-
-
-def side_by_side(batches: Sequence[Sequence[Task]], *, backend: str, jobs: int) -> None:
-    """Run batches of tasks through joblib. The tasks of a batch run one after another in one process.
+def side_by_side(
+    batches: Sequence[Sequence[Task]], *, backend: str, jobs: int = 0, ray_address: str | None = None
+) -> None:
+    """Run batches of tasks in several processes. The tasks of a batch run one after another in one process.
 
     A task that fails stops no other task; the results of the others are kept.
 
     Args:
         batches: tasks of each batch.
-        backend: joblib's backend, loky or ray.
-        jobs: number of processes.
+        backend: ``loky`` for processes on this machine, ``ray`` for a Ray cluster. On a cluster another process does
+            the task again at which one has died.
+        jobs: number of processes; 0 means one for every core of the machine or of the cluster.
+        ray_address: address of the Ray cluster; see :func:`rt_torchrl.study.ray_workers.connected`.
 
     Raises:
-        ValueError: if the backend is Ray and Ray is not installed.
-        RuntimeError: after all tasks, if some failed; it repeats their errors.
+        ValueError: if the backend is unknown, is Ray and Ray is not installed, or an address is given for another one;
+            if no Ray cluster answers at the address.
+        RuntimeError: after all tasks, if some failed; it repeats their errors. Before all tasks, if no worker can be
+            started on the cluster.
     """
-    if backend == "ray":
-        try:
-            from ray.util.joblib import register_ray
-        except ImportError as error:
-            raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
-        register_ray()
-    with progress([task for batch in batches for task in batch]):
-        said = Parallel(n_jobs=jobs, backend=backend, batch_size=1)(delayed(in_a_row)(batch) for batch in batches)
-    failures = [failure for batch in said for failure in batch]
+    if backend not in ("loky", "ray"):
+        raise ValueError(f"backend={backend!r} does not exist; choose loky or ray.")
+    if ray_address is not None and backend != "ray":
+        raise ValueError(f"ray_address={ray_address!r} needs backend='ray'; the backend is {backend!r}.")
+    failures = over_ray(batches, jobs, ray_address) if backend == "ray" else over_processes(batches, jobs)
     if failures:
         raise RuntimeError(f"{len(failures)} failed, the others are kept:\n" + "\n".join(failures))
 
 
+def over_processes(batches: Sequence[Sequence[Task]], jobs: int) -> list[str]:
+    """Run batches in processes on this machine, and return the errors of the tasks that failed."""
+    with progress([task for batch in batches for task in batch]):
+        workers = Parallel(n_jobs=jobs or os.cpu_count() or 1, backend="loky", batch_size=1)
+        said = workers(delayed(in_a_row)(batch) for batch in batches)
+    return [failure for batch in said for failure in batch]
+
+
 def in_a_row(tasks: Sequence[Task]) -> list[str]:
     """Run tasks one after another, and return the errors of those that failed."""
-    failures = []
-    for task in tasks:
-        try:
-            task.run()
-        except Exception as error:
-            failures.append(f"{type(error).__name__}: {error}")
-    return failures
+    return [failure for task in tasks if (failure := failure_of(task))]
+
+
+def over_ray(batches: Sequence[Sequence[Task]], jobs: int, address: str | None) -> list[str]:
+    """Run batches on a Ray cluster, and return the errors of the tasks that failed."""
+    try:
+        from rt_torchrl.study.ray_workers import RayWorkers, connected
+    except ImportError as error:
+        raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
+    with connected(address, jobs) as count, progress([task for batch in batches for task in batch]):
+        return RayWorkers(batches, count).run()
 
 
 @contextmanager
 def progress(tasks: Sequence[Task]) -> Iterator[None]:
     """A bar that counts the finished tasks, for as long as the context lasts.
 
-    The bar looks for results that were missing at its last look. So it counts the tasks inside a batch and on other
-    machines. joblib's generator gives one result for a whole batch, and Ray's backend refuses it.
+    The bar looks for results that were missing at its last look. So it counts the tasks inside a batch, for which
+    joblib's generator gives one result.
     """
     stopped = threading.Event()
     missing = [task for task in tasks if not task.done()]

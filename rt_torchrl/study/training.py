@@ -52,6 +52,9 @@ class Training:
         if self.variant not in VARIANTS:
             raise ValueError(f"variant={self.variant!r} does not exist; choose one of {', '.join(VARIANTS)}.")
 
+    def __str__(self) -> str:
+        return f"the training in {self.folder}"
+
     @property
     def plant(self) -> str:
         return self.recipe.stem

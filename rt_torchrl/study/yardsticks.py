@@ -15,6 +15,7 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.atomic_file import write_atomically
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run_config import RunConfig, plant_of
 from rt_torchrl.study.json_file import read_json
@@ -39,6 +40,9 @@ class Yardstick:
     path: Path
     compute: Callable[[], dict[str, Any]]
 
+    def __str__(self) -> str:
+        return f"the yardstick in {self.path}"
+
     def done(self) -> bool:
         """Whether a whole result is kept."""
         return read_json(self.path) is not None
@@ -51,8 +55,9 @@ class Yardstick:
             warnings.warn(f"{self.path} is damaged; what it held is computed again.", stacklevel=2)
         found = self.compute()
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.write_text(json.dumps(found, indent=2) + "\n")
-        return json.loads(self.path.read_text())
+        content = json.dumps(found, indent=2) + "\n"
+        write_atomically(self.path, content.encode())
+        return json.loads(content)
 
 
 def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iterations: int, polish: int) -> dict[str, Any]:
