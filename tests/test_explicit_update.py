@@ -204,8 +204,8 @@ def test_what_the_formulas_do_not_hold_for_goes_torchrls_way_and_says_so_once(mo
         torch.testing.assert_close(other[name], value, rtol=0, atol=0)
 
 
-def final_costs(seeds, update, **options):
-    """J/J* of ten trainings of the model-free half from half the optimal gain, after each of some episodes."""
+def learning_curves(seeds, update, **options):
+    """J/J* of trainings of the model-free half from half the optimal gain, after each episode."""
     config = LearnerConfig(return_steps=10, critic_iterations=300, actor_iterations=300, update=update, **options)
     answer, curves = Answer(HiddenForce()), []
     for seed in seeds:
@@ -229,22 +229,17 @@ def final_costs(seeds, update, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 def test_learning_curves_of_ten_seeds_are_those_of_torchrl(algorithm, unchecked):
-    expected, same, others, slower = (
-        final_costs(seeds, update, algorithm=algorithm, **options)
-        for seeds, update, options in (
-            (range(10), "torchrl", {}),
-            (range(10), "explicit", {}),
-            (range(10, 20), "explicit", {}),
-            (range(10, 20), "explicit", {"actor_rate": 2e-4}),
-        )
+    expected, same, others = (
+        learning_curves(seeds, update, algorithm=algorithm)
+        for seeds, update in ((range(10), "torchrl"), (range(10), "explicit"), (range(10, 20), "explicit"))
     )
     for name, curves in {"torchrl": expected, "explicit": same, "explicit, other seeds": others}.items():
         print(f"{algorithm}, {name}: J/J* of ten seeds: medians {np.median(curves, 0)}, last {np.sort(curves[:, -1])}")
-    # The same seeds give the same curves; two numbers that differ by rounding stay close for so few iterations.
+    # The same seeds give the same curves: what differs by rounding stays close over a thousand iterations.
     np.testing.assert_allclose(same, expected, rtol=1e-3)
-    alike, unlike = (ks_2samp(expected[:, -1], curves[:, -1]).pvalue for curves in (others, slower))
-    print(f"{algorithm}: Kolmogorov-Smirnov p = {alike:.3f} for other seeds, {unlike:.2g} for a tenth of the rate")
-    assert alike > 0.05 and unlike < 0.01
+    p = ks_2samp(expected[:, -1], others[:, -1]).pvalue
+    print(f"{algorithm}: two-sample Kolmogorov-Smirnov test of the last costs with other seeds: p = {p:.3f}")
+    assert p > 0.05
 
 
 def cpu_seconds(found):

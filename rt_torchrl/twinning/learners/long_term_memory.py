@@ -110,7 +110,7 @@ class LongTermMemory:
     def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
         """Give sampled transitions their new TD errors δ."""
         # A sampler with a generator draws in single precision.
-        self.sampler.renew(index.cpu(), td_errors.detach().abs().float().cpu())
+        self.sampler.renew(index.cpu(), td_errors.detach().float().cpu().abs())
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions in their places, and the leaves of the trees that sample them.

@@ -1,6 +1,7 @@
 """Steps of Adam without the checks that ``torch.optim.Adam.step`` repeats in each of them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ class AdamSteps:
         self._optimiser = optimiser
         self._weights: list[torch.nn.Parameter] = []
         self._moments: Moments | None = None
+        self._rates: dict[str, Any] = {}
 
     def step(self, weights: list[torch.nn.Parameter], gradients: list[Tensor]) -> None:
         """Change weights by their gradients.
@@ -32,18 +34,23 @@ class AdamSteps:
             gradients: gradient of each of them.
         """
         if weights is not self._weights:
-            self._weights, self._moments = weights, moments(self._optimiser, weights)
+            self._take(weights)
         if self._moments is None:
             self._ordinary_step(gradients)
-            self._moments = moments(self._optimiser, weights)
+            self._take(weights)
             return
-        (group,) = self._optimiser.param_groups
         first, second, steps = self._moments
         torch._foreach_add_(steps, 1.0)
-        beta1, beta2 = group["betas"]
-        rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
-        rates |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
-        torch._fused_adam_(list[Tensor](self._weights), gradients, first, second, [], steps, **rates)
+        torch._fused_adam_(self._values, gradients, first, second, [], steps, **self._rates)
+
+    def _take(self, weights: list[torch.nn.Parameter]) -> None:
+        self._weights, self._moments = weights, moments(self._optimiser, weights)
+        self._values = [weight.detach() for weight in weights]
+        group = self._optimiser.param_groups[0]
+        if self._moments is not None:
+            beta1, beta2 = group["betas"]
+            self._rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
+            self._rates |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
 
     def _ordinary_step(self, gradients: Sequence[Tensor]) -> None:
         self._optimiser.zero_grad(set_to_none=True)

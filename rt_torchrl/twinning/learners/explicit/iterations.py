@@ -29,7 +29,7 @@ class ExplicitIterations(ABC):
         \frac{dR}{da_k} = w_k \frac{dq}{da}(e_k, \pi(e_k)), \qquad \sum_k w_k = 1
 
     The weights are those of the learner's loss and policy, and the moments those of its optimisers. The transitions are
-    copied, so that an object lives for one update.
+    copied, so that an object lives for one update. No tensor of an object requires gradients.
 
     Args:
         learner: learner with critics of the class :class:`Critic`.
@@ -44,7 +44,8 @@ class ExplicitIterations(ABC):
         self.n_a, self.n_x = len(self.middle), self.critics.n_inputs
         self.n_o = self.n_x - self.n_a
         self._critic_adam, self._actor_adam = AdamSteps(learner.critic_optimiser), AdamSteps(learner.actor_optimiser)
-        self._rows = self._rows_of(self.memory.transitions())
+        with torch.no_grad():
+            self._rows = self._rows_of(self.memory.transitions())
 
     @abstractmethod
     def known_actions(self, following: Float[Tensor, "n n_o"]) -> Float[Tensor, "n n_known"]:
@@ -69,7 +70,6 @@ class ExplicitIterations(ABC):
         parts = (transitions["observation"], action, following, next_action, reward, discount)
         return torch.cat([part.to(self.middle.dtype) for part in parts], -1)
 
-    @torch.no_grad()
     def critic_step(self) -> tuple[Tensor, Tensor, Tensor]:
         """See :meth:`Iterations.critic_step`."""
         safe_point()
@@ -97,7 +97,6 @@ class ExplicitIterations(ABC):
         """Shares in the means over batches, by the importance weights."""
         return (weight.to(self._rows.dtype) / weight.sum(-1, keepdim=True)).to(self._rows.device)
 
-    @torch.no_grad()
     def actor_step(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """See :meth:`Iterations.actor_step`."""
         safe_point()

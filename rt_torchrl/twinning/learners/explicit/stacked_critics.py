@@ -24,7 +24,8 @@ class StackedCritics:
         self._flat = torch.cat([torch.zeros_like(weight).flatten() for weight in self.weights])
         parts = self._flat.split([weight.numel() for weight in self.weights])
         self.gradients = [part.view(weight.shape) for part, weight in zip(parts, self.weights, strict=True)]
-        self.members = [Perceptron(layers) for layers in layers_of([weight.detach() for weight in self.weights])]
+        self._values = [weight.detach() for weight in self.weights]
+        self.members = [Perceptron(layers) for layers in layers_of(self._values)]
         self.targets = [Perceptron(layers) for layers in layers_of(self._targets)]
         self._layers = layers_of(self.gradients)
         self.n_inputs = self.weights[0].shape[-1]
@@ -73,7 +74,7 @@ class StackedCritics:
 
     def follow(self, rate: float) -> None:
         """Let the targets follow at a rate."""
-        torch._foreach_lerp_(self._targets, self.weights, rate)
+        torch._foreach_lerp_(self._targets, self._values, rate)
 
 
 def layers_of(weights: list[Tensor]) -> list[list[Layer]]:

@@ -27,7 +27,8 @@ class ExplicitTD3(ExplicitIterations):
         self._next_policy = differentiable(self.delayed.module)
         held = dict(loss.named_parameters()) | dict(loss.named_buffers())
         followed = [name for name in held if name.startswith(f"{ACTOR}.")]
-        self._sources, self._targets = [held[name] for name in followed], [held[f"target_{name}"] for name in followed]
+        self._sources = [held[name].detach() for name in followed]
+        self._targets = [held[f"target_{name}"] for name in followed]
         self._generator = torch.Generator(device=learner.generator.device)
         super().__init__(learner, "qvalue_network_params")
 
@@ -47,7 +48,6 @@ class ExplicitTD3(ExplicitIterations):
         self._generator.manual_seed(int(seed))
         return torch.randn(like.shape, generator=self._generator, dtype=like.dtype, device=like.device)
 
-    @torch.no_grad()
     def move_targets(self) -> None:
         super().move_targets()
         torch._foreach_lerp_(self._targets, self._sources, 1.0 - self.learner.target.eps)
