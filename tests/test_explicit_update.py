@@ -251,7 +251,7 @@ def cpu_seconds(found):
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 def test_the_formulas_take_less_than_half_the_time(algorithm):
-    """Measured: a sixth for DDPG, on a core without other work."""
+    """Measured on a core without other work: a fifth for DDPG."""
     sizes = {"critic_hidden": (64, 64), "batch_size": 128, "critic_iterations": 200, "actor_iterations": 200}
     torch.set_num_threads(1)
     both = [learner(update, algorithm, **sizes) for update in ("torchrl", "explicit")]
