@@ -113,7 +113,7 @@ def test_target_follows_at_its_rate():
 
 
 def test_critic_iterations_come_first_and_are_counted(monkeypatch):
-    found, calls, sizes = learner(critic_iterations=7, actor_iterations=4, batch_size=64), [], []
+    found, calls, sizes = learner(critic_iterations=7, actor_iterations=4, batch_size=64, update="torchrl"), [], []
     memory = filled(explored(10), found)
     for optimiser, label in ((found.critic_optimiser, "q"), (found.actor_optimiser, "a")):
         step = optimiser.step

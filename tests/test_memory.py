@@ -149,3 +149,25 @@ def test_short_term_memory_keeps_the_last_episodes_in_order():
     assert list(found) == ["b", "c"]
     with pytest.raises(ValueError, match="capacity=0"):
         ShortTermMemory(0)
+
+
+def test_draws_and_renewals_are_those_of_torchrls_sampler():
+    one, other = memory(seed=1), memory(seed=1)
+    generator = torch.Generator().manual_seed(2)
+    for each in (one, other):
+        each.store(transitions(list(range(8))), ERRORS)
+    for count in (16, 1, 5):
+        drawn = one.sample(count)
+        index, weight = other.draw(count)
+        assert torch.equal(drawn["index"], index) and torch.equal(drawn["priority_weight"], weight)
+        assert torch.equal(drawn["label"], other.transitions()["label"][index])
+        errors = 200.0 * torch.rand(count, generator=generator)
+        one.sampler.update_priority(index, errors)
+        other.refresh(index, errors)
+        assert torch.equal(one.sampler.priorities(8), other.sampler.priorities(8))
+        assert [float(x) for x in one.sampler._max_priority] == [float(x) for x in other.sampler._max_priority]
+
+
+def test_a_draw_from_an_empty_memory_is_refused():
+    with pytest.raises(ValueError, match="memory is empty"):
+        memory().draw(3)

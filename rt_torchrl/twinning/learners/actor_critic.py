@@ -1,7 +1,7 @@
 """The common part of learners with a critic: transitions with sums of rewards, prioritised memory, optimisers."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
@@ -70,6 +70,7 @@ class ActorCritic(ABC):
     """
 
     loss: LossModule
+    target: SoftUpdate
 
     def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator):
         if config.return_steps > plant.n_steps:
@@ -154,9 +155,8 @@ class ActorCritic(ABC):
         self.actor_optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.config.actor_rate)
 
     def critic_step(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Take one iteration of the critics; return loss and mean |δ| for unscaled rewards, and the gradient norm."""
+        """See :meth:`Iterations.critic_step`."""
         safe_point()
-        scale = self.config.reward_scale
         batch = self.memory.sample(self.batch_size)
         loss, td_error = self.critic_loss(batch)
         self.critic_optimiser.zero_grad(set_to_none=True)
@@ -164,17 +164,25 @@ class ActorCritic(ABC):
         norm = nn.utils.get_total_norm([w.grad for w in self.critic_weights() if w.grad is not None])
         self.critic_optimiser.step()
         self.memory.refresh(batch["index"], td_error)
-        return loss.detach() / scale**2, td_error.mean() / scale, norm
+        return loss.detach(), td_error.mean(), norm
+
+    def move_targets(self) -> None:
+        """See :meth:`Iterations.move_targets`."""
+        self.target.step()
+
+    def batches(self, count: int) -> Iterator[TensorDictBase]:
+        """See :meth:`Iterations.batches`."""
+        return self.memory.samples(self.batch_size, count)
 
     def actor_step(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Take one iteration of the policy; return the mean value for unscaled rewards and the gradient norm."""
+        """See :meth:`Iterations.actor_step`."""
         safe_point()
         loss = self.actor_loss(batch)
         self.actor_optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.gradient_limit)
         self.actor_optimiser.step()
-        return -loss.detach() / self.config.reward_scale, norm
+        return -loss.detach(), norm
 
     def state_dict(self) -> dict[str, Any]:
         """See :meth:`Learner.state_dict`."""
@@ -188,15 +196,23 @@ class ActorCritic(ABC):
         self.generator.set_state(state["generator"].cpu())
 
 
-CRITIC_FINDINGS = "critic_loss", "td_error", "critic_gradient"
-ACTOR_FINDINGS = "value", "actor_gradient"
+CRITIC_FINDINGS = {"critic_loss": 2, "td_error": 1, "critic_gradient": 0}
+"""What :meth:`Iterations.critic_step` returns, and the power of the rewards' scale in it that a report leaves out."""
+ACTOR_FINDINGS = {"value": 1, "actor_gradient": 0}
+"""The same of :meth:`Iterations.actor_step`."""
 COMPONENTS = ("loss", "critic_optimiser", "actor_optimiser", "memory")
 
 
-def means(critic: Sequence[tuple[Tensor, ...]], actor: Sequence[tuple[Tensor, ...]]) -> TensorDict:
-    """Means of the results of :meth:`ActorCritic.critic_step` and :meth:`ActorCritic.actor_step` over iterations."""
+def means(critic: Sequence[tuple[Tensor, ...]], actor: Sequence[tuple[Tensor, ...]], scale: float) -> TensorDict:
+    """Means over iterations for the rewards without their scale.
+
+    Args:
+        critic: results of :meth:`Iterations.critic_step`.
+        actor: results of :meth:`Iterations.actor_step`.
+        scale: factor on the rewards that the critics learn from.
+    """
     found: dict[str, Tensor] = {}
-    for names, iterations in ((CRITIC_FINDINGS, critic), (ACTOR_FINDINGS, actor)):
-        for name, values in zip(names, zip(*iterations, strict=True), strict=bool(iterations)):
-            found[name] = torch.stack(values).mean()
+    for powers, iterations in ((CRITIC_FINDINGS, critic), (ACTOR_FINDINGS, actor)):
+        for (name, power), values in zip(powers.items(), zip(*iterations, strict=True), strict=bool(iterations)):
+            found[name] = torch.stack(values).mean() / scale**power
     return TensorDict(found)

@@ -83,6 +83,9 @@ class LearnerConfig:
         critic_hidden: widths of the critic's hidden layers.
         memory: parameters of the long-term memory D_L.
         td3: parameters of TD3 that DDPG does not have.
+        update: way to compute an update: ``explicit`` for gradients by formula, several times as fast, or ``torchrl``
+            for TorchRL's losses and autograd. Both give the same weights up to rounding. Critics or losses of your own
+            always use TorchRL's way.
     """
 
     algorithm: LearnerName = "ddpg"
@@ -99,6 +102,7 @@ class LearnerConfig:
     critic_hidden: Sequence[int] = field(default=(64, 64))
     memory: LongTermMemoryConfig = field(default_factory=LongTermMemoryConfig)
     td3: TD3Config = field(default_factory=TD3Config)
+    update: Literal["explicit", "torchrl"] = "explicit"
 
     def __post_init__(self) -> None:
         check_options(self, infinite=("gradient_limit",))

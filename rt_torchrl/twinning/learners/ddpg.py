@@ -7,6 +7,8 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.twinning.learners.actor_critic import ActorCritic, Critic, means
+from rt_torchrl.twinning.learners.explicit.choice import iterations_of
+from rt_torchrl.twinning.learners.explicit.ddpg import ExplicitDDPG
 
 
 class DDPG(ActorCritic):
@@ -52,9 +54,9 @@ class DDPG(ActorCritic):
             Means of ``critic_loss``, ``td_error``, ``value`` and both gradient norms over the iterations; the first
             three are for the rewards without ``reward_scale``.
         """
-        critic = []
+        iterations, critic = iterations_of(self, DDPG, ExplicitDDPG), []
         for _ in range(self.config.critic_iterations):
-            critic.append(self.critic_step())
-            self.target.step()
-        batches = self.memory.samples(self.batch_size, self.config.actor_iterations)
-        return means(critic, [self.actor_step(batch) for batch in batches])
+            critic.append(iterations.critic_step())
+            iterations.move_targets()
+        actor = [iterations.actor_step(batch) for batch in iterations.batches(self.config.actor_iterations)]
+        return means(critic, actor, self.config.reward_scale)

@@ -9,6 +9,8 @@ from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.twinning.learners.actor_critic import ActorCritic, Critic, means
+from rt_torchrl.twinning.learners.explicit.choice import iterations_of
+from rt_torchrl.twinning.learners.explicit.td3 import ExplicitTD3
 
 CRITICS = 2
 
@@ -67,10 +69,10 @@ class TD3(ActorCritic):
         Returns:
             The same means as :meth:`DDPG.update <rt_torchrl.twinning.learners.ddpg.DDPG.update>`.
         """
-        critic, actor = [], []
+        iterations, critic, actor = iterations_of(self, TD3, ExplicitTD3), [], []
         for iteration in range(1, self.config.critic_iterations + 1):
-            critic.append(self.critic_step())
+            critic.append(iterations.critic_step())
             if iteration % self.config.td3.delay == 0:
-                actor.append(self.actor_step(self.memory.sample(self.batch_size)))
-                self.target.step()
-        return means(critic, actor)
+                actor += [iterations.actor_step(batch) for batch in iterations.batches(1)]
+                iterations.move_targets()
+        return means(critic, actor, self.config.reward_scale)
