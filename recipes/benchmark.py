@@ -222,11 +222,13 @@ def main(config: Config) -> None:
     folder = config.log_dir or Path("runs") / "benchmark" / time.strftime("%Y%m%d-%H%M%S")
     folder.mkdir(parents=True, exist_ok=True)
     benchmark = Benchmark(config, folder)
-    benchmark.run()
-    _tell("")
-    benchmark.save()
-    print(benchmark.report())
-    print(f"results in {folder}")
+    try:
+        benchmark.run()
+    finally:  # an interrupted benchmark reports what it has
+        _tell("")
+        benchmark.save()
+        print(benchmark.report())
+        print(f"results in {folder}")
 
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ class Summary:
                 shown = ", ".join(f"{value:.3g} us at {steps}" for steps, value in per_step.items())
                 spread = max(per_step.values()) / min(per_step.values())
                 lines.append(
-                    f"{case.name}, {quantity}: {self.subject} per step {shown}; greatest over least {spread:.3g}"
+                    f"{case.name}, {quantity}: {self.subject}, CPU per step {shown}; greatest over least {spread:.3g}"
                 )
         return lines
 
@@ -112,7 +112,8 @@ class Summary:
         ]
         batches = [cell.size.realisations for cell in found]
         common = max(set(batches), key=batches.count) if batches else 0
-        return [cell for cell in found if cell.size.realisations == common]
+        line = [cell for cell in found if cell.size.realisations == common]
+        return sorted(line, key=lambda cell: cell.size.steps)
 
     def _sizes(self, case: Case, contender: str) -> list[Size]:
         found = {

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from benchmarking.timing import Cell
-from benchmarking.trainings import STEPS
+from rt_torchrl.figures.style import STEPS
 
 HEADER = (
     f"{'steps':>7} {'batch':>6} {'thr':>3} {'':<9}{'contender':<15} "

@@ -12,6 +12,7 @@ from benchmarking import cores
 from benchmarking.case import System, scenario_of, system_of
 from benchmarking.contenders import QUANTITIES, Calls, Contenders, Quantity, made_once, quantities_of
 from benchmarking.sizes import Size
+from rt_torchrl import DivergenceError
 
 
 @dataclass(frozen=True)
@@ -101,29 +102,22 @@ class Stopwatch:
         return found
 
     def predicted(self, size: Size, contender: str, quantity: Quantity) -> float:
-        """Wall time [s] that smaller sizes predict at most, in proportion to the work; NaN if there is none."""
+        """Wall time [s] that other sizes predict at most; NaN if none has been timed.
+
+        It is in proportion to the steps and to more realisations; fewer realisations may take as long.
+        """
         found = [
-            cell.wall * size.work / cell.size.work
+            cell.wall * size.steps / cell.size.steps * max(1.0, size.realisations / cell.size.realisations)
             for cell in self.cells
             if (cell.contender, cell.quantity, cell.size.case) == (contender, quantity, size.case)
             and cell.size.threads == size.threads
-            and cell.size.steps <= size.steps
-            and cell.size.realisations <= size.realisations
             and not cell.left_out
         ]
         return min(found, default=float("nan"))
 
     def _too_long(self, size: Size, name: str, quantity: Quantity) -> str:
         seconds = self.predicted(size, name, quantity)
-        if seconds > self.limit:
-            return f"about {seconds:.3g} s predicted, limit {self.limit:g} s"
-        smaller_left_out = any(
-            cell.left_out
-            for cell in self.cells
-            if (cell.contender, cell.quantity, cell.size.case) == (name, quantity, size.case)
-            and cell.size.threads == size.threads
-        )
-        return "a smaller size is left out" if np.isnan(seconds) and smaller_left_out else ""
+        return f"about {seconds:.3g} s predicted, limit {self.limit:g} s" if seconds > self.limit else ""
 
     def _in_turn(self, size: Size, quantity: Quantity, functions: dict[str, Callable[[], Any]]) -> list[Cell]:
         results, first = {}, {}
@@ -133,15 +127,17 @@ class Stopwatch:
             for name, function in functions.items():
                 self.tell(f"{size.case.name}: {name}, {quantity}, {size.steps} x {size.realisations}")
                 start = time.perf_counter()
-                results[name] = np.asarray(function())
-                first[name] = time.perf_counter() - start
+                found = _finite(function)
+                if found is not None:
+                    results[name], first[name] = found, time.perf_counter() - start
             with cores.limited_to(size.threads):
                 for _ in range(self.repeats):
-                    for name, function in functions.items():
+                    for name in results:
                         if sum(wall[name]) <= self.limit:
-                            _clock(function, wall[name], cpu[name])
+                            _clock(functions[name], wall[name], cpu[name])
         reference = next(iter(results.values()), None)
-        return [
+        diverged = [Cell(size, name, quantity, left_out="diverged") for name in functions if name not in results]
+        return diverged + [
             Cell(
                 size,
                 name,
@@ -152,8 +148,17 @@ class Stopwatch:
                 first[name],
                 float(np.linalg.norm(results[name] - reference) / np.linalg.norm(reference)),
             )
-            for name in functions
+            for name in results
         ]
+
+
+def _finite(function: Callable[[], Any]) -> np.ndarray | None:
+    """A result; None if it is not finite."""
+    try:
+        result = np.asarray(function())
+    except DivergenceError:
+        return None
+    return result if np.isfinite(result).all() else None
 
 
 def _clock(function: Callable[[], Any], wall: list[float], cpu: list[float]) -> None:

@@ -6,15 +6,14 @@ import json
 from pathlib import Path
 
 from rt_torchrl import Engine
+from rt_torchrl.figures.style import STEPS
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 
 RECIPES = Path(__file__).resolve().parent.parent
-STEPS = ("interact", "update_model_free", "fit_exogenous", "assimilate", "plan", "switch_policies")
-"""The six steps of the algorithm in their order, by the names that the results of a run give them."""
 
 
 def seconds_of_steps(plant: str, engine: Engine, folder: Path, episodes: int, *, compiled: bool) -> list[float]:
-    """Mean wall time [s] of each step in the last episodes of a short training.
+    """Mean wall time [s] of each of the six ``STEPS`` in an episode of a short training.
 
     The first episode, in which the steps are compiled, does not count unless it is the only one.
 
