@@ -1,108 +1,234 @@
-"""Measure the time of one gradient by each engine; the engines take turns in one process."""
+"""Measure time and memory of forward and gradient by each engine and by JAX; all take turns in one process."""
 
+import dataclasses
 import json
-import statistics
+import platform
+import sys
+import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, get_args
 
-import torch
+from benchmarking import cores, fresh_process
+from benchmarking.case import Case, ClosureKind, PlantName, PolicyKind, system_of
+from benchmarking.contenders import Contenders, Jax
+from benchmarking.figures import save_figures
+from benchmarking.sizes import Grid
+from benchmarking.summary import Summary
+from benchmarking.tables import start_table, time_table, training_table
+from benchmarking.timing import Cell, Stopwatch
+from benchmarking.trainings import seconds_of_steps
 
-from rt_torchrl import Engine, Rollout, control_cost, main_of, shipped_plants
-from rt_torchrl.trajectories.rollout import refusal
+from rt_torchrl import Engine, main_of
+from rt_torchrl.trajectories.rollout import ENGINES
 
-REFERENCE: Engine = "odeint_adjoint"
+SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0}
+"""Shares of the minutes after which the parts of the benchmark begin nothing more."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Time the gradient of J_a with respect to policy and closure by the gradient engines.
+    """Time J_a and its gradient with respect to the policy by the gradient engines and by JAX.
 
     Args:
-        plant: folder of the plant under envs.
-        realisations: trajectories N_z.
-        steps: number of control intervals; 0 takes the plant's whole episode.
-        repeats: number of gradients of each engine; the engines take turns.
-        engines: gradient engines; those that cannot roll the plant out are left out, and ratios are to the last of the
-            rest.
+        plants: plants; the first one matters most.
+        closures: closures, law for the plant's own and mlp for one with a perceptron of 32 x 32.
+        policies: policies, affine for the plant's own and mlp for a perceptron of 32 x 32.
+        horizons: numbers of control intervals.
+        realisations: numbers of trajectories N_z.
+        at_horizon: number of control intervals with which the realisations vary.
+        at_realisations: number of trajectories with which the horizons vary.
+        all_pairs: whether to time all pairs of horizons and realisations instead of these two lines.
+        threads: numbers of CPU threads; on Linux JAX has as many cores.
+        engines: gradient engines; those that cannot roll a plant out are left out. Ratios are of native, or else of the
+            first one.
+        jax: jax_scan for one scan that JAX differentiates, jax_sweep for a reverse sweep by hand; both need the extra
+            bench.
         compiled: compile the engines.
         eager: engines that are not compiled all the same, such as odeint_adjoint as torchdiffeq ships it.
-        threads: number of CPU threads; 0 keeps torch's default.
-        output: JSON file for the result.
+        repeats: greatest number of evaluations behind a median.
+        limit: predicted time of one evaluation [s] above which a size is left out.
+        minutes: time [min] after which nothing new begins; 0 sets no end.
+        starts: whether to measure compilation and memory in fresh processes.
+        episodes: number of episodes of a short training of each plant with the engine that the ratios are of; its steps
+            are timed. 0 leaves the trainings out.
+        quick: whether to make a small benchmark with all its parts but the trainings.
+        log_dir: folder of tables and figures; by default runs/benchmark/TIME.
     """
 
-    plant: str = "flapping_wing"
-    realisations: int = 5
-    steps: int = 0
-    repeats: int = 3
-    engines: tuple[Engine, ...] = ("parallel", REFERENCE)
+    plants: tuple[PlantName, ...] = get_args(PlantName)
+    closures: tuple[ClosureKind, ...] = ("law",)
+    policies: tuple[PolicyKind, ...] = ("affine",)
+    horizons: tuple[int, ...] = (100, 1_000, 10_000, 100_000)
+    realisations: tuple[int, ...] = (1, 5, 25, 125)
+    at_horizon: int = 10_000
+    at_realisations: int = 5
+    all_pairs: bool = False
+    threads: tuple[int, ...] = (1, 2)
+    engines: tuple[Engine, ...] = tuple(ENGINES)
+    jax: tuple[Jax, ...] = get_args(Jax)
     compiled: bool = True
-    eager: tuple[Engine, ...] = ()
-    threads: int = 0
-    output: Path | None = None
+    eager: tuple[Engine, ...] = ("odeint_adjoint", "autograd")
+    repeats: int = 5
+    limit: float = 10.0
+    minutes: float = 10.0
+    starts: bool = True
+    episodes: int = 2
+    quick: bool = False
+    log_dir: Path | None = None
 
     def __post_init__(self):
-        if self.plant not in shipped_plants():
-            raise ValueError(f"plant={self.plant!r} does not exist; choose one of {', '.join(shipped_plants())}.")
-        if not set(self.eager) <= set(self.engines):
-            raise ValueError(f"eager={self.eager} must be some of engines={self.engines}.")
+        for name in ("plants", "closures", "policies", "horizons", "realisations", "threads", "engines"):
+            values = getattr(self, name)
+            if not values or len(set(values)) < len(values):
+                raise ValueError(f"{name}={values} must be one value or several different ones.")
+        for name in ("horizons", "realisations", "threads"):
+            if min(getattr(self, name)) < 1:
+                raise ValueError(f"{name}={getattr(self, name)} must all be at least 1.")
+        for name, least in (("at_horizon", 1), ("at_realisations", 1), ("repeats", 1), ("episodes", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
+        if max(self.threads) > cores.available():
+            raise ValueError(f"threads={self.threads} must be at most {cores.available()}, the cores of this process.")
+        if not self.limit > 0 or not self.minutes >= 0:
+            raise ValueError(f"limit={self.limit} s must be positive, and minutes={self.minutes} zero or above.")
+
+    def effective(self) -> "Config":
+        """The options that are carried out, in which ``quick`` has replaced other options."""
+        if not self.quick:
+            return self
+        sizes = {"horizons": (20, 60), "realisations": (1, 2), "at_horizon": 20, "at_realisations": 2}
+        return dataclasses.replace(self, **sizes, repeats=1, episodes=0, quick=False)
+
+    def grid(self) -> Grid:
+        cases = [Case(p, c, a) for c in self.closures for a in self.policies for p in self.plants]
+        lines = (self.horizons, self.realisations, self.at_horizon, self.at_realisations)
+        return Grid(cases, self.threads, *lines, all_pairs=self.all_pairs)
+
+    def contenders(self) -> Contenders:
+        return Contenders(self.engines, self.jax, self.compiled, self.eager)
+
+    def subject(self) -> Engine:
+        """The engine that is compared with the others."""
+        return next((engine for engine in self.engines if engine == "native"), self.engines[0])
 
 
-def gradient(config: Config, engine: Engine) -> Callable[[], torch.Tensor]:
-    """A function that computes one gradient, always of the same trajectories."""
-    generator = torch.Generator().manual_seed(0)
-    plant = shipped_plants()[config.plant]()
-    closure, policy = plant.make_closure(generator), plant.make_policy(generator)
-    initial_state = plant.draw_initial_state(config.realisations, generator)
-    exogenous = plant.draw_exogenous(config.realisations, generator)[:, : config.steps or plant.n_steps]
-    rollout = Rollout(plant, closure, policy, engine=engine, compiled=config.compiled and engine not in config.eager)
-    weights = [w for w in (*closure.parameters(), *policy.parameters()) if w.requires_grad]
+class Benchmark:
+    """The parts of a benchmark, which share its time; each leaves out what it has no time for, and says so."""
 
-    def compute() -> torch.Tensor:
-        cost = control_cost(plant, rollout(initial_state, exogenous)).mean()
-        return torch.cat([part.flatten() for part in torch.autograd.grad(cost, weights)])
+    def __init__(self, config: Config, folder: Path):
+        self.config, self.folder, self.began = config, folder, time.monotonic()
+        self.stopwatch = Stopwatch(config.contenders(), config.repeats, config.limit, _tell)
+        self.starts: dict[str, dict[str, dict[str, float]]] = {}
+        self.trainings: dict[str, list[float]] = {}
+        self.out_of_time: list[str] = []
 
-    return compute
+    def run(self) -> None:
+        self._times()
+        if self.config.starts:
+            self._starts()
+        if self.config.episodes:
+            self._trainings()
+
+    def _late(self, part: str, what: str) -> bool:
+        late = 0 < 60.0 * self.config.minutes * SHARES[part] < time.monotonic() - self.began
+        if late:
+            self.out_of_time.append(what)
+        return late
+
+    def _times(self) -> None:
+        shortest, timed = min(self.config.horizons), set()
+        for size in self.config.grid():
+            where = f"{size.case.name}, {size.threads} threads, {size.steps} x {size.realisations}"
+            if self._late("times", where):
+                continue
+            found = self.stopwatch.time(size)
+            timed.add(size)
+            slow = list(dict.fromkeys(cell.contender for cell in found if "predicted" in cell.left_out))
+            short = dataclasses.replace(size, steps=shortest)
+            if slow and short not in timed:  # what is too slow is timed over a short horizon, and scaled per step
+                timed.add(short)
+                self.stopwatch.time(short, slow)
+
+    def _starts(self) -> None:
+        config, cells = self.config, self.stopwatch.cells
+        for case in config.grid().cases:
+            system = system_of(case)
+            for name in config.contenders().names:
+                if config.contenders().refusal(name, system) or self._late("starts", f"start, {case.name}: {name}"):
+                    continue
+                _tell(f"start of {name}, {case.name}")
+                found = fresh_process.started(config.contenders(), name, case, self._longest(cells, name, case))
+                self.starts.setdefault(case.name, {})[name] = found
+
+    def _longest(self, cells: list[Cell], name: str, case: Case) -> tuple[int, int] | None:
+        """The longest horizon at which a contender's gradient has been timed with ``at_realisations``."""
+        steps = [
+            cell.size.steps
+            for cell in cells
+            if (cell.contender, cell.size.case, cell.quantity) == (name, case, "gradient")
+            and cell.size.realisations == self.config.at_realisations
+            and not cell.left_out
+        ]
+        return (max(steps), self.config.at_realisations) if steps else None
+
+    def _trainings(self) -> None:
+        config, engine = self.config, self.config.subject()
+        for plant in config.plants:
+            name = f"{plant}, {engine}"
+            if self._late("trainings", f"training, {name}"):
+                continue
+            _tell(f"training, {name}")
+            with tempfile.TemporaryDirectory() as run:
+                steps = seconds_of_steps(plant, engine, Path(run), config.episodes, compiled=config.compiled)
+            self.trainings[name] = steps
+
+    def report(self) -> str:
+        """The tables and the summary."""
+        parts = [time_table(self.stopwatch.cells)]
+        parts += [start_table(self.starts)] if self.starts else []
+        parts += [training_table(self.trainings)] if self.trainings else []
+        if self.out_of_time:
+            parts.append(f"no time within minutes={self.config.minutes:g} for:\n  " + "\n  ".join(self.out_of_time))
+        return "\n\n".join([*parts, "summary\n" + "\n".join(f"  {line}" for line in self.summary())])
+
+    def summary(self) -> list[str]:
+        """The ratios, and the compilation of the engine that they are about."""
+        lines = Summary(self.stopwatch.cells, self.config.subject()).lines()
+        for case, found in self.starts.items():
+            own = found.get(self.config.subject())
+            lines += [f"{case}: {self.config.subject()} compiles in {own['cold']:.2f} s cold"] if own else []
+        return lines
+
+    def save(self) -> None:
+        """Write ``benchmark.json``, ``benchmark.txt`` and the figures."""
+        machine = {"machine": platform.platform(), "processor": platform.machine(), "cores": cores.available()}
+        result: dict[str, Any] = {**machine, "python": platform.python_version(), "command": sys.argv}
+        result |= {"cells": [cell.record() for cell in self.stopwatch.cells], "starts": self.starts}
+        result |= {"trainings": self.trainings, "out_of_time": self.out_of_time, "summary": self.summary()}
+        (self.folder / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        (self.folder / "benchmark.txt").write_text(self.report() + "\n", encoding="utf-8")
+        save_figures(self.stopwatch.cells, self.folder)
 
 
-def sorted_out(config: Config) -> tuple[list[Engine], dict[Engine, str]]:
-    """The engines that can roll the plant out, and the reasons why the others cannot.
-
-    Raises:
-        ValueError: if no engine can.
-    """
-    plant = shipped_plants()[config.plant]()
-    reasons = {engine: refusal(engine, plant) for engine in config.engines}
-    left_out = {engine: reason for engine, reason in reasons.items() if reason}
-    able = [engine for engine in reasons if engine not in left_out]
-    if not able:
-        raise ValueError(f"engines={config.engines}: none of them can be timed. {' '.join(left_out.values())}")
-    return able, left_out
+def _tell(doing: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\033[K{doing}", end="", file=sys.stderr, flush=True)
 
 
 def main(config: Config) -> None:
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    able, left_out = sorted_out(config)
-    for reason in left_out.values():
-        print(f"left out: {reason}")
-    functions = {engine: gradient(config, engine) for engine in able}
-    found = {engine: compute() for engine, compute in functions.items()}  # compiles
-    seconds: dict[str, list[float]] = {engine: [] for engine in functions}
-    for _ in range(config.repeats):
-        for engine, compute in functions.items():
-            start = time.perf_counter()
-            compute()
-            seconds[engine].append(time.perf_counter() - start)
-    last = able[-1]
-    medians = {engine: statistics.median(values) for engine, values in seconds.items()}
-    gaps = {engine: ((g - found[last]).norm() / found[last].norm()).item() for engine, g in found.items()}
-    for engine, median in medians.items():
-        print(f"{engine:<15} {median:10.3f} s   {medians[last] / median:8.1f} times faster   gap {gaps[engine]:.1e}")
-    if config.output:
-        result = {"seconds": seconds, "medians": medians, "gaps": gaps, "left_out": left_out}
-        config.output.write_text(json.dumps(result, indent=2) + "\n")
+    config = config.effective()
+    folder = config.log_dir or Path("runs") / "benchmark" / time.strftime("%Y%m%d-%H%M%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    benchmark = Benchmark(config, folder)
+    try:
+        benchmark.run()
+    finally:  # an interrupted benchmark reports what it has
+        _tell("")
+        benchmark.save()
+        print(benchmark.report())
+        print(f"results in {folder}")
 
 
 if __name__ == "__main__":

@@ -1,58 +1,135 @@
-"""The gradient engines as the benchmark compares them; over whole episodes in the slow tests."""
+"""The benchmark times every contender, compares their results, and says what it leaves out."""
 
 import json
+import math
 import runpy
 from pathlib import Path
 
 import fresh_process
 import pytest
+from benchmarking.case import Case, system_of
+from benchmarking.contenders import Contenders
+from benchmarking.sizes import Grid, Size
+from benchmarking.summary import DRONE, Summary
+from benchmarking.timing import Cell, Stopwatch
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
+SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--plants", "wind_turbine", "--jax"]
+NOTHING = Contenders((), (), compiled=False, eager=())
 
 
-def compared(tmp_path, *options):
-    """Output of the benchmark, which runs in a process of its own."""
-    output = tmp_path / "result.json"
-    done = fresh_process.run(RECIPE, "--repeats", "1", "--output", str(output), *options)
+def compared(folder, *options):
+    """Cells of a benchmark that runs in a process of its own, by contender and quantity, at the largest size."""
+    done = fresh_process.run(RECIPE, "--log-dir", str(folder), *options)
     assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(output.read_text())
+    cells = json.loads((folder / "benchmark.json").read_text())["cells"]
+    largest = max(cell["steps"] * cell["realisations"] for cell in cells)
+    return {(c["contender"], c["quantity"]): c for c in cells if c["steps"] * c["realisations"] == largest}
+
+
+def cell(size, contender, quantity="gradient", wall=float("nan"), **more):
+    return Cell(size, contender, quantity, wall, 2.0 * wall, 1, wall, 0.0, **more)
 
 
 def test_every_engine_is_timed_and_compared(tmp_path):
-    options = ["--plant", "wind_turbine", "--steps", "20", "--realisations", "2", "--no-compiled"]
-    found = compared(tmp_path, *options, "--engines", "parallel", "autograd", "odeint_adjoint")
-    assert all(seconds > 0 for seconds in found["medians"].values())
-    assert found["gaps"]["odeint_adjoint"] == 0.0
-    # Both others are exact; the continuous adjoint differs from them by the order of its step.
-    assert 0.0 < found["gaps"]["parallel"] < 1e-4
-    assert found["gaps"]["parallel"] == pytest.approx(found["gaps"]["autograd"], rel=1e-6)
+    found = compared(tmp_path, *SMALL, "--engines", "parallel", "autograd", "odeint_adjoint")
+    assert set(found) == {
+        (name, quantity) for name in ("parallel", "autograd", "odeint_adjoint") for quantity in ("forward", "gradient")
+    }
+    assert all(cell["wall"] > 0 and cell["cpu"] > 0 for cell in found.values())
+    # Both exact gradients agree to rounding; the continuous adjoint differs from them by the order of its step.
+    assert found["autograd", "gradient"]["gap"] < 1e-11
+    assert 1e-11 < found["odeint_adjoint", "gradient"]["gap"] < 1e-4
+    assert (tmp_path / "wind_turbine-law-affine-1.png").stat().st_size > 10_000
+    assert "parallel" in (tmp_path / "benchmark.txt").read_text()
 
 
-def test_an_engine_that_cannot_is_left_out_and_the_others_are_timed(tmp_path, capsys):
-    """The pendulum steps by a scheme of its own, which the continuous adjoint does not know."""
-    recipe, output = runpy.run_path(str(RECIPE)), tmp_path / "result.json"
-    small = {"plant": "pendulum", "realisations": 2, "steps": 5, "repeats": 1, "compiled": False, "output": output}
-    recipe["main"](recipe["Config"](**small))
-    shown, found = capsys.readouterr().out, json.loads(output.read_text())
-    assert "left out: engine='odeint_adjoint' integrates the vector field, but plant 'pendulum'" in shown
-    assert list(found["medians"]) == ["parallel"] and list(found["left_out"]) == ["odeint_adjoint"]
-    recipe["main"](recipe["Config"](**small, engines=("odeint_adjoint", "parallel", "autograd")))
-    # Two exact gradients: rounding.
-    assert json.loads(output.read_text())["gaps"]["parallel"] < 1e-11
-    with pytest.raises(ValueError, match="none of them can be timed.*scheme of its own; use parallel or autograd"):
-        recipe["main"](recipe["Config"](**small, engines=("odeint_adjoint",)))
+def test_jax_takes_part(tmp_path):
+    pytest.importorskip("jax", reason="the plants in JAX need the extra bench")
+    found = compared(tmp_path, *SMALL, "jax_scan", "jax_sweep", "--engines", "parallel")
+    assert found["jax_scan", "gradient"]["gap"] < 1e-9 and found["jax_sweep", "gradient"]["gap"] < 1e-9
+    # The sweep goes forward by the same scan.
+    assert ("jax_scan", "forward") in found and ("jax_sweep", "forward") not in found
+
+
+def test_jax_that_is_not_installed_is_left_out(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    system = system_of(Case("wind_turbine"))
+    assert "install the extra bench" in NOTHING.refusal("jax_scan", system)
+    assert NOTHING.refusal("parallel", system) is None
+
+
+def test_compilation_and_memory_are_measured_in_fresh_processes(tmp_path):
+    done = fresh_process.run(RECIPE, "--log-dir", str(tmp_path), "--quick", "--no-compiled", *SMALL[3:-1], "--jax",
+                             "--engines", "autograd")  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    (found,) = json.loads((tmp_path / "benchmark.json").read_text())["starts"].values()
+    assert found["autograd"]["cold"] >= 0.0 and found["autograd"]["warm"] >= 0.0
+    # The tape of 60 intervals holds thousands of small tensors.
+    assert found["autograd"].get("peak_mib", 1.0) > 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
 def test_engines_agree_over_a_whole_episode(tmp_path, plant):
-    found = compared(tmp_path, "--plant", plant, "--realisations", "2")
-    assert found["gaps"]["parallel"] < 1e-4
+    steps = {"wind_turbine": "1200", "flapping_wing": "10000", "cryogenic_tank": "14400"}[plant]
+    sizes = ["--horizons", steps, "--at-horizon", steps, "--realisations", "2", "--at-realisations", "2"]
+    common = ["--plants", plant, "--engines", "parallel", "odeint_adjoint", "--jax", "--threads", "1", "--repeats", "1"]
+    found = compared(tmp_path, *common, *sizes, "--eager", "--no-starts", "--episodes", "0", "--minutes", "0")
+    assert found["odeint_adjoint", "gradient"]["gap"] < 1e-4
+
+
+def test_lines_go_through_the_chosen_sizes_and_the_smaller_work_comes_first():
+    drone, turbine = Case("flapping_wing"), Case("wind_turbine")
+    grid = Grid([drone, turbine], [1, 2], [10, 100], [1, 5], at_horizon=100, at_realisations=5)
+    assert grid.pairs() == [(10, 5), (100, 1), (100, 5)]
+    assert [(size.case, size.threads) for size in grid][::3] == [(drone, 1), (drone, 2), (turbine, 1), (turbine, 2)]
+    assert len(Grid([drone], [1], [10, 100], [1, 5], at_horizon=100, at_realisations=5, all_pairs=True).pairs()) == 4
+
+
+def test_a_size_that_would_take_too_long_is_left_out():
+    case = Case("wind_turbine")
+    watch = Stopwatch(Contenders(("autograd",), (), compiled=False, eager=()), 1, 1.0, lambda doing: None)
+    watch.cells += [
+        cell(Size(case, 1, 100, 5), "autograd", wall=0.5),
+        cell(Size(case, 1, 200, 1), "autograd", wall=0.4),
+    ]
+    # Ten times the first size, and 25 times the second one.
+    assert watch.predicted(Size(case, 1, 1000, 5), "autograd", "gradient") == pytest.approx(5.0)
+    # Ten times the first size, whose realisations may take no longer than one, and five times the second one.
+    assert watch.predicted(Size(case, 1, 1000, 1), "autograd", "gradient") == pytest.approx(2.0)
+    assert math.isnan(watch.predicted(Size(case, 2, 1000, 5), "autograd", "gradient"))
+    left = {found.quantity: found.left_out for found in watch.time(Size(case, 1, 1000, 5), ["autograd"])}
+    assert left == {"forward": "", "gradient": "about 5 s predicted, limit 1 s"}
+
+
+def test_the_summary_gives_the_ratios():
+    at = [Size(DRONE, 1, 10_000, batch) for batch in (5, 25)]
+    short, two = Size(DRONE, 1, 100, 25), Size(DRONE, 2, 10_000, 5)
+    cells = [cell(at[0], "native", wall=0.1), cell(at[0], "jax_scan", wall=1.0), cell(two, "native", wall=0.05)]
+    cells += [cell(at[1], "native", wall=0.2), cell(short, "odeint_adjoint", wall=1.0)]
+    cells += [cell(at[1], "odeint_adjoint", left_out="about 100 s predicted, limit 10 s")]
+    cells += [cell(Size(DRONE, 1, 1_000, 5), "native", wall=0.02)]
+    lines = Summary(cells, "native").lines()
+    start = "drone, gradient, 10000 steps, {} realisations, 1 thread: native over {}"
+    assert f"{start.format(5, 'jitted JAX scan')}: 10 times as fast by wall time, 10 by CPU time" in lines
+    scaled = "500 times as fast by wall time, 500 by CPU time, odeint_adjoint scaled per step from 100 steps"
+    assert f"{start.format(25, 'odeint_adjoint')}: {scaled}" in lines
+    assert f"{start.format(125, 'jitted JAX scan')}: not measured (this size was not asked for)" in lines
+    assert any("native on 2 threads is 2 times as fast as on 1" in line for line in lines)
+    # 40 and 20 microseconds of CPU time for a step.
+    assert any(line.endswith("40 us at 1000, 20 us at 10000; greatest over least 2") for line in lines)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"plant": "moon"}, "choose one of"), ({"eager": ("autograd",)}, "eager=.* must be some of engines=")],
+    [
+        ({"horizons": ()}, "horizons=.* must be one value or several different ones"),
+        ({"realisations": (0, 5)}, "realisations=.* must all be at least 1"),
+        ({"repeats": 0}, "repeats=0 must be at least 1"),
+        ({"threads": (1, 10_000)}, "threads=.* must be at most"),
+        ({"limit": 0.0}, "limit=0.0 s must be positive"),
+    ],
 )
 def test_options_that_do_not_fit_are_refused(options, message):
     with pytest.raises(ValueError, match=message):

@@ -1,0 +1,74 @@
+"""Figures of a benchmark: time against the horizon and against the realisations."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from benchmarking.contenders import QUANTITIES
+from benchmarking.timing import Cell
+from rt_torchrl.figures.style import caption, legend_below, panels
+
+COLOURS = {
+    "native": "#D55E00",
+    "parallel": "#0072B2",
+    "odeint_adjoint": "#009E73",
+    "autograd": "#222222",
+    "jax_scan": "#E69F00",
+    "jax_sweep": "#CC79A7",
+}
+MARKERS = "osv^D*Pdhp"
+AXES = {"steps": "control intervals", "realisations": "realisations"}
+
+
+def save_figures(cells: Sequence[Cell], folder: Path) -> list[Path]:
+    """Draw one figure for each case and number of threads, with wall time over horizons and over realisations.
+
+    Args:
+        cells: the cells; those that were left out are not drawn.
+        folder: folder of the files.
+
+    Returns:
+        The paths of the files.
+    """
+    drawn = [cell for cell in cells if not cell.left_out]
+    paths = []
+    for case, threads in dict.fromkeys((cell.size.case, cell.size.threads) for cell in drawn):
+        chosen = [cell for cell in drawn if (cell.size.case, cell.size.threads) == (case, threads)]
+        plural = "thread" if threads == 1 else "threads"
+        title = f"{case.name}, {threads} {plural}\nwall time [s]"
+        figure, axes = panels(2, 2, title=title, size=(10.5, 8.0), sharey="row")
+        for row, quantity in zip(axes, QUANTITIES, strict=True):
+            of_quantity = [cell for cell in chosen if cell.quantity == quantity]
+            for ax, along in zip(row, AXES, strict=True):
+                _draw(ax, of_quantity, along, quantity)
+        legend_below(figure, list(axes.flat))
+        path = folder / f"{case.plant}-{case.closure}-{case.policy}-{threads}.png"
+        figure.savefig(path)
+        paths.append(path)
+    return paths
+
+
+def _draw(ax: Axes, cells: Sequence[Cell], along: str, quantity: str) -> None:
+    """Draw the line of each contender along one of the two sizes, at the value of the other with the most points."""
+    across = next(other for other in AXES if other != along)
+    values = [getattr(cell.size, across) for cell in cells]
+    at = max(set(values), key=lambda value: (len(_different(cells, across, value, along)), value), default=0)
+    names = list(dict.fromkeys(cell.contender for cell in cells))
+    for k, name in enumerate(names):
+        line = sorted(
+            (getattr(cell.size, along), cell.wall)
+            for cell in cells
+            if cell.contender == name and getattr(cell.size, across) == at
+        )
+        if line:
+            look: dict[str, Any] = {"color": COLOURS.get(name, f"C{k}"), "marker": MARKERS[k % len(MARKERS)]}
+            ax.plot(*zip(*line, strict=True), label=name.replace("_", " "), markersize=5, **look)
+    ax.set(xscale="log", yscale="log")
+    ax.set_xlabel(AXES[along])
+    caption(ax, quantity, f"{at} {AXES[across]}")
+
+
+def _different(cells: Sequence[Cell], across: str, value: int, along: str) -> set[int]:
+    return {getattr(cell.size, along) for cell in cells if getattr(cell.size, across) == value}

@@ -1,0 +1,168 @@
+"""Times of the contenders, which take turns in one process."""
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from benchmarking import cores
+from benchmarking.case import System, scenario_of, system_of
+from benchmarking.contenders import QUANTITIES, Calls, Contenders, Quantity, made_once, quantities_of
+from benchmarking.sizes import Size
+from rt_torchrl import DivergenceError
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The time of one contender at one size, or the reason why it was not taken.
+
+    Args:
+        size: size of the problem.
+        contender: name of the contender.
+        quantity: forward for the cost, gradient for its gradient by the policy's weights.
+        wall: median wall time [s].
+        cpu: median CPU time of the process [s].
+        repeats: number of evaluations behind the medians.
+        first: wall time of the first evaluation, which may compile [s].
+        gap: relative difference of the result from that of the first contender of the cell.
+        left_out: reason why there is no time; empty if there is one.
+    """
+
+    size: Size
+    contender: str
+    quantity: Quantity
+    wall: float = float("nan")
+    cpu: float = float("nan")
+    repeats: int = 0
+    first: float = float("nan")
+    gap: float = float("nan")
+    left_out: str = ""
+
+    def record(self) -> dict[str, Any]:
+        """The cell for a JSON file."""
+        case = self.size.case
+        where = {"plant": case.plant, "closure": case.closure, "policy": case.policy, "threads": self.size.threads}
+        where |= {"steps": self.size.steps, "realisations": self.size.realisations}
+        where |= {"contender": self.contender, "quantity": self.quantity}
+        if self.left_out:
+            return where | {"left_out": self.left_out}
+        names = ("wall", "cpu", "repeats", "first", "gap")
+        return where | {name: getattr(self, name) for name in names}
+
+
+@dataclass
+class Stopwatch:
+    """Times all contenders at one size after another.
+
+    Args:
+        contenders: the contenders.
+        repeats: greatest number of timed evaluations in each cell.
+        limit: time [s] above which a cell is left out by its prediction, and after which it is repeated no more.
+        tell: function that is called with what is being done.
+    """
+
+    contenders: Contenders
+    repeats: int
+    limit: float
+    tell: Callable[[str], None]
+    cells: list[Cell] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._made = made_once(self.contenders)
+        self._systems: dict[Any, System] = {}
+
+    def time(self, size: Size, names: Sequence[str] = ()) -> list[Cell]:
+        """The cells at a size, which are also added to ``cells``.
+
+        Args:
+            size: size of the problem.
+            names: contenders to be timed; by default all.
+        """
+        system = self._systems.setdefault(size.case, system_of(size.case))
+        scenario = scenario_of(system.case, size.steps, size.realisations)
+        calls: dict[str, Calls] = {}
+        found: list[Cell] = []
+        for quantity in QUANTITIES:
+            able = []
+            for name in names or self.contenders.names:
+                if quantity not in quantities_of(name):
+                    continue
+                reason = self.contenders.refusal(name, system) or self._too_long(size, name, quantity)
+                if reason:
+                    found.append(Cell(size, name, quantity, left_out=reason))
+                    continue
+                if name not in calls:
+                    calls[name] = self._made(name, system).calls(scenario)
+                able.append(name)
+            found += self._in_turn(size, quantity, {name: getattr(calls[name], quantity) for name in able})
+        self.cells += found
+        return found
+
+    def predicted(self, size: Size, contender: str, quantity: Quantity) -> float:
+        """Wall time [s] that other sizes predict at most; NaN if none has been timed.
+
+        It is in proportion to the steps and to more realisations; fewer realisations may take as long.
+        """
+        found = [
+            cell.wall * size.steps / cell.size.steps * max(1.0, size.realisations / cell.size.realisations)
+            for cell in self.cells
+            if (cell.contender, cell.quantity, cell.size.case) == (contender, quantity, size.case)
+            and cell.size.threads == size.threads
+            and not cell.left_out
+        ]
+        return min(found, default=float("nan"))
+
+    def _too_long(self, size: Size, name: str, quantity: Quantity) -> str:
+        seconds = self.predicted(size, name, quantity)
+        return f"about {seconds:.3g} s predicted, limit {self.limit:g} s" if seconds > self.limit else ""
+
+    def _in_turn(self, size: Size, quantity: Quantity, functions: dict[str, Callable[[], Any]]) -> list[Cell]:
+        results, first = {}, {}
+        wall: dict[str, list[float]] = {name: [] for name in functions}
+        cpu: dict[str, list[float]] = {name: [] for name in functions}
+        with cores.torch_threads(size.threads):
+            for name, function in functions.items():
+                self.tell(f"{size.case.name}: {name}, {quantity}, {size.steps} x {size.realisations}")
+                start = time.perf_counter()
+                found = _finite(function)
+                if found is not None:
+                    results[name], first[name] = found, time.perf_counter() - start
+            with cores.limited_to(size.threads):
+                for _ in range(self.repeats):
+                    for name in results:
+                        if sum(wall[name]) <= self.limit:
+                            _clock(functions[name], wall[name], cpu[name])
+        reference = next(iter(results.values()), None)
+        diverged = [Cell(size, name, quantity, left_out="diverged") for name in functions if name not in results]
+        return diverged + [
+            Cell(
+                size,
+                name,
+                quantity,
+                statistics.median(wall[name]),
+                statistics.median(cpu[name]),
+                len(wall[name]),
+                first[name],
+                float(np.linalg.norm(results[name] - reference) / np.linalg.norm(reference)),
+            )
+            for name in results
+        ]
+
+
+def _finite(function: Callable[[], Any]) -> np.ndarray | None:
+    """A result; None if it is not finite."""
+    try:
+        result = np.asarray(function())
+    except DivergenceError:
+        return None
+    return result if np.isfinite(result).all() else None
+
+
+def _clock(function: Callable[[], Any], wall: list[float], cpu: list[float]) -> None:
+    start, start_cpu = time.perf_counter(), time.process_time()
+    function()
+    wall.append(time.perf_counter() - start)
+    cpu.append(time.process_time() - start_cpu)
