@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
+from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap
@@ -23,7 +24,6 @@ from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, results
-from rt_torchrl.runs.atomic_file import finite, write_json
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
