@@ -97,6 +97,7 @@ class Tracer(TorchDispatchMode):
         self, func: Any, types: Iterable[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
+        self.program.differentiating = torch._C._current_autograd_node() is not None
         packet = func._schema.name.split("::")[1]
         name = packet if packet.startswith("_") else packet.rstrip("_")
         if packet in DECISIONS:

@@ -5,11 +5,13 @@ from typing import ClassVar
 from torch import Tensor
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.linearisation import prepared
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class Autograd:
+class Autograd(GradientEngine):
     """Records every operation of every step; memory and time grow with the number of steps.
 
     Args:
@@ -24,4 +26,4 @@ class Autograd:
 
     def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
-        return self._march(interval, initial_state, drive)
+        return self._march(interval, *prepared(initial_state, drive))

@@ -6,12 +6,20 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from rt_torchrl.trajectories.engines.compilation import plain
+from rt_torchrl.trajectories.engines.compilation import marked_dynamic, plain
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
 PIECE = 2048
 """Number of intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one
 number of intervals; with this fixed number one graph serves all trajectories that are not shorter."""
+
+
+def prepared(initial_state: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
+    """State and drive in memory of their own, marked so that one compiled graph serves all batch sizes."""
+    copies = Drive(drive.t, plain(drive.exogenous), plain(drive.command))
+    for tensor in copies if drive.t.shape[1] > 1 else copies[1:]:
+        marked_dynamic(tensor, 1)
+    return marked_dynamic(plain(initial_state), 0), copies
 
 
 def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:

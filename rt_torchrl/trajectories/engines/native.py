@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.groups import Group, Signals, for_each_group, pieces
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
@@ -29,7 +30,7 @@ MEMORY = 2.0**30
 LEAST_MEMORY = 2.0**20
 
 
-class Native:
+class Native(GradientEngine):
     """Computes trajectories and their exact discrete adjoint by machine code; the module describes it.
 
     Where an interval cannot become a program, or is not on the CPU, the engine ``parallel`` takes its place, with one

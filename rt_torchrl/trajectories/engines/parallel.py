@@ -22,12 +22,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic, plain
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
-from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all, piece, pieces
+from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all, piece, pieces, prepared
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class Parallel:
+class Parallel(GradientEngine):
     """Computes the exact discrete adjoint in parallel over time; the module describes it.
 
     Args:
@@ -45,6 +46,7 @@ class Parallel:
 
     def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
+        initial_state, drive = prepared(initial_state, drive)
         weights = [w for w in interval.parameters() if w.requires_grad]
         return _DiscreteAdjoint.apply(self, interval, initial_state, *drive, *weights)
 

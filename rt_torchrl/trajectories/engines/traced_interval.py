@@ -95,7 +95,6 @@ class Sweep:
                 leaf.requires_grad_()
             with tracer:
                 end = torch.func.functional_call(interval, weights, (state, drive))
-                tracer.program.differentiating = True
                 found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
         cells = [_gradient(tracer, g, leaf) for g, leaf in zip(found or [None] * len(leaves), leaves, strict=True)]
         by_state, by_drive, by_weights = cells[0], sum(cells[1:4], []) if driven else [], cells[4 if driven else 1 :]
@@ -158,7 +157,8 @@ class Sweep:
 
 def packed(drive: Drive) -> np.ndarray:
     """The drive of one interval as one row, ``1 n_x lanes``."""
-    return np.concatenate([drive.t[None].numpy(), drive.exogenous.numpy().T, drive.command.numpy().T])[None]
+    rows = np.concatenate([drive.t[None].numpy(), drive.exogenous.numpy().T, drive.command.numpy().T])
+    return np.ascontiguousarray(rows)[None]  # NumPy keeps the order of transposed parts
 
 
 def weights_of(interval: nn.Module) -> np.ndarray:
