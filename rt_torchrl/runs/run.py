@@ -86,7 +86,8 @@ class Run:
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
         device = require_device(config.device)
-        compiled = can_compile(device) if config.compiled is None else config.compiled
+        native = config.engine == "native" and device.type == "cpu"
+        compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
         require_simulation(config, plant, env, baselines)
         for physics in filter(None, (plant, believed)):
             check_plant(physics, steps=CHECKED_STEPS, traced=False)

@@ -27,7 +27,7 @@ class DigitalTwin:
         self.plant, self.closure = plant, closure
         self._engine, self._compiled = engine, compiled
         self._replay = self._rollout(closure, None)
-        self.sensitivities = Sensitivities(plant, closure, compiled=compiled)
+        self.sensitivities = Sensitivities(plant, closure)
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)

@@ -11,6 +11,7 @@ which computes each interval again from its start. The lanes of the processor's 
 lanes are divided among the threads of torch.
 """
 
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,9 +51,17 @@ class Native(GradientEngine):
     def __init__(self, *, compiled: bool, memory: float = MEMORY):
         if not memory >= LEAST_MEMORY:
             raise ValueError(f"memory={memory} bytes of engine 'native' must be at least {LEAST_MEMORY:.0f}.")
-        self.memory, self._substitute = memory, Parallel(compiled=compiled)
+        self.memory, self._compiled = memory, compiled
 
-    def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    @cached_property
+    def _substitute(self) -> Parallel:
+        return Parallel(compiled=self._compiled)
+
+    def takes(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> bool:
+        """Whether the interval can become a program; a warning says why not."""
+        return programs_of(interval, initial_state, drive) is not None
+
+    def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         programs = programs_of(interval, initial_state, drive)
         if programs is None:

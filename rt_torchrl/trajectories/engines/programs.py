@@ -54,7 +54,9 @@ class Programs:
 
 
 def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Programs | None:
-    """The programs of an interval; None, with one warning, if it cannot become one."""
+    """The programs of an interval; None where it is not on the CPU or, with one warning, cannot become a program."""
+    if initial_state.device.type != "cpu":
+        return None
     with _lock:
         lanes = lanes_of_this_machine()
         digest, alive = fingerprint(interval)
@@ -63,8 +65,6 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Pro
         if found is None:
             point = _point(initial_state, drive, lanes.number)
             try:
-                if initial_state.device.type != "cpu":
-                    raise UntraceableError(f"it computes on the CPU, and the states are on {initial_state.device}")
                 found = Programs(interval, point, lanes, alive)
             except UntraceableError as error:
                 found = error
