@@ -16,7 +16,6 @@ from rt_torchrl.identification.identification import Identified, held_back, meas
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
 from rt_torchrl.identification.sensor_log import Column, checked
 from rt_torchrl.runs.loaded_run import config_class_of
-from rt_torchrl.runs.machine import can_compile
 from rt_torchrl.runs.shipped_plants import plant_class
 
 
@@ -37,7 +36,6 @@ class Config:
         shortest: least number of control intervals of a part between gaps; shorter parts are left out.
         held_out: share at the end of the log on which the twin is judged and not trained.
         seed: seed of the closure's first weights, if these are random.
-        compiled: compile with torch.compile; by default for 500 control intervals or more, if this machine can.
         log_dir: folder of the results; by default runs/identify/PLANT/TIME.
         identification: options of the search for the weights.
     """
@@ -52,7 +50,6 @@ class Config:
     shortest: int = 10
     held_out: float = 0.25
     seed: int = 0
-    compiled: bool | None = None
     log_dir: Path | None = None
     identification: Annotated[IdentificationConfig, tyro.conf.arg(name="")] = field(
         default_factory=IdentificationConfig
@@ -109,17 +106,9 @@ def main(config: Config) -> None:
     training, held_out = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
-    steps = sum(len(segment.actions) for segment in parts.segments)
-    wanted = steps >= 500 if config.compiled is None else config.compiled
     measured = measured_states(plant, log)
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
-    task = Identification(
-        plant,
-        closure,
-        free=measured,
-        config=config.identification,
-        compiled=wanted and (config.compiled is True or can_compile(torch.device("cpu"))),
-    )
+    task = Identification(plant, closure, free=measured, config=config.identification)
     found = task.run(training, held_out)
     metrics = metrics_of(plant, measured, found, parts) | {
         "config": dataclasses.asdict(config),

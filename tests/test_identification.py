@@ -2,7 +2,6 @@
 
 import math
 
-import fresh_process
 import numpy as np
 import pytest
 import torch
@@ -23,7 +22,6 @@ from rt_torchrl.identification.identification import (
 from rt_torchrl.identification.output_error import InitialStates, OutputError
 from rt_torchrl.identification.resampling import hold_out, resample
 from rt_torchrl.identification.simulated_log import policy_law, recorded
-from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -183,29 +181,3 @@ def test_a_twin_that_diverges_at_the_start_is_told():
 def test_options_out_of_range_are_refused(options, unchecked):
     with pytest.raises(ValueError, match=next(iter(options))):
         IdentificationConfig(**options)
-
-
-COMPARISON = """
-import sys, torch
-sys.path.insert(0, "tests")
-from test_identification import *
-from rt_torchrl.trajectories.sensitivity import Sensitivities
-plant = LinearQuadratic(horizon=5.0)
-segments = flown(plant, torch.Generator().manual_seed(0), (30, 20))
-twin = DigitalTwin(plant, plant.make_closure(torch.Generator().manual_seed(1)))
-initial = InitialStates(segments, (0, 1), torch.ones(2).double())
-by_step = Sensitivities(plant, twin.closure, compiled_step=True)
-eager, compiled = (OutputError(twin, segments, initial, sensitivities=s).normal_equations() for s in (None, by_step))
-# The same sums in another order.
-for first, second in zip(eager, compiled, strict=True):
-    torch.testing.assert_close(first, second, rtol=1e-11, atol=1e-13)
-print("equal")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(missing_for_compilation() is not None, reason=f"torch.compile lacks {missing_for_compilation()}")
-def test_a_compiled_interval_gives_the_same_for_every_length():
-    """The test runs in a process of its own, because annotations that are checked at run time cannot be compiled."""
-    done = fresh_process.run(COMPARISON)
-    assert done.stdout.strip() == "equal", done.stderr[-3000:]

@@ -8,10 +8,10 @@ import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
 
+from rt_torchrl.atomic_file import finite
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs import results
-from rt_torchrl.runs.atomic_file import finite
 from rt_torchrl.runs.results_table import results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig

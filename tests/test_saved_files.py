@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from rt_torchrl.runs.atomic_file import finite, write_atomically, write_json
+from rt_torchrl.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
 
 CONTENT = {

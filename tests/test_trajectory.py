@@ -168,7 +168,10 @@ def call(plant=None, policy=None, *, state=(2, 2), exogenous=(2, 50, 1), command
         (lambda: call(spoil="initial_state"), "initial_state holds NaN"),
         (lambda: call(spoil="exogenous"), "exogenous holds NaN"),
         (lambda: call(spoil="command"), "command holds NaN"),
-        (lambda: call(engine="magic"), "engine='magic' does not exist; choose one of parallel, odeint_adjoint, auto"),
+        (
+            lambda: call(engine="magic"),
+            "engine='magic' does not exist; choose one of native, parallel, odeint_adjoint",
+        ),
         (
             lambda: call(policy=nn.Linear(2, 1), command=None),
             r"policy Linear has weight in torch\.float32; .*Call policy\.double\(\)",

@@ -8,9 +8,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic
+from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
-from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 from rt_torchrl.trajectories.rollout import drive_of
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -49,7 +48,7 @@ class ClassicalController(nn.Module, ABC):
         low, high = bounds(plant.actions)
         self.register_buffer("low_action", low)
         self.register_buffer("high_action", high)
-        self._march = compiled_if(compiled, march_by_scan, march)
+        self._engine = Native(compiled=compiled)
 
     def named_gains(self) -> dict[str, float]:
         """The gains by name."""
@@ -75,9 +74,9 @@ class ClassicalController(nn.Module, ABC):
         """Episodes under this controller, of a system with the closure; None takes the plant's own closure."""
         closure = self.plant.closure if closure is None else closure
         loop, n_s = ControlledInterval(self, closure), len(self.plant.states)
-        start = marked_dynamic(torch.cat([initial_state, self.first_memory(initial_state)], -1), 0)
+        start = torch.cat([initial_state, self.first_memory(initial_state)], -1)
         drive = drive_of(self.plant, exogenous, None)
-        carries = torch.cat([start.unsqueeze(0), self._march(loop, start, drive)])
+        carries = torch.cat([start.unsqueeze(0), self._engine.end_states(loop, start, drive)])
         states = carries[..., :n_s].transpose(0, 1)
         command = loop.commanded(carries[:-1].flatten(0, 1))[0].unflatten(0, carries[:-1].shape[:2])
         return Trajectory(states, self.plant.actuate(states[:, :-1], command.transpose(0, 1)), exogenous)

@@ -11,17 +11,17 @@ STEPS = 40
 
 
 def engine_gap(closure: nn.Module, policy: nn.Module, unseen: UnseenEpisodes) -> float:
-    """Relative gap ‖g_parallel − g_reference‖/‖g_reference‖ of the gradients of J_a by closure and policy weights.
+    """Relative gap ‖g − g_reference‖/‖g_reference‖ of the gradients of J_a by closure and policy weights.
 
     The reference engine is ``odeint_adjoint``, the paper's adjoint, or ``autograd`` for a plant with a scheme of its
-    own. Both run eagerly over a short horizon and two episodes, so that the check takes seconds and not minutes.
+    own. Both run eagerly over a short horizon and two episodes, so that the check takes seconds.
     Weights that are not trained are left out.
 
     Raises:
         ValueError: if no weight of the closure or the policy is trained.
     """
     slow: Engine = "autograd" if refusal("odeint_adjoint", unseen.plant) else "odeint_adjoint"
-    fast, reference = (_gradient(closure, policy, unseen, engine) for engine in ("parallel", slow))
+    fast, reference = (_gradient(closure, policy, unseen, engine) for engine in ("native", slow))
     return ((fast - reference).norm() / reference.norm()).item()
 
 

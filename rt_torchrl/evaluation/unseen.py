@@ -54,8 +54,10 @@ class UnseenEpisodes:
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly the episodes with a policy on the real system."""
-        rollout = Rollout(self.plant, self.known_closure(), policy, compiled=self._compiled)
-        return rollout(self.initial_state, self.exogenous)
+        return self._rollout(policy)(self.initial_state, self.exogenous)
+
+    def _rollout(self, policy: nn.Module) -> Rollout:
+        return Rollout(self.plant, self.known_closure(), policy, compiled=self._compiled)
 
     def known_closure(self) -> nn.Module:
         """The true closure.
@@ -83,9 +85,10 @@ class UnseenEpisodes:
             )
         return law.fly(self.initial_state, self.exogenous, self.closure)
 
+    @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
         """J_a of each episode."""
-        return control_cost(self.plant, self.fly(policy))
+        return self._rollout(policy).costs(self.initial_state, self.exogenous)
 
     def validation(self) -> "UnseenEpisodes | None":
         """Validation episodes: as many, with other draws, on the system as it is now; None if they would cost flights.
@@ -202,11 +205,11 @@ def exact_optimum(
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
     def descend(policy: nn.Module, count: int, iterations: int) -> float:
-        rollout = Rollout(unseen.plant, unseen.known_closure(), policy, compiled=unseen._compiled)
+        rollout = unseen._rollout(policy)
         state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
 
         def cost() -> Tensor:
-            return control_cost(unseen.plant, rollout(state, exogenous)).mean()
+            return rollout.costs(state, exogenous).mean()
 
         return Descent(policy, DescentConfig(optimiser="lbfgs", rate=1.0)).run(cost, iterations).best
 

@@ -83,7 +83,6 @@ class Identification:
         closure: closure of the twin, trained in place.
         free: indices of the states whose initial value is estimated, see :func:`measured_states`.
         config: parameters of the identification.
-        compiled: whether to compile one interval.
     """
 
     def __init__(
@@ -93,11 +92,10 @@ class Identification:
         *,
         free: Sequence[int],
         config: IdentificationConfig,
-        compiled: bool = False,
     ):
         self.twin, self.config = DigitalTwin(plant, closure), config
         self.free = tuple(free) if config.initial == "estimated" else ()
-        self._sensitivities = Sensitivities(plant, closure, compiled_step=compiled)
+        self._sensitivities = Sensitivities(plant, closure)
 
     def run(self, training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> Identified:
         """Train on some segments and judge on both kinds; the initial states of both are treated the same way.

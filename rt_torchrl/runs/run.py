@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
+from rt_torchrl.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap
@@ -23,7 +24,6 @@ from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, results
-from rt_torchrl.runs.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.progress import Progress
@@ -84,7 +84,8 @@ class Run:
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
         device = require_device(config.device)
-        compiled = can_compile(device) if config.compiled is None else config.compiled
+        native = config.engine == "native" and device.type == "cpu"
+        compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
         require_simulation(config, plant, env, baselines)
         for physics in filter(None, (plant, believed)):
             check_plant(physics, steps=CHECKED_STEPS, traced=False)

@@ -38,10 +38,11 @@ class RunConfig:
         closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number n_e of real episodes.
         seed: seed of weights, disturbances, exploration and sampling; the same seed gives the same run.
-        engine: gradient engine of steps 4 and 5: parallel (exact, fast), odeint_adjoint (the paper's continuous
-            adjoint, slow) or autograd (exact, slow).
-        compiled: whether to compile with torch.compile. By default a run compiles if this machine can, and a notice
-            says if it cannot. A run that does not compile starts at once, but every step is several times slower.
+        engine: gradient engine of steps 4 and 5: native (exact, machine code, for CPUs), parallel (exact, PyTorch, for
+            GPUs), odeint_adjoint (the paper's continuous adjoint, slow) or autograd (exact, slow).
+        compiled: whether to compile with torch.compile what PyTorch computes. By default the engine native compiles
+            nothing, because it computes itself; other engines and devices compile if this machine can, and a notice
+            says if it cannot. Without compilation these start at once, but every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
@@ -73,7 +74,7 @@ class RunConfig:
     closure_hidden: tuple[int, ...] = (16, 16)
     episodes: int = 20
     seed: int = 0
-    engine: Engine = "parallel"
+    engine: Engine = "native"
     compiled: bool | None = None
     device: str = "cpu"
     threads: int = 0

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import filelock
 
+from rt_torchrl.atomic_file import remove_partials
 from rt_torchrl.runs import run_settings
-from rt_torchrl.runs.atomic_file import remove_partials
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import FILE
 

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rt_torchrl.runs.atomic_file import write_atomically
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, FILE, RAN, read_settings, settings_of
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rt_torchrl.runs.atomic_file import write_atomically
+from rt_torchrl.atomic_file import write_atomically
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:

@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs.atomic_file import write_atomically
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.run_config import RunConfig, plant_of
 from rt_torchrl.study.json_file import read_json

@@ -4,9 +4,9 @@ r"""Forward sensitivities of a trajectory to the closure's weights, :math:`S_k =
     S_0 = 0, \qquad S_{k+1} = A_kS_k + B_k, \quad
     A_k = \frac{\partial\Phi}{\partial s}(s_k, x_k), \quad B_k = \frac{\partial\Phi}{\partial w}(s_k, x_k)
 
-As in the parallel adjoint, a batched call computes all A_k and B_k; only the linear recurrence is sequential. The
-sensitivities give the gradient, the Gauss-Newton matrix and the Fisher information of an identification. Their cost
-grows with the number of weights, unlike that of an adjoint: they are for closures of up to some hundred weights.
+The engine ``native`` runs this recurrence as a part of the trajectory's. The sensitivities give the gradient, the
+Gauss-Newton matrix and the Fisher information of an identification. Their cost grows with the number of weights, unlike
+that of an adjoint: they are for closures of up to some hundred weights.
 """
 
 from functools import partial
@@ -16,14 +16,45 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic, plain
-from rt_torchrl.trajectories.engines.interval import Interval
-from rt_torchrl.trajectories.engines.linearisation import linearise, linearise_by_rows, over_all
-from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan, march_by_step
+from rt_torchrl.trajectories.engines import Native
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.linearisation import linearise_by_rows, over_all
 from rt_torchrl.trajectories.rollout import drive_of
 
-WIDE = 4
-"""Ratio of weights to states above which reverse-mode products for all states are quicker than one for each weight."""
+WIDE = 64
+"""Number of columns of S from which batched Jacobians by torch are quicker than one recurrence of states and S."""
+
+
+class TangentInterval(nn.Module):
+    """An interval whose state (s, S) also holds the sensitivities S, flattened, of weights and of initial states.
+
+    Args:
+        interval: the interval of the states s, with the closure whose trained weights come first among the columns.
+    """
+
+    def __init__(self, interval: Interval):
+        super().__init__()
+        self.interval = interval
+        self.names = [name for name, w in interval.closure.named_parameters() if w.requires_grad]
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """States and sensitivities, (s, S), at the end of the interval."""
+        n_s = len(self.interval.plant.states)
+        s, S = state[..., :n_s], state[..., n_s:].unflatten(-1, (n_s, -1))
+        held = dict(self.interval.closure.named_parameters())
+        weights = {f"closure.{name}": held[name] for name in self.names}
+        t = drive.t.expand(s.shape[:1])
+
+        def end(values: dict[str, Tensor], s: Tensor, *drive: Tensor) -> Tensor:
+            return torch.func.functional_call(self.interval, values, (s, Drive(*drive)))
+
+        jacobians = torch.func.vmap(torch.func.jacrev(end, argnums=(0, 1)), in_dims=(None, 0, 0, 0, 0))
+        by_weights, A = jacobians(weights, s, t, drive.exogenous, drive.command)
+        sources = [jacobian.flatten(2) for jacobian in by_weights.values()]
+        # s_0 acts like weights that are used in the first interval alone.
+        unused = S.shape[-1] - sum(part.shape[-1] for part in sources)
+        B = torch.cat([*sources, s.new_zeros(*s.shape, unused)], -1)
+        return torch.cat([self.interval(s, drive), (A @ S + B).flatten(1)], -1)
 
 
 class Sensitivities:
@@ -32,17 +63,11 @@ class Sensitivities:
     Args:
         plant: the physics.
         closure: closure with the trainable weights w_p, flattened in the order of ``parameters()``.
-        compiled: compile recurrences and Jacobians, for trajectories that all have the same length.
-        compiled_step: compile one interval instead, for trajectories of any length.
     """
 
-    def __init__(self, plant: Plant, closure: nn.Module, *, compiled: bool = False, compiled_step: bool = False):
+    def __init__(self, plant: Plant, closure: nn.Module):
         self.interval = Interval(plant, closure, None)
-        self._march = march_by_step if compiled_step else compiled_if(compiled, march_by_scan, march)
-        wide = sum(w.numel() for w in closure.parameters() if w.requires_grad) > WIDE * len(plant.states)
-        # The Jacobians by rows are not compiled: the compiler gains little there.
-        self._jacobians = linearise_by_rows if wide else compiled_if(compiled, linearise)
-        self._propagate = compiled_if(compiled, propagate_by_scan, propagate)
+        self._engine = Native(compiled=False)
 
     @torch.no_grad()
     def __call__(
@@ -64,36 +89,27 @@ class Sensitivities:
             initial: append the n_s columns of ds_k/ds_0.
         """
         drive = drive_of(self.interval.plant, exogenous, actions, start=start)
-        initial_state = marked_dynamic(plain(initial_state), 0)
-        ends = self._march(self.interval, initial_state, drive)
-        starts = torch.cat([initial_state.unsqueeze(0), ends[:-1]])
-        names = tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
-        n_s = initial_state.shape[-1]
-        A, B = over_all(partial(self._jacobians, self.interval, names), starts, drive).tensor_split([n_s], -1)
+        batch, n_s = initial_state.shape
+        count = sum(w.numel() for w in self.interval.closure.parameters() if w.requires_grad)
+        S = initial_state.new_zeros(batch, n_s, count)
         if initial:
-            # s_0 acts like weights that are used in the first interval alone.
-            B = torch.cat([B, torch.cat([A[:1], torch.zeros_like(A[1:])])], -1)
-        return ends.transpose(0, 1), self._propagate(A, B).transpose(0, 1)
+            S = torch.cat([S, torch.eye(n_s, dtype=S.dtype, device=S.device).expand(batch, -1, -1)], -1)
+        tangent, state = TangentInterval(self.interval), torch.cat([initial_state, S.flatten(1)], -1)
+        if S.shape[-1] <= WIDE and self._engine.takes(tangent, state, drive):
+            ends, S_ends = self._engine.end_states(tangent, state, drive).split([n_s, n_s * S.shape[-1]], -1)
+            S_ends = S_ends.unflatten(-1, S.shape[1:])
+        else:
+            ends = self._engine.end_states(self.interval, initial_state, drive)
+            S_ends = self._propagated(S, torch.cat([initial_state.unsqueeze(0), ends[:-1]]), drive)
+        return ends.transpose(0, 1), S_ends.transpose(0, 1)
 
-
-def propagate(A: Tensor, B: Tensor) -> Tensor:
-    """The sensitivities S_1 ... S_n, ``n batch n_s n_w``, by a loop."""
-    sensitivity, found = torch.zeros_like(B[0]), []
-    for transition, source in zip(A, B, strict=True):
-        sensitivity = transition @ sensitivity + source
-        found.append(sensitivity)
-    return torch.stack(found)
-
-
-def propagate_by_scan(A: Tensor, B: Tensor) -> Tensor:
-    """The sensitivities of :func:`propagate` by one ``scan``, for the compiler."""
-    from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
-
-    def body(sensitivity: Tensor, x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        transition, source = x
-        product = (transition.unsqueeze(-1) * sensitivity.unsqueeze(-3)).sum(-2)
-        sensitivity = (product + source).contiguous()
-        return sensitivity, sensitivity.clone()
-
-    start = torch.zeros_like(B[0], memory_format=torch.contiguous_format)
-    return scan(body, start, (A.contiguous(), B.contiguous()))[1]
+    def _propagated(self, S: Tensor, starts: Tensor, drive: Drive) -> Tensor:
+        """The sensitivities S_1 ... S_n, ``n batch n_s n_w``, from the Jacobians of all intervals at once."""
+        names = tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
+        jacobians = over_all(partial(linearise_by_rows, self.interval, names), starts, drive)
+        A, B = jacobians.tensor_split([starts.shape[-1]], -1)
+        unused, found = S.shape[-1] - B.shape[-1], []
+        for transition, source in zip(A, B, strict=True):
+            S = transition @ S + torch.nn.functional.pad(source, (0, unused))
+            found.append(S)
+        return torch.stack(found)

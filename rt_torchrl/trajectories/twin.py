@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine, Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class DigitalTwin:
@@ -23,11 +23,11 @@ class DigitalTwin:
         compiled: compile the engine.
     """
 
-    def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "parallel", compiled: bool = False):
+    def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "native", compiled: bool = False):
         self.plant, self.closure = plant, closure
         self._engine, self._compiled = engine, compiled
         self._replay = self._rollout(closure, None)
-        self.sensitivities = Sensitivities(plant, closure, compiled=compiled)
+        self.sensitivities = Sensitivities(plant, closure)
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
@@ -61,7 +61,7 @@ class DigitalTwin:
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
-        return control_cost(self.plant, self.control(policy, initial_state, exogenous)).mean()
+        return self._rollout(constant(self.closure), policy).costs(initial_state, exogenous).mean()
 
 
 def constant(module: nn.Module) -> nn.Module:

@@ -2,14 +2,16 @@
 
 from typing import ClassVar
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
+from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.linearisation import prepared
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class Autograd:
+class Autograd(GradientEngine):
     """Records every operation of every step; memory and time grow with the number of steps.
 
     Args:
@@ -22,6 +24,6 @@ class Autograd:
     def __init__(self, *, compiled: bool):
         self._march = compiled_if(compiled, march_by_scan, march)
 
-    def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
-        return self._march(interval, initial_state, drive)
+        return self._march(interval, *prepared(initial_state, drive))

@@ -23,3 +23,10 @@ class GradientEngine(Protocol):
     def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable by weights, initial state and drive."""
         ...
+
+    def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
+        """Sums of the running cost over all intervals, ``batch``, differentiable; None if they follow from the states.
+
+        An engine computes them itself if this is quicker than to differentiate the costs of all states.
+        """
+        return None

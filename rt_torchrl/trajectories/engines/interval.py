@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
@@ -40,3 +41,22 @@ class Interval(nn.Module):
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """The state at the end of the interval."""
         return self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure).state
+
+
+class CostInterval(nn.Module):
+    """An interval whose state (s, J) also sums the running cost, J_{k+1} = J_k + L_a(t_k, s_k, a_k, z_k).
+
+    Args:
+        interval: the interval of the states s.
+    """
+
+    def __init__(self, interval: Interval):
+        super().__init__()
+        self.interval = interval
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """State and cost, (s, J), at the end of the interval."""
+        plant, s = self.interval.plant, state[..., :-1]
+        applied = plant.actuate(s, self.interval.command(s, drive))
+        cost = state[..., -1] + plant.running_cost(drive.t, s, applied, drive.exogenous)
+        return torch.cat([self.interval(s, drive), cost.unsqueeze(-1)], -1)

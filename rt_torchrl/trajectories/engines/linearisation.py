@@ -4,14 +4,22 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from rt_torchrl.trajectories.engines.compilation import plain
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.compilation import marked_dynamic, plain
+from rt_torchrl.trajectories.engines.interval import Drive
 
 PIECE = 2048
 """Number of intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one
 number of intervals; with this fixed number one graph serves all trajectories that are not shorter."""
+
+
+def prepared(initial_state: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
+    """State and drive in memory of their own, marked so that one compiled graph serves all batch sizes."""
+    copies = Drive(drive.t, plain(drive.exogenous), plain(drive.command))
+    for tensor in copies if drive.t.shape[1] > 1 else copies[1:]:
+        marked_dynamic(tensor, 1)
+    return marked_dynamic(plain(initial_state), 0), copies
 
 
 def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
@@ -54,7 +62,7 @@ def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive:
     return torch.cat(found).unflatten(0, starts.shape[:2])
 
 
-def linearise(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+def linearise(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
     """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column.
 
     Args:
@@ -63,7 +71,7 @@ def linearise(interval: Interval, names: tuple[str, ...], starts: Tensor, drive:
         starts: states at the starts of the intervals, ``rows n_s``.
         drive: times and inputs of the intervals.
     """
-    weights = tuple(interval.closure.get_parameter(name) for name in names)
+    weights = tuple(interval.get_parameter(f"closure.{name}") for name in names)
     sizes = [starts.shape[-1], *(w.numel() for w in weights)]
     basis = torch.eye(sum(sizes), dtype=starts.dtype, device=starts.device)
 
@@ -79,9 +87,9 @@ def linearise(interval: Interval, names: tuple[str, ...], starts: Tensor, drive:
     return torch.func.vmap(column, out_dims=-1)(basis)
 
 
-def linearise_by_rows(interval: Interval, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+def linearise_by_rows(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
     """The result of :func:`linearise` by a reverse-mode product for each row: less work where n_w is far above n_s."""
-    weights = {f"closure.{name}": interval.closure.get_parameter(name).detach() for name in names}
+    weights = {f"closure.{name}": interval.get_parameter(f"closure.{name}").detach() for name in names}
 
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
         return torch.func.functional_call(interval, values, (state, Drive(*drive)))

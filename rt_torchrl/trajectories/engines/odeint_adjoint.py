@@ -6,10 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
 
-class OdeintAdjoint:
+class OdeintAdjoint(GradientEngine):
     r"""Chains :func:`torchdiffeq.odeint_adjoint` over the control intervals.
 
     The applied action and the exogenous input are constant components of the integrated state. The co-state of an

@@ -17,16 +17,17 @@ from functools import partial, reduce
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic, plain
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
-from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all, piece, pieces
+from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
+from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all, piece, pieces, prepared
 from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
 
 
-class Parallel:
+class Parallel(GradientEngine):
     """Computes the exact discrete adjoint in parallel over time; the module describes it.
 
     Args:
@@ -42,8 +43,9 @@ class Parallel:
         self.costates = compiled_if(compiled, costates_by_scan, costates)
         self.intervals = compiled_if(compiled, _all_intervals)
 
-    def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+    def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
+        initial_state, drive = prepared(initial_state, drive)
         weights = [w for w in interval.parameters() if w.requires_grad]
         return _DiscreteAdjoint.apply(self, interval, initial_state, *drive, *weights)
 
@@ -55,7 +57,7 @@ class _DiscreteAdjoint(torch.autograd.Function):
     def forward(
         ctx: Any,
         engine: Parallel,
-        interval: Interval,
+        interval: nn.Module,
         initial_state: Tensor,
         t: Tensor,
         exogenous: Tensor,
@@ -83,8 +85,8 @@ class _DiscreteAdjoint(torch.autograd.Function):
 
 
 def _products(
-    function: Callable[[Interval, Tensor, Drive], Tensor],
-    interval: Interval,
+    function: Callable[[nn.Module, Tensor, Drive], Tensor],
+    interval: nn.Module,
     starts: Tensor,
     drive: Drive,
     weights: Sequence[Tensor],
@@ -130,9 +132,10 @@ def _known(parts: Sequence[Tensor | None]) -> list[Tensor]:
     return [part for part in parts if part is not None]
 
 
-def _all_intervals(interval: Interval, starts: Tensor, drive: Drive) -> Tensor:
+def _all_intervals(interval: nn.Module, starts: Tensor, drive: Drive) -> Tensor:
     """Φ at every interval at once."""
-    return interval(starts, drive)
+    ends: Tensor = interval(starts, drive)
+    return ends
 
 
 def costates(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:

@@ -1,13 +1,13 @@
 """The recurrence s_{k+1} = Φ(s_k, x_k) itself, as a Python loop or as one compiled scan."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from rt_torchrl.trajectories.engines.compilation import compiled_if, plain
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.compilation import plain
+from rt_torchrl.trajectories.engines.interval import Drive
 
 
-def march(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+def march(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
     """States at the end of every interval, ``n batch n_s``, by a loop."""
     state, states = initial_state, []
     for k in range(drive.t.shape[0]):
@@ -16,7 +16,7 @@ def march(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
     return torch.stack(states)
 
 
-def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
+def march_by_scan(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
     """The states of :func:`march` by one ``scan``, for the compiler."""
     from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
 
@@ -26,20 +26,3 @@ def march_by_scan(interval: Interval, initial_state: Tensor, drive: Drive) -> Te
         return state, state.clone()
 
     return scan(body, plain(initial_state), tuple(drive))[1]
-
-
-def march_by_step(interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
-    """The states of :func:`march` by a loop over one compiled interval.
-
-    The loop is slower than the scan, but is compiled once for all lengths.
-    """
-    step = compiled_if(True, _one_interval)
-    state, states = initial_state, []
-    for k in range(drive.t.shape[0]):
-        state = step(interval, state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
-        states.append(state)
-    return torch.stack(states)
-
-
-def _one_interval(interval: Interval, state: Tensor, drive: Drive) -> Tensor:
-    return interval(state, drive)

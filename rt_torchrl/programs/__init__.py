@@ -1,0 +1,1 @@
+"""Programs: torch functions as straight-line arithmetic, in machine code and in C."""

@@ -1,0 +1,69 @@
+"""Elementwise operators of torch as scalar operations of a program."""
+
+from collections.abc import Callable
+
+from rt_torchrl.programs.program import COMPARISONS, UNARY, Program
+
+Scalar = Callable[..., int]
+
+
+def _sigmoid(p: Program, a: int) -> int:
+    one = p.constant(1.0)
+    return p.div(one, p.add(one, p.unary("exp", p.neg(a))))
+
+
+def _sign(p: Program, a: int) -> int:
+    zero = p.constant(0.0)
+    return p.sub(p.as_number(p.compare("ogt", a, zero)), p.as_number(p.compare("olt", a, zero)))
+
+
+def _one_minus_square(p: Program, a: int) -> int:
+    return p.sub(p.constant(1.0), p.mul(a, a))
+
+
+def _unary(name: str) -> Scalar:
+    return lambda p, a: p.unary(name, a)
+
+
+def _comparison(how: str) -> Scalar:
+    return lambda p, a, b: p.compare(how, a, b)
+
+
+def _logic(how: str) -> Scalar:
+    return lambda p, *a: p.logic(how, *a)
+
+
+ELEMENTWISE: dict[str, Scalar] = {
+    **{name: _unary(name) for name in UNARY},
+    **{name: _comparison(how) for name, how in COMPARISONS.items()},
+    **{f"{family}_{how}": _logic(how) for family in ("logical", "bitwise") for how in ("and", "or", "xor", "not")},
+    "add": Program.add,
+    "sub": Program.sub,
+    "mul": Program.mul,
+    "div": Program.div,
+    "pow": Program.pow,
+    "where": Program.select,
+    "minimum": lambda p, a, b: p.extreme("minimum", a, b),
+    "maximum": lambda p, a, b: p.extreme("maximum", a, b),
+    "atan2": lambda p, a, b: p.new("atan2", p.as_number(a), p.as_number(b)),
+    "hypot": lambda p, a, b: p.unary("sqrt", p.add(p.mul(a, a), p.mul(b, b))),
+    "reciprocal": lambda p, a: p.div(p.constant(1.0), a),
+    "rsqrt": lambda p, a: p.div(p.constant(1.0), p.unary("sqrt", a)),
+    "square": lambda p, a: p.mul(a, a),
+    "isnan": lambda p, a: p.compare("une", a, a),
+    "relu": lambda p, a: p.select(p.compare("olt", a, p.constant(0.0)), p.constant(0.0), a),
+    "sign": _sign,
+    "sgn": _sign,
+    "sigmoid": _sigmoid,
+    "remainder": lambda p, a, b: p.sub(a, p.mul(p.unary("floor", p.div(a, b)), b)),
+    "tanh_backward": lambda p, g, y: p.mul(g, _one_minus_square(p, y)),
+    "sigmoid_backward": lambda p, g, y: p.mul(g, p.mul(y, p.sub(p.constant(1.0), y))),
+}
+ARITY = {
+    **dict.fromkeys(ELEMENTWISE, 2),
+    **dict.fromkeys((*UNARY, "reciprocal", "rsqrt", "square", "isnan", "relu", "sign", "sgn", "sigmoid"), 1),
+    **dict.fromkeys(("logical_not", "bitwise_not"), 1),
+    "where": 3,
+}
+IN_LOOPS = UNARY | set("add sub mul div pow atan2 square reciprocal tanh_backward sigmoid sigmoid_backward".split())
+"""Operators that the loop of a long row may hold; the others become straight-line code."""

@@ -1,0 +1,219 @@
+"""Lowering: a program becomes arithmetic, loads, stores and loops, which a writer puts into a language."""
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from typing import Protocol, runtime_checkable
+
+from rt_torchrl.programs.program import UNIFORM, Access, Program
+
+BLOCKS = (8, 6, 5, 4, 3, 2, 1)
+"""Numbers of columns of a product of matrices that are summed at once, so that a row is read once for all of them."""
+SHORT = 16
+"""Number of elements from which a run of gradients is added by a loop."""
+
+
+@runtime_checkable
+class Writer(Protocol):
+    """A language for lowered programs. Operands, indices and arrays are texts of that language.
+
+    ``lanes`` says whether a value is computed for each lane or once for all.
+    """
+
+    def constant(self, number: float, *, truth: bool, lanes: bool) -> str: ...
+    def compute(self, name: str, operands: Sequence[str], how: str, *, truth: bool, lanes: bool) -> str: ...
+    def spread(self, operand: str, *, truth: bool) -> str: ...
+    def table(self, numbers: Sequence[float]) -> str: ...
+    def local(self, size: int) -> str: ...
+    def index(self, base: int, terms: Sequence[tuple[int, str]]) -> str: ...
+    def load(self, array: str, index: str, *, lanes: bool, stored_lanes: bool) -> str: ...
+    def store(self, array: str, index: str, operand: str) -> None: ...
+    def look_up(self, table: str, size: int, place: str, offset: int) -> str: ...
+    def loop(self, count: int) -> AbstractContextManager[str]: ...
+    def variable(self, start: str) -> str: ...
+    def get(self, variable: str) -> str: ...
+    def put(self, variable: str, operand: str) -> None: ...
+
+
+class Lowering:
+    """Writes the values of a program that its outputs need, in the order of their computation.
+
+    Args:
+        program: the program.
+        writer: the language.
+        inputs: operand of each input, by name and position.
+        weights: array of the weights.
+    """
+
+    def __init__(self, program: Program, writer: Writer, inputs: dict[tuple[str, int], str], weights: str):
+        self.program, self.writer, self._inputs, self._weights = program, writer, inputs, weights
+        self._operands: dict[tuple[int, bool], str] = {}
+        self._arrays: dict[int, tuple[str, int, bool]] = {}  # name, offset, whether it holds lanes
+
+    def write(self, outputs: Sequence[int]) -> None:
+        """Write everything that the outputs need."""
+        for value in self.program.needed(outputs):
+            if self.program.kinds[value] == "array":
+                self._array(value)
+            else:
+                self._scalar(value)
+
+    def operand(self, value: int, *, lanes: bool = True) -> str:
+        """The operand of a scalar value that has been written."""
+        key, truth = (value, lanes), self.program.kinds[value] == "truth"
+        if key not in self._operands:
+            number = self.program.number(value)
+            if number is not None:
+                self._operands[key] = self.writer.constant(number, truth=truth, lanes=lanes)
+            else:  # computed once, wanted in every lane
+                self._operands[key] = self.writer.spread(self._operands[value, False], truth=truth)
+        return self._operands[key]
+
+    def _scalar(self, value: int) -> None:
+        p, (name, operands, attributes) = self.program, self.program.operations[value]
+        lanes = p.levels[value] > UNIFORM
+        if name == "constant":
+            return
+        if name == "input":
+            self._operands[value, lanes] = self._inputs[attributes]
+        elif name == "element":
+            array, offset, stored = self._arrays[operands[0]]
+            index = self.writer.index(offset + attributes[0], ())
+            self._operands[value, lanes] = self.writer.load(array, index, lanes=lanes, stored_lanes=stored)
+        elif name == "look_up":
+            size = len(p.operations[operands[0]].attributes)
+            place = self.operand(operands[1])
+            table = self._arrays[operands[0]][0]
+            self._operands[value, True] = self.writer.look_up(table, size, place, attributes[0])
+        else:
+            found = [self.operand(a, lanes=lanes) for a in operands]
+            how, truth = str(attributes[0]) if attributes else "", p.kinds[value] == "truth"
+            self._operands[value, lanes] = self.writer.compute(name, found, how, truth=truth, lanes=lanes)
+
+    # Arrays
+
+    def _array(self, value: int) -> None:
+        name, operands, attributes = self.program.operations[value]
+        if name == "weights":
+            self._arrays[value] = (self._weights, attributes[0], False)
+        elif name == "table":
+            self._arrays[value] = (self.writer.table([float.fromhex(x) for x in attributes]), 0, False)
+        else:
+            shapes: dict[str, Callable[..., int]] = {
+                "row": lambda *_: len(operands),
+                "map": lambda name, dims, accesses: math.prod(dims),
+                "product": lambda m, k, n, accesses: m * n,
+            }
+            array = self.writer.local(shapes[name](*attributes))
+            self._arrays[value] = (array, 0, True)
+            getattr(self, f"_{name}")(array, operands, *attributes)
+
+    def _row(self, array: str, operands: Sequence[int]) -> None:
+        for i, a in enumerate(operands):
+            self.writer.store(array, self.writer.index(i, ()), self.operand(a))
+
+    def _map(
+        self, array: str, operands: Sequence[int], name: str, dims: Sequence[int], accesses: Sequence[Access | None]
+    ) -> None:
+        strides = [math.prod(dims[d + 1 :]) for d in range(len(dims))]
+        if all(access is None or list(access.strides) == strides for access in accesses):
+            dims, strides = [math.prod(dims)], [1]  # all operands are walked through in order: one loop will do
+            accesses = [access and Access(access.base, (1,)) for access in accesses]
+
+        def inner(indices: list[str]) -> None:
+            found = [self._read(a, access, indices) for a, access in zip(operands, accesses, strict=True)]
+            at = self.writer.index(0, list(zip(strides, indices, strict=True)))
+            self.writer.store(array, at, self._elementwise(name, found))
+
+        self._loops(dims, inner)
+
+    def _elementwise(self, name: str, x: Sequence[str]) -> str:
+        """An elementwise operator on operands within a loop."""
+
+        def compute(name: str, *operands: str) -> str:
+            return self.writer.compute(name, operands, "", truth=False, lanes=True)
+
+        one = self.writer.constant(1.0, truth=False, lanes=True)
+        if name == "square":
+            return compute("mul", x[0], x[0])
+        if name == "reciprocal":
+            return compute("div", one, x[0])
+        if name == "sigmoid":
+            return compute("div", one, compute("add", one, compute("exp", compute("neg", x[0]))))
+        if name == "tanh_backward":
+            return compute("mul", x[0], compute("sub", one, compute("mul", x[1], x[1])))
+        if name == "sigmoid_backward":
+            return compute("mul", x[0], compute("mul", x[1], compute("sub", one, x[1])))
+        return compute(name, *x)
+
+    def _product(
+        self, array: str, operands: Sequence[int], m: int, k: int, n: int, accesses: Sequence[Access | None]
+    ) -> None:
+        writer, block = self.writer, next(b for b in BLOCKS if n % b == 0)
+        a, b, start = zip(operands, accesses, strict=True)
+
+        def inner(indices: list[str]) -> None:
+            i, j = indices
+            columns = [writer.index(c, [(block, j)]) for c in range(block)]
+            totals = [writer.variable(self._read(*start, [i, column])) for column in columns]
+
+            def step(inner_indices: list[str]) -> None:
+                (at,) = inner_indices
+                x = self._read(*a, [i, at])
+                for total, column in zip(totals, columns, strict=True):
+                    y = self._read(*b, [at, column])
+                    product = writer.compute("mul", [x, y], "", truth=False, lanes=True)
+                    sum_ = writer.compute("add", [writer.get(total), product], "", truth=False, lanes=True)
+                    writer.put(total, sum_)
+
+            self._loops([k], step)
+            for total, column in zip(totals, columns, strict=True):
+                writer.store(array, writer.index(0, [(n, i), (1, column)]), writer.get(total))
+
+        self._loops([m, n // block], inner)
+
+    def _read(self, value: int, access: Access | None, indices: Sequence[str]) -> str:
+        if access is None:
+            return self.operand(value)
+        array, offset, stored = self._arrays[value]
+        terms = [(stride, i) for stride, i in zip(access.strides, indices, strict=True) if stride]
+        at = self.writer.index(offset + access.base, terms)
+        return self.writer.load(array, at, lanes=True, stored_lanes=stored)
+
+    def _loops(self, counts: Sequence[int], inner: Callable[[list[str]], None]) -> None:
+        """Nested loops around ``inner``, which takes their indices."""
+
+        def nest(indices: list[str]) -> None:
+            if len(indices) == len(counts):
+                inner(indices)
+                return
+            with self.writer.loop(counts[len(indices)]) as index:
+                nest([*indices, index])
+
+        nest([])
+
+    # Outputs
+
+    def add_to(self, array: str, outputs: Sequence[int]) -> None:
+        """Add outputs to the elements of an array that holds lanes; runs of elements of one array by a loop."""
+        first = 0
+        while first < len(outputs):
+            operation, last = self.program.operations[outputs[first]], first
+            while operation.name == "element" and last + 1 < len(outputs):
+                follows = (operation.attributes[0] + last + 1 - first,)
+                if self.program.operations[outputs[last + 1]] != operation._replace(attributes=follows):
+                    break
+                last += 1
+            if last - first + 1 >= SHORT:
+                run = Access(operation.attributes[0], (1,))
+                with self.writer.loop(last - first + 1) as i:
+                    self._add(array, self.writer.index(first, [(1, i)]), self._read(operation.operands[0], run, [i]))
+            else:
+                for j in range(first, last + 1):
+                    if self.program.number(outputs[j]) != 0.0:
+                        self._add(array, self.writer.index(j, ()), self.operand(outputs[j]))
+            first = last + 1
+
+    def _add(self, array: str, index: str, operand: str) -> None:
+        held = self.writer.load(array, index, lanes=True, stored_lanes=True)
+        self.writer.store(array, index, self.writer.compute("add", [held, operand], "", truth=False, lanes=True))

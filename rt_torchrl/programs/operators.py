@@ -1,0 +1,297 @@
+"""Translations of torch's operators that are neither elementwise nor fills."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rt_torchrl.programs.program import VARYING, Program
+from rt_torchrl.programs.tracer import STRAIGHT, Rule, Tracer
+
+STRAIGHT_PRODUCT = 200
+"""Greatest number of multiplications of a product of matrices that becomes straight-line code."""
+Arguments = tuple[Any, ...]
+Options = dict[str, Any]
+
+# Copies, which are carried out on the cells
+
+
+def _copy_by(operator: Any) -> Rule:
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
+        def celled(x: Any) -> Any:
+            if isinstance(x, Tensor):
+                return tracer.cells(x)
+            return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
+
+        kept = {key: value for key, value in options.items() if key != "memory_format"}
+        return operator(*(celled(a) for a in args), **kept)
+
+    return rule
+
+
+def _copy(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.cells(args[0])
+
+
+def _overwrite(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.cells(args[1])
+
+
+def _pick_by(operator: Any) -> Rule:
+    """Copies from places that are known: ``gather`` and ``index_select``."""
+
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+        if tracer.numbers(tracer.cells(args[2])) is None:
+            raise tracer.refuse(f"{operator} by an index that varies")
+        picked: Tensor = operator(tracer.cells(args[0]), *args[1:])
+        return picked
+
+    return rule
+
+
+def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    if tracer.numbers(tracer.cells(args[2])) is None:
+        raise tracer.refuse("scatter by an index that varies")
+    source = tracer.cells(args[3]).expand(args[2].shape)
+    return tracer.cells(args[0]).scatter(args[1], args[2], source)
+
+
+def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    filling = tracer.program.constant(float(args[2]) if len(args) > 2 else 0.0)
+    return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
+
+
+def _slice_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    gradient, sizes, dim, start, end, step = args
+    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
+    index = torch.arange(sizes[dim])[slice(start, min(end, sizes[dim]), step)]
+    return zeros.index_copy(dim, index, tracer.cells(gradient))
+
+
+def _select_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    gradient, sizes, dim, index = args
+    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
+    return zeros.index_copy(dim, torch.tensor([index % sizes[dim]]), tracer.cells(gradient).unsqueeze(dim))
+
+
+def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    source, p = tracer.cells(args[0]), tracer.program
+    if args[0].dtype == out.dtype:
+        return source
+    if out.dtype == torch.bool:
+        convert: Callable[[int], int] = p.as_truth
+    elif out.is_floating_point() and out.dtype != torch.float64:
+        raise tracer.refuse(f"a conversion to {out.dtype}; trajectories need torch.float64")
+    elif out.is_complex():
+        raise tracer.refuse("complex numbers")
+    elif args[0].is_floating_point() and not out.is_floating_point():
+        convert = lambda i: p.unary("trunc", i)  # noqa: E731
+    else:
+        convert = p.as_number
+    return torch.tensor([convert(i) for i in source.flatten().tolist()], dtype=torch.int64).view(source.shape)
+
+
+# Elementwise operators with arguments of their own
+
+
+def _clamp(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    low, high = (*args[1:], None, None)[:2]
+    cells = tracer.cells(args[0]).expand(out.shape)
+    for name, limit in (("maximum", options.get("min", low)), ("minimum", options.get("max", high))):
+        if limit is not None:
+            cells = tracer.pointwise(name, [cells, tracer.cells(limit)], out.shape)
+    return cells
+
+
+def _clamp_max(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return _clamp(tracer, (args[0], None, args[1]), options, out)
+
+
+def _masked_fill(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    source, mask, value = (tracer.cells(a) for a in args)
+    return tracer.pointwise("where", [mask, value, source], out.shape)
+
+
+def _degrees_to_radians(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.pointwise("mul", [tracer.cells(args[0]), tracer.cells(math.pi / 180.0)], out.shape)
+
+
+def _reversed_sub(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.pointwise("sub", [tracer.cells(args[1]), tracer.cells(args[0])], out.shape)
+
+
+# Sums, products and folds
+
+
+def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    cells, p = tracer.cells(args[0]), tracer.program
+    rows = _rows(cells, args[1] if len(args) > 1 else options.get("dim"))
+    m, n = rows.shape
+    if m * n > 4 * STRAIGHT:
+        ones = torch.full((n, 1), p.constant(1.0))
+        return matrix_product(tracer, rows, ones).view(out.shape)
+    found = [_folded(p.add, row, p.constant(0.0)) for row in rows.tolist()]
+    return torch.tensor(found, dtype=torch.int64).view(out.shape)
+
+
+def _mean(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    count = tracer.cells(float(args[0].numel() // max(1, out.numel())))
+    return tracer.pointwise("div", [_sum(tracer, args, options, out), count], out.shape)
+
+
+def _fold(step: Callable[[Program, int, int], int]) -> Rule:
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+        rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
+        found = [_folded(lambda a, b: step(tracer.program, a, b), rest, first) for first, *rest in rows]
+        return torch.tensor(found, dtype=torch.int64).view(out.shape)
+
+    return rule
+
+
+def _cumulate(step: Callable[[Program, int, int], int]) -> Rule:
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+        cells = tracer.cells(args[0]).movedim(args[1], -1)
+        rows = cells.reshape(-1, cells.shape[-1]).tolist()
+        for row in rows:
+            for k in range(1, len(row)):
+                row[k] = step(tracer.program, row[k - 1], row[k])
+        return torch.tensor(rows, dtype=torch.int64).view(cells.shape).movedim(-1, args[1])
+
+    return rule
+
+
+def _rows(cells: Tensor, dims: int | Sequence[int] | None) -> Tensor:
+    """Cells as a matrix, with the dimensions ``dims`` (None or none for all) in its rows."""
+    chosen = [dims] if isinstance(dims, int) else list(dims or range(cells.ndim))
+    chosen = [d % cells.ndim for d in chosen]
+    kept = [d for d in range(cells.ndim) if d not in chosen]
+    return cells.permute(*kept, *chosen).reshape(math.prod(cells.shape[d] for d in kept), -1)
+
+
+def _folded(step: Callable[[int, int], int], row: Sequence[int], first: int) -> int:
+    for value in row:
+        first = step(first, value)
+    return first
+
+
+def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = None) -> Tensor:
+    """The cells of ``start`` + a b: straight-line code, or one loop for large matrices."""
+    p, (m, k), n = tracer.program, a.shape, b.shape[1]
+    zero = p.constant(0.0)
+    first = torch.full((m, n), zero) if start is None else start.expand(m, n)
+    if m * k * n <= STRAIGHT_PRODUCT:
+        found = []
+        for row, starts in zip(a.tolist(), first.tolist(), strict=True):
+            for column, total in zip(b.t().tolist(), starts, strict=True):
+                for x, y in zip(row, column, strict=True):
+                    total = p.add(total, p.mul(x, y))
+                found.append(total)
+        return torch.tensor(found, dtype=torch.int64).view(m, n)
+    if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
+        return first
+    accesses = [tracer.access(x) for x in (a, b, first)]
+    shape = (m, k, n, tuple(x for _, x in accesses))
+    array = p.new("product", *(i for i, _ in accesses), attributes=shape, kind="array", level=VARYING)
+    return tracer.elements(array, m * n).view(m, n)
+
+
+def _mm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return matrix_product(tracer, tracer.cells(args[0]), tracer.cells(args[1]))
+
+
+def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    if options.get("beta", 1) != 1 or options.get("alpha", 1) != 1:
+        raise tracer.refuse("addmm with alpha or beta")
+    start, a, b = (tracer.cells(x) for x in args)
+    return matrix_product(tracer, a, b, start)
+
+
+def _bmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    pairs = zip(tracer.cells(args[0]), tracer.cells(args[1]), strict=True)
+    return torch.stack([matrix_product(tracer, a, b) for a, b in pairs])
+
+
+# Tables
+
+
+def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    p, (source, indices) = tracer.program, args
+    given = [i for i in indices if i is not None]
+    cells = tracer.cells(source)
+    if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
+        picked: Tensor = torch.ops.aten.index.Tensor(cells, indices)
+        return picked
+    if None in indices[: len(given)] or any(i.dtype == torch.bool for i in given):
+        raise tracer.refuse("an index by a mask that varies, or after a full slice")
+    numbers = tracer.numbers(cells)
+    if numbers is None:
+        raise tracer.refuse("a look-up at a varying place in a table that is learned or varies")
+    table, rest = tracer.table(numbers), math.prod(source.shape[len(given) :])
+    strides = torch.empty(source.shape, device="meta").stride()
+    spread = torch.broadcast_tensors(*(tracer.cells(i) for i in given))
+    found = []
+    for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
+        place = p.constant(0.0)
+        for index, stride in zip(at, strides, strict=False):
+            place = p.add(place, p.mul(index, p.constant(float(stride))))
+        found += [p.new("look_up", table, place, attributes=(r,)) for r in range(rest)]
+    return torch.tensor(found, dtype=torch.int64).view(out.shape)
+
+
+def _bucketize(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    p, how = tracer.program, "oge" if options.get("right", False) else "ogt"
+    knots = tracer.cells(args[1]).tolist()
+    found = []
+    for x in tracer.cells(args[0]).flatten().tolist():
+        passed = [p.as_number(p.compare(how, x, knot)) for knot in knots]
+        found.append(_folded(p.add, passed, p.constant(0.0)))
+    return torch.tensor(found, dtype=torch.int64).view(out.shape)
+
+
+def _searchsorted(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    right = options.get("right", False) or options.get("side") == "right"
+    if args[0].ndim != 1:
+        raise tracer.refuse("searchsorted in more than one row of knots")
+    return _bucketize(tracer, (args[1], args[0]), {"right": right}, out)
+
+
+COPIES = (
+    "cat stack flip roll repeat expand_copy diag_embed slice_scatter select_scatter unfold_copy view_copy permute_copy "
+    "_unsafe_view alias_copy"
+).split()
+RULES: dict[str, Rule] = {
+    **{name: _copy_by(getattr(torch.ops.aten, name)) for name in COPIES},
+    **dict.fromkeys(("clone", "contiguous", "lift_fresh", "lift_fresh_copy"), _copy),
+    **dict.fromkeys(("copy", "fill"), _overwrite),
+    **{name: _pick_by(getattr(torch.ops.aten, name)) for name in ("gather", "index_select")},
+    **dict.fromkeys(("clamp", "clamp_min"), _clamp),
+    "scatter": _scatter,
+    "constant_pad_nd": _pad,
+    "slice_backward": _slice_backward,
+    "select_backward": _select_backward,
+    "_to_copy": _convert,
+    "clamp_max": _clamp_max,
+    "masked_fill": _masked_fill,
+    "deg2rad": _degrees_to_radians,
+    "rsub": _reversed_sub,
+    "sum": _sum,
+    "mean": _mean,
+    "amax": _fold(lambda p, a, b: p.extreme("maximum", a, b)),
+    "amin": _fold(lambda p, a, b: p.extreme("minimum", a, b)),
+    "prod": _fold(Program.mul),
+    "cumsum": _cumulate(Program.add),
+    "cumprod": _cumulate(Program.mul),
+    "mm": _mm,
+    "addmm": _addmm,
+    "bmm": _bmm,
+    "index": _index,
+    "bucketize": _bucketize,
+    "searchsorted": _searchsorted,
+}
+
+
+def new_tracer() -> Tracer:
+    """A tracer with all translations."""
+    return Tracer(RULES)

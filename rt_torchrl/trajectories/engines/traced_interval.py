@@ -1,0 +1,217 @@
+"""Machine code of the recurrence of an interval and of its reverse sweep, traced and compared with torch."""
+
+import ctypes
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rt_torchrl.programs.machine_code import march_text, sweep_text
+from rt_torchrl.programs.object_code import ObjectCode
+from rt_torchrl.programs.operators import new_tracer
+from rt_torchrl.programs.program import Program, UntraceableError
+from rt_torchrl.programs.tracer import Tracer
+from rt_torchrl.programs.vector_functions import Lanes
+from rt_torchrl.trajectories.engines.interval import Drive
+
+POINTER = ctypes.c_void_p
+MARCH = (POINTER, POINTER, POINTER, ctypes.c_int64)
+SWEEP = (POINTER, POINTER, POINTER, ctypes.c_int64, *[POINTER] * 4, ctypes.c_int64)
+AGREEMENT = 1e-8
+"""Greatest difference between machine code and torch, relative to the largest value of a signal."""
+
+
+class Point(NamedTuple):
+    """States and drive of one interval for a few realisations, at which code is traced and compared."""
+
+    state: Tensor
+    drive: Drive
+
+
+class March:
+    """Machine code of s_{k+1} = Φ(s_k, x_k; w).
+
+    Args:
+        interval: the map Φ.
+        point: a point at which it is traced, and compared with torch.
+        lanes: lanes of the processor.
+
+    Raises:
+        UntraceableError: if the interval cannot become a program, or the program differs from torch.
+    """
+
+    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
+        tracer = new_tracer()
+        state, drive, weights = _traced_inputs(tracer, interval, point)
+        with torch.no_grad(), tracer:
+            end = torch.func.functional_call(interval, weights, (state, drive))
+        ends = tracer.cells(end).flatten().tolist()
+        sizes = {"x": _width(point.drive), "s": state.shape[-1]}
+        if len(ends) != sizes["s"]:
+            raise UntraceableError(f"the interval maps {sizes['s']} states to {len(ends)}")
+        self.lanes, self.sizes = lanes, sizes
+        self._code = ObjectCode(
+            march_text(tracer.program, _numbers(tracer.program, ends), sizes, lanes), "march", MARCH
+        )
+        self._compare(interval, point)
+
+    def __call__(self, x: np.ndarray, states: np.ndarray, weights: np.ndarray, n: int) -> None:
+        """Write the states 1 ... n of ``states`` (``n+1 n_s lanes``), under the drive ``x`` (``n n_x lanes``)."""
+        self._code.call(x.ctypes.data, states.ctypes.data, weights.ctypes.data, n)
+
+    @torch.no_grad()
+    def _compare(self, interval: nn.Module, point: Point) -> None:
+        states = np.empty((2, self.sizes["s"], self.lanes.number))
+        states[0] = point.state.numpy().T
+        self(packed(point.drive), states, weights_of(interval), 1)
+        require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
+
+
+class Sweep:
+    """Machine code of the reverse sweep λ_k = (∂Φ/∂s)ᵀλ_{k+1} + ∂J/∂s_k, which computes each interval again.
+
+    Args:
+        interval: the map Φ.
+        point: a point at which it is traced, and compared with torch.
+        lanes: lanes of the processor.
+        driven: whether it gives the gradients by the drive too.
+
+    Raises:
+        UntraceableError: if the interval cannot become a program, or the program differs from torch.
+    """
+
+    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes, *, driven: bool):
+        tracer = new_tracer()
+        state, drive, weights = _traced_inputs(tracer, interval, point)
+        learned = {name: weights[name] for name, w in interval.named_parameters() if w.requires_grad}
+        costate = torch.ones_like(state)
+        tracer.input(costate, "l")
+        leaves = [state, *(drive if driven else ()), *learned.values()]
+        with torch.enable_grad():
+            for leaf in leaves:
+                leaf.requires_grad_()
+            with tracer:
+                end = torch.func.functional_call(interval, weights, (state, drive))
+                found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
+        cells = [_gradient(tracer, g, leaf) for g, leaf in zip(found or [None] * len(leaves), leaves, strict=True)]
+        by_state, by_drive, by_weights = cells[0], sum(cells[1:4], []) if driven else [], cells[4 if driven else 1 :]
+        self.lanes, self.driven, self.names = lanes, driven, list(learned)
+        self.sizes = {"x": _width(point.drive), "s": state.shape[-1], "w": sum(w.numel() for w in learned.values())}
+        write = partial(sweep_text, tracer.program, sizes=self.sizes, lanes=lanes)
+        self._code = ObjectCode(write(by_state, sum(by_weights, []), by_drive), "sweep", SWEEP)
+        self._compare(interval, point)
+
+    def __call__(
+        self,
+        x: np.ndarray,
+        states: np.ndarray,
+        source: np.ndarray,
+        costate: np.ndarray,
+        weights: np.ndarray,
+        by_drive: np.ndarray,
+        by_weights: np.ndarray,
+        n: int,
+    ) -> None:
+        """Replace the co-state of the end (``n_s lanes``) by that of the start, and give the gradients.
+
+        Args:
+            x: drive, ``n n_x lanes``.
+            states: states at the starts of the intervals, ``n n_s lanes``.
+            source: ∂J/∂s at the end of every interval, ``n n_s lanes``, or one row that serves all.
+            costate: the co-state.
+            weights: all weights of the interval.
+            by_drive: gradients by the drive, ``n n_x lanes``; untouched unless ``driven``.
+            by_weights: gradients by the learned weights, ``n_w lanes``, which are added to.
+            n: number of intervals.
+        """
+        stride = int(len(source) > 1)
+        arrays = (costate, weights, by_drive, by_weights)
+        self._code.call(
+            x.ctypes.data, states.ctypes.data, source.ctypes.data, stride, *(a.ctypes.data for a in arrays), n
+        )
+
+    def _compare(self, interval: nn.Module, point: Point) -> None:
+        n_lanes, names = self.lanes.number, self.names
+        costate = 1.0 + 0.1 * np.arange(self.sizes["s"] * n_lanes, dtype=float).reshape(-1, n_lanes)
+        source, x = np.zeros((1, self.sizes["s"], n_lanes)), packed(point.drive)
+        found = costate.copy(), np.zeros((1, self.sizes["x"], n_lanes)), np.zeros((self.sizes["w"], n_lanes))
+        self(x, point.state.numpy().T[None].copy(), source, found[0], weights_of(interval), *found[1:], 1)
+        weights = {name: w.detach().clone().requires_grad_(name in names) for name, w in interval.named_parameters()}
+        leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
+        with torch.enable_grad():
+            end = torch.func.functional_call(interval, weights, (leaves[0], Drive(*leaves[1:])))
+            given = [*leaves, *(weights[name] for name in names)]
+            exact = torch.autograd.grad(end, given, torch.from_numpy(costate.T), allow_unused=True)
+        wanted = [torch.zeros_like(x) if g is None else g for g, x in zip(exact, given, strict=True)]
+        by_state, by_drive = wanted[0].numpy(), torch.cat([wanted[1].unsqueeze(-1), *wanted[2:4]], -1).numpy()
+        require_equal("the co-state", found[0].T, by_state, by_state)
+        if self.driven:
+            require_equal("the gradient by the drive", found[1][0].T, by_drive, by_drive)
+        parts = np.split(found[2].sum(-1), np.cumsum([w.numel() for w in wanted[4:]])[:-1]) if names else []
+        for name, part, exactly in zip(names, parts, wanted[4:], strict=True):
+            require_equal(f"the gradient by {name}", part, exactly.flatten().numpy(), exactly.flatten().numpy())
+
+
+def packed(drive: Drive) -> np.ndarray:
+    """The drive of one interval as one row, ``1 n_x lanes``."""
+    rows = np.concatenate([drive.t[None].numpy(), drive.exogenous.numpy().T, drive.command.numpy().T])
+    return np.ascontiguousarray(rows)[None]  # NumPy keeps the order of transposed parts
+
+
+def weights_of(interval: nn.Module) -> np.ndarray:
+    """All weights of an interval as one row of numbers."""
+    found = [w.detach().numpy().ravel() for w in interval.parameters()]
+    return np.concatenate(found) if found else np.zeros(1)
+
+
+def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
+    """Refuse machine code that differs from torch.
+
+    Raises:
+        UntraceableError: if a number differs by more than :data:`AGREEMENT` of the largest finite number of its column.
+    """
+    sizes = np.abs(np.where(np.isfinite(exact), exact, 0.0)) + np.abs(np.where(np.isfinite(scale), scale, 0.0))
+    equal = np.isclose(found, exact, rtol=0.0, atol=AGREEMENT * sizes.max(0, initial=0.0) + 1e-300, equal_nan=True)
+    if not equal.all():
+        raise UntraceableError(
+            f"{what} differs from what torch computes, for example {found[~equal][0]} instead of {exact[~equal][0]}. A "
+            "number has left torch where tracing cannot follow it, such as by .numpy()"
+        )
+
+
+def _traced_inputs(tracer: Tracer, interval: nn.Module, point: Point) -> tuple[Tensor, Drive, dict[str, Tensor]]:
+    """State, drive and weights of the first realisation, as inputs of a program."""
+    state, drive = point.state[:1].clone(), Drive(*(x[:1].clone() for x in point.drive))
+    tracer.input(state, "s")
+    offset = 0
+    for x in drive:
+        tracer.input(x, "x", offset)
+        offset += x.numel()
+    weights, first = {}, 0
+    for name, w in interval.named_parameters():
+        if w.dtype != torch.float64:
+            raise UntraceableError(f"{name} is in {w.dtype}; trajectories need torch.float64")
+        weights[name] = w.detach().clone()
+        tracer.weight(weights[name], first)
+        first += w.numel()
+    return state, drive, weights
+
+
+def _width(drive: Drive) -> int:
+    return 1 + drive.exogenous.shape[-1] + drive.command.shape[-1]
+
+
+def _gradient(tracer: Tracer, gradient: Tensor | None, leaf: Tensor) -> list[int]:
+    zero = tracer.program.constant(0.0)
+    return (
+        [zero] * leaf.numel()
+        if gradient is None
+        else _numbers(tracer.program, tracer.cells(gradient).flatten().tolist())
+    )
+
+
+def _numbers(program: Program, values: Sequence[int]) -> list[int]:
+    return [program.as_number(value) for value in values]
