@@ -280,3 +280,11 @@ BROKEN = {
     OwnSeed: "draw_exogenous: draws different episodes, but the same ones for generators of another seed",
     BrokenClosure: "make_closure: raised .*Error in .*linear_quadratic.py, line",
 }
+
+
+class Sorting(LinearQuadratic):
+    """A plant that keeps the contract with an operator that cannot become machine code."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state, action, exogenous, closure)
+        return rates + 0.0 * state.sort(-1).values

@@ -65,7 +65,7 @@ class Calls:
         state = plant.draw_initial_state(episodes, generator)
         exogenous = plant.draw_exogenous(episodes, generator)[:, :steps]
         command = random_commands(plant, (episodes, steps), generator)
-        flown = Rollout(plant, plant.closure)(state, exogenous, command)
+        flown = Rollout(plant, plant.closure, engine="autograd")(state, exogenous, command)
         t = plant.dt * torch.arange(steps, dtype=torch.float64).unsqueeze(-1)
         rows = [x.transpose(0, 1).contiguous() for x in (flown.states[:, :-1], command, exogenous, flown.actions)]
         return cls(plant, _named(t, *rows), seed)

@@ -15,7 +15,7 @@ from rt_torchrl.contract.methods import methods
 from rt_torchrl.contract.periods import periods
 from rt_torchrl.contract.signals import signals
 from rt_torchrl.contract.stability import stability
-from rt_torchrl.contract.tracing import forward_mode, tracing
+from rt_torchrl.contract.tracing import forward_mode, tracing, untraceable
 from rt_torchrl.plants.plant import Plant
 
 Check = Callable[[Calls], Iterable[str]]
@@ -39,6 +39,8 @@ class ContractReport(NamedTuple):
         episodes: number of flights.
         steps: number of control intervals of each flight.
         dt: control interval [s].
+        untraceable: what keeps the engine ``native`` from the plant, whose place ``parallel`` then takes; None if
+            nothing does, or if the methods were not traced.
     """
 
     plant: str
@@ -46,11 +48,13 @@ class ContractReport(NamedTuple):
     episodes: int
     steps: int
     dt: float
+    untraceable: str | None = None
 
     def __str__(self) -> str:
+        engine = f"; engine 'parallel' takes the place of 'native': {self.untraceable}" if self.untraceable else ""
         return (
             f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}, on {self.episodes} flights of "
-            f"{self.steps} intervals of {self.dt:g} s"
+            f"{self.steps} intervals of {self.dt:g} s{engine}"
         )
 
 
@@ -81,8 +85,8 @@ def check_plant(
         episodes: number of flights, at least 2.
         steps: number of control intervals of each flight, at least 2 and at most that of an episode.
         seed: seed of the draws and of the random commands.
-        traced: whether the methods are also traced into one graph. Tracing takes seconds, and methods that jaxtyping
-            checks at run time cannot be traced.
+        traced: whether the methods are also traced, into one graph and for the engine ``native``. Tracing takes
+            seconds, and methods that jaxtyping checks at run time cannot become one graph.
 
     Returns:
         The checks that were made; the function prints nothing.
@@ -102,7 +106,9 @@ def check_plant(
     found = found or _on_flights(plant, episodes, steps, seed, checks.values())
     if found:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
-    return ContractReport(plant.name, ("signals", "draws", "closures and policy", *checks), episodes, steps, plant.dt)
+    passed = ("signals", "draws", "closures and policy", *checks)
+    reason = untraceable(Calls.at_the_start(plant, episodes, seed)) if traced else None
+    return ContractReport(plant.name, passed, episodes, steps, plant.dt, reason)
 
 
 def _on_cpu(plant: Plant) -> Plant:

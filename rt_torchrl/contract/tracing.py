@@ -6,9 +6,13 @@ import torch
 from torch import Tensor
 
 from rt_torchrl.contract.calls import Arguments, Calls, Method
+from rt_torchrl.contract.draws import seeded
+from rt_torchrl.programs.program import UntraceableError
+from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines.compilation import raised_limits
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise
+from rt_torchrl.trajectories.engines.programs import Programs, point_near
 
 REMEDY = (
     "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
@@ -58,6 +62,20 @@ def tracing(calls: Calls) -> Iterator[str]:
         for (name, _), one, other in zip(method.gives.items(), found, method.outputs(arguments), strict=True):
             if not torch.allclose(one, other, rtol=1e-10, atol=1e-10):
                 yield f"{method.name}: {name} has another value when it is traced; expected {REMEDY}."
+
+
+def untraceable(calls: Calls) -> str | None:
+    """What keeps the engine ``native`` from the plant under its own policy, with the line of code; None if nothing."""
+    plant, arguments, lanes = calls.plant, calls.arguments, lanes_of_this_machine()
+    policy = plant.make_policy(seeded(calls.seed))
+    initial_state = torch.nn.functional.pad(arguments["state"][0], (0, 1))  # the cost is one more state
+    drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"][..., :0])
+    point = point_near(initial_state, drive, lanes.number)
+    try:
+        Programs(CostInterval(Interval(plant, calls.closure, policy)), point, lanes, ()).sweep(False)
+    except UntraceableError as error:
+        return str(error)
+    return None
 
 
 def _first_line(error: Exception) -> str:

@@ -53,8 +53,18 @@ class Programs:
             return self._sweeps[driven]
 
 
-def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Programs | None:
-    """The programs of an interval; None where it is not on the CPU or, with one warning, cannot become a program."""
+def programs_of(
+    interval: nn.Module, initial_state: Tensor, drive: Drive, *, sweep: bool = False, driven: bool = False
+) -> Programs | None:
+    """The programs of an interval; None where it is not on the CPU or, with one warning, cannot become a program.
+
+    Args:
+        interval: the map Φ.
+        initial_state: initial states, near which machine code is compared with torch.
+        drive: the drive of the trajectory.
+        sweep: whether a gradient is wanted.
+        driven: whether the gradient by the drive is wanted.
+    """
     if initial_state.device.type != "cpu":
         return None
     with _lock:
@@ -62,10 +72,11 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Pro
         digest, alive = fingerprint(interval)
         key = (digest, lanes, initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1])
         found = _kept.get(key)
-        if found is None:
-            point = _point(initial_state, drive, lanes.number)
+        if not isinstance(found, UntraceableError):
             try:
-                found = Programs(interval, point, lanes, alive)
+                found = found or Programs(interval, point_near(initial_state, drive, lanes.number), lanes, alive)
+                if sweep:
+                    found.sweep(driven)
             except UntraceableError as error:
                 found = error
                 warnings.warn(f"engine 'parallel' takes the place of 'native': {error}.", stacklevel=2)
@@ -77,7 +88,7 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Pro
 
 
 @torch.no_grad()
-def _point(initial_state: Tensor, drive: Drive, lanes: int) -> Point:
+def point_near(initial_state: Tensor, drive: Drive, lanes: int) -> Point:
     """States and drive of one interval for every lane, near the initial states and at times over the whole drive."""
     n, batch, lane = len(drive.t), len(initial_state), torch.arange(lanes)
     state = initial_state.detach()[lane % batch]
