@@ -1,4 +1,4 @@
-"""The three gradient engines against each other and against central differences."""
+"""The gradient engines against each other and against central differences."""
 
 import fresh_process
 import pytest
@@ -133,15 +133,16 @@ CASES += [("perceptron", "perceptron", 4), ("perceptron", "commands", 4)]
     "plant, closure, driver, batch",
     [(plant, *case) for plant in PLANTS for case in CASES if plant in OUTPUTS or case[0] == "own"],
 )
-def test_parallel_equals_autograd_and_differences(plant, closure, driver, batch):
+def test_exact_engines_equal_autograd_and_differences(plant, closure, driver, batch):
     case = Case(PLANTS[plant](), closure, driver, batch)
-    exact, parallel = case.gradients("autograd"), case.gradients("parallel")
+    exact, parallel, native = (case.gradients(engine) for engine in ("autograd", "parallel", "native"))
     generator, value = seeded(9), case.cost().item()
     walk = case.plant.n_steps**0.5 * (exact["initial_state"] * case.initial_state).abs().sum().item()
     for name, gradient in exact.items():
         assert gradient.norm() > 0, name
         # The same derivatives summed in another order, over at most 200 steps of a damped system.
         assert relative_gap(parallel[name], gradient) < 1e-10, name
+        assert relative_gap(native[name], gradient) < 1e-10, name
         leaf, scale = case.leaves()[name]
         direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
         # Error of the central difference: step² times the third derivative, 1e-10 of the norm of the gradient (not of

@@ -92,8 +92,9 @@ def test_a_run_without_random_starts_has_the_same_results(tmp_path, capsys):
 def test_every_policy_is_flown_once_before_and_once_after(tmp_path, monkeypatch):
     """An unseen episode of a real system may take hours."""
     run, flown = small_run(tmp_path, episodes=1, untrained=0), []
-    fly = run.unseen.fly
-    monkeypatch.setattr(run.unseen, "fly", lambda policy: flown.append(policy) or fly(policy))
+    for name in ("fly", "control_costs"):
+        call = getattr(run.unseen, name)
+        monkeypatch.setattr(run.unseen, name, lambda policy, call=call: flown.append(policy) or call(policy))
     run.train()
     both = [*run.algorithm.policies.values(), *run.initial_policies.values()]
     assert len(flown) == 4 and {id(policy) for policy in flown} == {id(policy) for policy in both}
@@ -254,7 +255,7 @@ def test_a_checkpoint_of_another_architecture_is_refused(finished):
         ({"policy": "cubic"}, "policy='cubic' does not exist; choose plant or mlp"),
         ({"model_free_policy": "x"}, "model_free_policy='x' does not exist; choose same, plant or mlp"),
         ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
-        ({"engine": "fast"}, "engine='fast' does not exist; choose parallel, odeint_adjoint or autograd"),
+        ({"engine": "fast"}, "engine='fast' does not exist; choose native, parallel, odeint_adjoint or autograd"),
         ({"noise": -0.1}, "noise=-0.1 must not be negative"),
         ({"noise": math.inf}, "noise=inf must be a finite number"),
         ({"episodes": 2.5}, "episodes=2.5 must be a whole number"),

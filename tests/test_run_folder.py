@@ -80,7 +80,7 @@ def changed_twinning():
     ("options", "named"),
     [
         ({"seed": 1}, "seed is 1 here and was 0 in the run"),
-        ({"engine": "autograd"}, "engine is autograd here and was parallel in the run"),
+        ({"engine": "autograd"}, "engine is autograd here and was native in the run"),
         ({"quick": True}, "quick is True here and was False in the run"),
         ({"hidden": (4,)}, r"hidden is \[4\] here and was \[32, 32\] in the run"),
         ({"twinning": changed_twinning()}, "critic_rate is 0.002 here and was 0.001.*learner.discount is 0.5"),

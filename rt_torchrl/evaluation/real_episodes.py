@@ -1,7 +1,7 @@
 """Unseen episodes on a real system whose true closure nobody knows."""
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.systems.real_system import RealSystem
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 
 class RealEpisodes(UnseenEpisodes):
@@ -31,6 +31,9 @@ class RealEpisodes(UnseenEpisodes):
 
     def fly(self, policy: nn.Module) -> Trajectory:
         return self._flown(policy, self._count)
+
+    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+        return control_cost(self.plant, self.fly(policy))
 
     def validation(self) -> None:
         """No validation episodes, because a real episode may take hours."""

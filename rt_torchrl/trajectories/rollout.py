@@ -10,7 +10,7 @@ engine             gradient                                            for
 =================  ==================================================  ======================================
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, get_args
 
 import torch
@@ -121,7 +121,7 @@ class Rollout:
         """The drive, after a check of everything."""
         self._validate(initial_state, exogenous, command)
         if isinstance(start, Tensor) and not self._engine.start_per_realisation:
-            others = " or ".join(name for name, kind in ENGINES.items() if kind.start_per_realisation)
+            others = _listed(name for name, kind in ENGINES.items() if kind.start_per_realisation)
             raise ValueError(
                 f"engine={self.engine!r} integrates all realisations over the same span and takes no start for each; "
                 f"use {others}, or whole records (segment=0)."
@@ -156,12 +156,17 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
     if engine not in ENGINES:
         return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
     if plant.own_scheme and not ENGINES[engine].own_scheme:
-        others = " or ".join(name for name, kind in ENGINES.items() if kind.own_scheme)
+        others = _listed(name for name, kind in ENGINES.items() if kind.own_scheme)
         return (
             f"engine={engine!r} integrates the vector field, but plant {plant.name!r} steps by a scheme of its own; "
             f"use {others}."
         )
     return None
+
+
+def _listed(names: Iterable[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}"
 
 
 def require_finite(

@@ -50,8 +50,8 @@ class March:
             end = torch.func.functional_call(interval, weights, (state, drive))
         ends = tracer.cells(end).flatten().tolist()
         sizes = {"x": _width(point.drive), "s": state.shape[-1]}
-        if len(ends) != sizes["s"]:
-            raise UntraceableError(f"the interval maps {sizes['s']} states to {len(ends)}")
+        if end.shape != state.shape:
+            raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
         self.lanes, self.sizes = lanes, sizes
         self._code = ObjectCode(
             march_text(tracer.program, _numbers(tracer.program, ends), sizes, lanes), "march", MARCH
