@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from rt_torchrl import (
+    LoadedRun,
     check_options,
     export_c,
     export_controller,
@@ -18,11 +19,11 @@ from rt_torchrl import (
     main_of,
 )
 from rt_torchrl.export.onnx_model import require_packages
-from rt_torchrl.runs.loaded_run import LoadedRun
 from rt_torchrl.runs.settings import read_settings
 
 FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c",), "twin": ("c",)}
 """The formats that there are of each thing."""
+DEFAULT = ("c", "pt2")
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 
 
@@ -36,7 +37,8 @@ class Config:
             action, with filters and integrals) and twin (one control interval with the learned closure); controller and
             twin are written in C alone.
         role: role of the policy, model_based or model_free.
-        formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
+        formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export); by default
+            c, and pt2 of a policy.
         output: folder for the files; by default RUN/exported.
         name: name of the files and of the C function, to which _controller or _twin is added; by default PLANT_ROLE,
             and PLANT for the twin.
@@ -47,21 +49,21 @@ class Config:
     run: Annotated[Path, Positional]
     what: tuple[str, ...] = ("policy",)
     role: str = "model_based"
-    formats: tuple[str, ...] = ("c", "pt2")
+    formats: tuple[str, ...] | None = None
     output: Path | None = None
     name: str | None = None
     recipe: str | None = None
 
     def __post_init__(self):
         check_options(self)
-        for option, known in (("what", FORMATS), ("formats", WRITERS)):
-            given = getattr(self, option)
+        formats = DEFAULT if self.formats is None else self.formats
+        for option, given, known in (("what", self.what, FORMATS), ("formats", formats, WRITERS)):
             if not given or not set(given) <= set(known):
                 raise ValueError(f"{option}={given} must be some of {', '.join(known)}.")
         for what in self.what:
-            if not set(FORMATS[what]) & set(self.formats):
-                raise ValueError(f"formats={self.formats} must hold {FORMATS[what][0]}, the format of the {what}.")
-        for kind in self.formats:
+            if not set(FORMATS[what]) & set(formats):
+                raise ValueError(f"formats={formats} must hold {FORMATS[what][0]}, the format of the {what}.")
+        for kind in self.formats or ():
             if not any(kind in FORMATS[what] for what in self.what):
                 raise ValueError(
                     f"formats={self.formats}: no {kind} of {' or '.join(self.what)} can be written; leave it out."
@@ -73,7 +75,8 @@ class Config:
 
 
 def main(config: Config) -> None:
-    if "onnx" in config.formats:
+    formats = config.formats or DEFAULT
+    if "onnx" in formats:
         require_packages()
     settings = read_settings(config.run)
     beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
@@ -85,7 +88,7 @@ def main(config: Config) -> None:
     except OSError as error:
         raise ValueError(f"output={output} cannot be written ({error}); choose another.") from error
     for what in config.what:
-        for kind in config.formats:
+        for kind in formats:
             if kind in FORMATS[what]:
                 print(written(config, run, output, what, kind))
 

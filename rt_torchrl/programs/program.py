@@ -69,7 +69,7 @@ class Program:
             self.levels.append(max(level, *(self.levels[a] for a in operands)) if operands else level)
         return self._known[operation]
 
-    def constant(self, value: float | int) -> int:
+    def constant(self, value: int | float) -> int:
         """A number or a truth value that is known."""
         kind: Kind = "truth" if isinstance(value, bool) else "number"
         found = self.new("constant", attributes=(kind, float(value).hex()), kind=kind)
