@@ -231,6 +231,8 @@ def every_controller():
         yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
         mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=generator())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
+    plant = InstrumentedTurbine()
+    yield pytest.param(plant, plant.make_policy(generator()), id="gain-scheduled")
 
 
 @needs_compiler
@@ -292,9 +294,37 @@ class Branching(LinearQuadratic):
         return state if state.sum() > 0.0 else -state
 
 
+class Misstarted(Lagged):
+    def controller_start(self, measured, exogenous):
+        return measured[..., :1]
+
+
+class Turning(Lagged):
+    """The position is an angle, and the filter follows it."""
+
+    states = (
+        Lagged.states[0],
+        Signal(symbol="x", name="position", unit="m", low=-math.pi, high=math.pi, periodic=True),
+        *Lagged.states[2:],
+    )
+
+
+def test_an_angle_goes_the_short_way():
+    """From 3.1 over π to −3.1 is an advance of 2π − 6.2, which the filter df/dt = x − f follows."""
+    controller = Controller(Turning(dt=0.1), LinearGain(GAINS))
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    before, after = (torch.tensor([[x, 0.0]], dtype=torch.float64) for x in (3.1, -3.1))
+    memory = torch.tensor([[0.0, 3.0]], dtype=torch.float64)
+    _, found = controller.advance(zero, memory, before, one, one, after)[0].tolist()
+    rate = (2.0 * math.pi - 6.2) / 0.1
+    exact = 3.1 + 0.1 * rate - rate + (3.0 - 3.1 + rate) * math.exp(-0.1)
+    assert found == pytest.approx(exact, abs=1e-6)
+
+
 REFUSED = {
     "a state that depends on the closure": (Guessed, GAINS, r"integral, filtered_position\) depend on the closure"),
     "a name that is no state": (Misnamed, [[1.0, 1.0]], "names speed_error; its states are position, velocity"),
+    "another number of first states": (Misstarted, GAINS, r"returns shape \(1, 1\); its last dimension must be 2"),
     "a branch": (Branching, [[1.0, 1.0]], "controller of plant 'linear_quadratic' .* a branch of Python .*in observe"),
 }
 

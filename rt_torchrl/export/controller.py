@@ -49,8 +49,18 @@ class Controller:
         self._order = torch.tensor([*self.measured, *self.held]).argsort()
 
     def start(self, measured: Float[Tensor, "*batch n_y"], inputs: Float[Tensor, "*batch n_z"]) -> Tensor:
-        """The controller's states c_0 at the first measurement."""
-        return self.plant.controller_start(measured, inputs)
+        """The controller's states c_0 at the first measurement.
+
+        Raises:
+            ValueError: if the plant starts another number of states than it names.
+        """
+        found = self.plant.controller_start(measured, inputs)
+        if found.shape[-1:] != (len(self.held),):
+            raise ValueError(
+                f"controller_start of plant {self.plant.name!r} returns shape {tuple(found.shape)}; its last dimension "
+                f"must be {len(self.held)}, the number of controller_states."
+            )
+        return found
 
     def act(
         self,
