@@ -1,4 +1,4 @@
-"""Export a trained policy from a run folder as C99, as an ONNX model or as a PyTorch program."""
+"""Export from a run folder: a trained policy, the controller around it, or the twin."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,39 +7,67 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from rt_torchrl import check_options, export_c, export_onnx, export_program, load_run, main_of
+from rt_torchrl import (
+    LoadedRun,
+    check_options,
+    export_c,
+    export_controller,
+    export_onnx,
+    export_program,
+    export_twin,
+    load_run,
+    main_of,
+)
 from rt_torchrl.export.onnx_model import require_packages
 from rt_torchrl.runs.settings import read_settings
 
+FORMATS = {"policy": ("c", "onnx", "pt2"), "controller": ("c",), "twin": ("c",)}
+"""The formats that there are of each thing."""
+DEFAULT = ("c", "pt2")
 WRITERS: dict[str, Callable[..., float | None]] = {"c": export_c, "onnx": export_onnx, "pt2": export_program}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Export a trained policy; every file is compared with the policy on random observations before it is written.
+    """Export a trained policy; every file is compared with what it is made of before it is written.
 
     Args:
         run: run folder of any recipe.
+        what: one or more of policy (from the observation to the action), controller (from the measured signals to the
+            action, with filters and integrals) and twin (one control interval with the learned closure); controller and
+            twin are written in C alone.
         role: role of the policy, model_based or model_free.
-        formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export).
+        formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export); by default
+            c, and pt2 of a policy.
         output: folder for the files; by default RUN/exported.
-        name: name of the files and of the C function; by default PLANT_ROLE.
+        name: name of the files and of the C function, to which _controller or _twin is added; by default PLANT_ROLE,
+            and PLANT for the twin.
         recipe: recipe that made the run, as its file or as package.module:Config; by default the recipe that the run
             names or, for a run of version 0.1, the recipe beside this file with the name of the plant.
     """
 
     run: Annotated[Path, Positional]
+    what: tuple[str, ...] = ("policy",)
     role: str = "model_based"
-    formats: tuple[str, ...] = ("c", "pt2")
+    formats: tuple[str, ...] | None = None
     output: Path | None = None
     name: str | None = None
     recipe: str | None = None
 
     def __post_init__(self):
         check_options(self)
-        unknown = [name for name in self.formats if name not in WRITERS]
-        if unknown or not self.formats:
-            raise ValueError(f"formats={self.formats} must be some of {', '.join(WRITERS)}.")
+        formats = DEFAULT if self.formats is None else self.formats
+        for option, given, known in (("what", self.what, FORMATS), ("formats", formats, WRITERS)):
+            if not given or not set(given) <= set(known):
+                raise ValueError(f"{option}={given} must be some of {', '.join(known)}.")
+        for what in self.what:
+            if not set(FORMATS[what]) & set(formats):
+                raise ValueError(f"formats={formats} must hold {FORMATS[what][0]}, the format of the {what}.")
+        for kind in self.formats or ():
+            if not any(kind in FORMATS[what] for what in self.what):
+                raise ValueError(
+                    f"formats={self.formats}: no {kind} of {' or '.join(self.what)} can be written; leave it out."
+                )
         if self.name is not None and not (self.name.isascii() and self.name.isidentifier()):
             raise ValueError(
                 f"name={self.name!r} must be a name in C, such as blade_controller; give --output a folder."
@@ -47,23 +75,47 @@ class Config:
 
 
 def main(config: Config) -> None:
-    if "onnx" in config.formats:
+    formats = config.formats or DEFAULT
+    if "onnx" in formats:
         require_packages()
     settings = read_settings(config.run)
     beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
     run = load_run(config.run, config.recipe or beside)
-    policy, name = run.policy(config.role), config.name or f"{run.plant.name}_{config.role}"
+    run.policy(config.role)
     output = config.output or config.run / "exported"
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"output={output} cannot be written ({error}); choose another.") from error
-    for kind in config.formats:
-        path = output / f"{name}.{kind}"
+    for what in config.what:
+        for kind in formats:
+            if kind in FORMATS[what]:
+                print(written(config, run, output, what, kind))
+
+
+def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) -> str:
+    """Write one file, and say how it agrees."""
+    role, plant = config.name or f"{run.plant.name}_{config.role}", run.plant
+    name = {"policy": role, "controller": f"{role}_controller", "twin": f"{config.name or plant.name}_twin"}[what]
+    path = output / f"{name}.{kind}"
+    if what == "policy":
         named = {"function": name} if kind == "c" else {}
-        error = WRITERS[kind](policy, path, run.plant, **named)
-        found = "not checked" if error is None else f"within {error:.1e} of the actions' ranges"
-        print(f"{path}: {found}")
+        error = WRITERS[kind](run.policy(config.role), path, plant, **named)
+        found = "" if error is None else f"within {error:.1e} of the actions' ranges"
+    elif what == "controller":
+        flown = export_controller(run.policy(config.role), path, plant, name=name)
+        found = (
+            ""
+            if flown is None
+            else (
+                f"within {flown.difference:.1e} of the actions' ranges over {flown.intervals} intervals; "
+                f"{flown.from_plant:.1e} from the policy on the plant's own states"
+            )
+        )
+    else:
+        error = export_twin(run.closure, path, plant, name=name)
+        found = "" if error is None else f"within {error:.1e} of the sizes of the states"
+    return f"{path}: {found or 'not checked'}"
 
 
 if __name__ == "__main__":

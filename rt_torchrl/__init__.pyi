@@ -47,7 +47,7 @@ from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
-from .export import export_c, export_onnx, export_program
+from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
 __version__: str
 
@@ -115,8 +115,10 @@ __all__ = [
     "check_plant",
     "control_cost",
     "export_c",
+    "export_controller",
     "export_onnx",
     "export_program",
+    "export_twin",
     "identification_cost",
     "load_run",
     "main_of",

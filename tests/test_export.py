@@ -11,7 +11,7 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.export import c_file, export_c, export_onnx, export_program, onnx_model
+from rt_torchrl.export import c_compiler, export_c, export_onnx, export_program, onnx_model
 from rt_torchrl.export.agreement import detached, sample_observations
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
@@ -157,7 +157,7 @@ def test_what_is_no_function_of_the_observation_is_refused(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["the batch as a whole", "a fixed batch"])
 def test_a_c_function_of_one_observation_is_compared_with_the_policy_of_many(name, tmp_path):
-    if not any(map(shutil.which, c_file.COMPILERS)):
+    if not any(map(shutil.which, c_compiler.COMPILERS)):
         pytest.skip("no C compiler here")
     with pytest.raises(ValueError, match="the C function of policy Law differs from it by .*'force'"):
         export_c(Law(REFUSED[name][0]), tmp_path / "policy.c", LinearQuadratic())

@@ -12,12 +12,12 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.export import c_file, export_c
-from rt_torchrl.export.c_operators import literal
+from rt_torchrl.export import c_compiler, export_c
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.programs.c_source import CSource, literal
 
-COMPILER = next(filter(None, map(shutil.which, c_file.COMPILERS)), None)
+COMPILER = next(filter(None, map(shutil.which, c_compiler.COMPILERS)), None)
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
 STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 # The same operations in double precision; sums in another order and another libm: a few ulp per operation.
@@ -152,6 +152,11 @@ FORMULAS = {
     "a constant": lambda e, W, b: torch.zeros_like(e) + b,
     "a tensor of the formula": lambda e, W, b: e * torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64),
     "truth values as numbers": lambda e, W, b: (e > b).double() * e,
+    "softmax": lambda e, W, b: torch.softmax(e, -1),
+    "integers": lambda e, W, b: (e > 0).sum(-1, keepdim=True).double(),
+    "rounding": lambda e, W, b: torch.div(e, 2.0, rounding_mode="floor") + e.round() + torch.remainder(e, 0.7),
+    "look up": lambda e, W, b: torch.linspace(-1.0, 1.0, 50, dtype=torch.float64)[(e.tanh() * 10.0 + 20.0).long()],
+    "long rows": lambda e, W, b: torch.tanh(e.repeat(1, 10) * W.repeat(1, 10)[:1]).view(-1, 10, 4).sum(1) @ W,
 }
 
 
@@ -240,16 +245,14 @@ def test_literals_are_read_back_to_the_bit(number):
     assert text.endswith("inf") or "." in text or "e" in text  # a double, not an int
 
 
-HEAD = nn.Sequential(nn.Linear(4, 1, dtype=torch.float64), nn.Softmax(-1))
 REFUSED = {
-    "softmax": (lambda e, W, b: HEAD(e), "policy Formula uses '_softmax', .*export_program.*export_onnx"),
-    "sort": (lambda e, W, b: e.sort(-1).values[..., :1], "policy Formula uses 'sort'"),
-    "single precision": (
-        lambda e, W, b: e.float().double()[..., :1],
-        "policy Formula uses '_to_copy in torch.float32'",
+    "sort": (
+        lambda e, W, b: e.sort(-1).values[..., :1],
+        "policy Formula cannot be .* aten.sort.* pt2 and onnx",
     ),
-    "integers": (lambda e, W, b: (e > 0).sum(-1, keepdim=True).double(), "'sum in torch.int64'"),
-    "rounding": (lambda e, W, b: torch.div(e, 2.0, rounding_mode="floor")[..., :1], "uses 'div'"),
+    "single precision": (lambda e, W, b: e.float().double()[..., :1], "a conversion to torch.float32"),
+    "a branch": (lambda e, W, b: e[..., :1] if e.sum() > 0 else -e[..., :1], "a branch of Python is taken"),
+    "random numbers": (lambda e, W, b: e[..., :1] + torch.randn(1, 1, dtype=torch.float64), "draws random numbers"),
 }
 
 
@@ -261,23 +264,28 @@ def test_what_has_no_c_form_is_refused(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+class Sorted(nn.Module):
+    def forward(self, e):
+        return e.sort(-1).values
+
+
 def test_a_refusal_names_the_layer(tmp_path):
-    policy = nn.Sequential(nn.Sequential(nn.Linear(2, 1, dtype=torch.float64), nn.Softmax(-1)), nn.Tanh())
-    with pytest.raises(ValueError, match=r"layer '0\.1' \(Softmax\) of policy Sequential uses '_softmax'"):
+    policy = nn.Sequential(nn.Sequential(nn.Linear(2, 1, dtype=torch.float64), Sorted()), nn.Tanh())
+    with pytest.raises(ValueError, match=r"layer '0\.1' \(Sorted\) of policy Sequential cannot be written in C"):
         export_c(policy, tmp_path / "policy.c", LinearQuadratic())
 
 
 def test_a_machine_without_compiler_says_that_nothing_was_checked(tmp_path, monkeypatch):
-    monkeypatch.setattr(c_file, "COMPILERS", ("no_such_compiler",))
-    with pytest.warns(UserWarning, match="not checked against the policy: there is no C compiler"):
+    monkeypatch.setattr(c_compiler, "COMPILERS", ("no_such_compiler",))
+    with pytest.warns(UserWarning, match="not checked: there is no C compiler"):
         assert export_c(LinearGain([[0.1, 0.2]]), tmp_path / "policy.c", LinearQuadratic()) is None
     assert (tmp_path / "policy.c").exists() and (tmp_path / "policy.h").exists()
 
 
 @needs_compiler
 def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
-    right = c_file._source
-    monkeypatch.setattr(c_file, "_source", lambda *parts: right(*parts).replace("0.25", "0.2500004"))
+    right = CSource.text
+    monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.25", "0.2500004"))
     with pytest.raises(ValueError, match=r"the C function of policy LinearGain differs from it by .*'force'"):
         export_c(LinearGain([[0.25, 1.0]]), tmp_path / "policy.c", LinearQuadratic())
     assert not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ from linear_quadratic import LinearQuadratic
 from test_run import SMALL
 
 from rt_torchrl import load_run
+from rt_torchrl.export import c_compiler
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
@@ -94,12 +95,32 @@ def test_the_recipe_writes_every_format(tmp_path, capsys):
     assert capsys.readouterr().out.count("of the actions' ranges") >= 2
 
 
+def test_the_recipe_writes_policy_controller_and_twin(tmp_path, capsys, monkeypatch):
+    """A run with perceptrons in all places, in C and nothing else."""
+    if not any(map(shutil.which, c_compiler.COMPILERS)):
+        pytest.skip("no C compiler here")
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 20)
+    leave_run(tmp_path, "wind_turbine", policy="mlp", closure="mlp", hidden=(5,))
+    export = recipe("export")
+    export.main(export.Config(run=tmp_path, what=("policy", "controller", "twin"), formats=("c",)))
+    names = ("wind_turbine_model_based", "wind_turbine_model_based_controller", "wind_turbine_twin")
+    written = {path.name for path in (tmp_path / "exported").iterdir()}
+    assert written == {f"{name}.{suffix}" for name in names for suffix in ("c", "h")}
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 3 and "over 20 intervals" in printed[1] and "of the sizes of the states" in printed[2]
+    export.main(export.Config(run=tmp_path, what=("twin",), name="blade", output=tmp_path / "other"))
+    assert "void blade_twin_step(double t," in (tmp_path / "other" / "blade_twin.h").read_text()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"role": "oracle"}, "role='oracle' does not exist in this run; choose model_based or model_free"),
         ({"formats": ("jar",)}, r"formats=\('jar',\) must be some of c, onnx, pt2"),
         ({"formats": ()}, r"formats=\(\) must be some of"),
+        ({"what": ("plant",)}, r"what=\('plant',\) must be some of policy, controller, twin"),
+        ({"what": ("policy", "twin"), "formats": ("pt2",)}, r"formats=\('pt2',\) must hold c, the format of the twin"),
+        ({"what": ("controller",), "formats": ("c", "pt2")}, "no pt2 of controller can be written; leave it out"),
         ({"name": "../up"}, "name='../up' must be a name in C"),
         ({"recipe": Path("nowhere.py")}, "recipe=nowhere.py does not exist"),
         ({"recipe": RECIPES / "record_log.py"}, "has no class Config derived from RunConfig"),

@@ -161,9 +161,7 @@ def test_another_time_step_than_gymnasiums_is_refused():
 
 def test_the_engine_that_knows_no_own_step_is_refused():
     plant = Pendulum()
-    with pytest.raises(
-        ValueError, match="odeint_adjoint.*scheme of its own; use native, parallel or autograd"
-    ):
+    with pytest.raises(ValueError, match="odeint_adjoint.*scheme of its own; use native, parallel or autograd"):
         Rollout(plant, plant.closure, plant.make_policy(seeded()), engine="odeint_adjoint")
 
 

@@ -1,4 +1,4 @@
-r"""The turbine's filters and last actions, computed from the logged signals: rotor speed, actions and wind.
+r"""The turbine's filters and last actions, computed from the measured signals: rotor speed, actions and wind.
 
 The filters are first-order lags :math:`T\dot{\hat y} = y - \hat y`, settled at the start of the record:
 
@@ -40,6 +40,15 @@ def completed(
     # The action before the record is not known; the first action of the record never meets a rate limit.
     last = torch.cat([actions[:1], actions])
     return torch.cat([torch.stack([measured["rotor_speed"], omega_hat, u_hat, e2], -1), last], -1)
+
+
+def started(
+    plant: "WindTurbine", measured: Float[Tensor, "*batch 1"], exogenous: Float[Tensor, "*batch 1"]
+) -> Float[Tensor, "*batch 5"]:
+    """Settled filters, a torque by K ω_g² and blades at 0 deg, in the order of the states."""
+    omega_g, wind = plant.gear_ratio * measured[..., 0], exogenous[..., 0]
+    torque = (plant.optimal_gain * omega_g**2).clamp(max=plant.actions[0].high)
+    return torch.stack([omega_g, wind, plant.speed_error(omega_g, wind), torque, torch.zeros_like(wind)], -1)
 
 
 def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:

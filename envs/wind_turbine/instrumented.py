@@ -35,6 +35,7 @@ class InstrumentedTurbine(WindTurbine):
         *WindTurbine.states,
         Signal(symbol=r"\omega_F", name="fast_generator_speed", unit="rad/s"),
     )
+    controller_states = tuple(signal.name for signal in states[1:])
     observations = (
         *WindTurbine.observations,
         Signal(symbol=r"e_\omega", name="speed_above_rated", unit="-", low=-2.0, high=1.0),
@@ -67,6 +68,12 @@ class InstrumentedTurbine(WindTurbine):
         rate = (self.gear_ratio * state[..., 0] - state[..., 6]) / self.speed_error_scale
         pitch = state[..., 5] / self.actions[1].high
         return torch.cat([errors, torch.stack([above, rate, pitch], -1)], -1)
+
+    def controller_start(
+        self, measured: Float[Tensor, "*batch 1"], exogenous: Float[Tensor, "*batch 1"]
+    ) -> Float[Tensor, "*batch 6"]:
+        """The start of a :class:`WindTurbine`, and a settled fast filter."""
+        return torch.cat([super().controller_start(measured, exogenous), self.gear_ratio * measured], -1)
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
         state = super().draw_initial_state(batch, generator)

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.envs.wind_turbine.completion import completed
+from rt_torchrl.envs.wind_turbine import merit as judgement
+from rt_torchrl.envs.wind_turbine.completion import completed, started
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
-from rt_torchrl.envs.wind_turbine.merit import merit
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
@@ -93,6 +93,7 @@ class WindTurbine(Plant):
         Signal(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0),
         Signal(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0),
     )
+    controller_states: tuple[str, ...] = tuple(signal.name for signal in states[1:])
     greatest_increment: Tensor
 
     def __init__(
@@ -256,8 +257,7 @@ class WindTurbine(Plant):
         """The discrepancy ½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
         return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
 
-    def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
-        return merit(self, states, applied, exogenous)
+    merit, controller_start = judgement.merit, started
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """All states from the rotor speed: the filters start settled, and the last actions are those of the record."""

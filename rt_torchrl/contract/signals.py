@@ -10,7 +10,7 @@ GROUPS = {"states": "n_s", "actions": "n_a", "inputs": "n_z", "observations": "n
 
 
 def signals(plant: Plant) -> Iterator[str]:
-    """Violations in the name and in the four tuples of signals, with their names, units and ranges."""
+    """Violations in the plant's name, in its four tuples of signals, and in the names of the controller's states."""
     name = getattr(plant, "name", None)
     if not isinstance(name, str) or not name.isidentifier():
         yield f"name: is {name!r}; give the class a name such as name = 'two_tanks', which run folders are called by."
@@ -22,6 +22,14 @@ def signals(plant: Plant) -> Iterator[str]:
         if not declared and group != "inputs":
             yield f"{group}: is empty; declare at least one Signal (only inputs may be empty)."
         yield from _of_group(group, declared)
+    yield from _of_controller(plant)
+
+
+def _of_controller(plant: Plant) -> Iterator[str]:
+    names = [getattr(signal, "name", None) for signal in getattr(plant, "states", None) or ()]
+    for name in plant.controller_states:
+        if name not in names:
+            yield f"controller_states: {name!r} is no state; it must be one of {', '.join(map(str, names))}."
 
 
 def _of_group(group: str, declared: tuple[Signal, ...]) -> Iterator[str]:

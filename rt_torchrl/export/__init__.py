@@ -1,10 +1,12 @@
-"""Export of a trained policy as a PyTorch program, an ONNX model or a C99 file.
+"""Export: policies as C99, ONNX models or PyTorch programs; controllers and twins as C99.
 
-Before a file is written, the export is compared with the policy on random observations, see :mod:`.agreement`.
+Before a file is written, it is compared with what it was made of, see :mod:`.agreement`.
 """
 
-from rt_torchrl.export.c_file import export_c
+from rt_torchrl.export.c_controller import export_controller
+from rt_torchrl.export.c_policy import export_c
+from rt_torchrl.export.c_twin import export_twin
 from rt_torchrl.export.onnx_model import export_onnx
 from rt_torchrl.export.program import export_program
 
-__all__ = ["export_c", "export_onnx", "export_program"]
+__all__ = ["export_c", "export_controller", "export_onnx", "export_program", "export_twin"]

@@ -97,10 +97,7 @@ def require_agreement(
     if not expected.isfinite().all():
         worst = observations[(~expected.isfinite()).any(-1)][0].tolist()
         raise ValueError(f"policy {type(policy).__name__} gives actions that are not finite at observation {worst}.")
-    low, high = bounds(plant.actions)
-    ranges = high - low
-    size = torch.where(ranges.isfinite(), ranges, expected.abs().amax(0).clamp(min=torch.finfo(torch.float64).tiny))
-    errors = ((found - expected).abs() / size).nan_to_num(nan=math.inf)
+    errors = shares_of_range(found, expected, plant)
     if errors.max() > TOLERANCE:
         row, column = divmod(int(errors.argmax()), len(plant.actions))
         raise ValueError(
@@ -110,3 +107,13 @@ def require_agreement(
             "no memory, no use of the batch as a whole."
         )
     return errors.max().item()
+
+
+def shares_of_range(
+    found: Float[Tensor, "n n_a"], expected: Float[Tensor, "n n_a"], plant: Plant
+) -> Float[Tensor, "n n_a"]:
+    """Differences of actions over their ranges or, without a range, over their greatest sizes; infinite for NaN."""
+    low, high = bounds(plant.actions)
+    ranges = high - low
+    size = torch.where(ranges.isfinite(), ranges, expected.abs().amax(0).clamp(min=torch.finfo(torch.float64).tiny))
+    return ((found - expected).abs() / size).nan_to_num(nan=math.inf)

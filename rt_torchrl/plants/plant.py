@@ -64,6 +64,11 @@ class Plant(nn.Module, ABC):
 
     The engine ``odeint_adjoint`` cannot follow it and is refused.
     """
+    controller_states: tuple[str, ...] = ()
+    """Names of the states that a controller computes, such as filters, integrals and the actions applied last.
+
+    All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
+    """
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module):
         super().__init__()
@@ -200,6 +205,17 @@ class Plant(nn.Module, ABC):
                 "its states; log them, name their columns, or override Plant.complete_states."
             )
         return torch.stack([measured[state.name] for state in self.states], -1)
+
+    def controller_start(
+        self, measured: Float[Tensor, "*batch n_y"], exogenous: Float[Tensor, "*batch n_z"]
+    ) -> Float[Tensor, "*batch n_c"]:
+        """The :attr:`controller_states` of a controller that is switched on; by default zeros.
+
+        Args:
+            measured: the other states, in their order.
+            exogenous: exogenous inputs.
+        """
+        return measured.new_zeros(*measured.shape[:-1], len(self.controller_states))
 
     # Randomness, always from the generator that is passed in
 

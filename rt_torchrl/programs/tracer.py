@@ -5,6 +5,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -23,6 +24,9 @@ FILLS = frozenset(
     "zeros ones full empty zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty "
     "scalar_tensor arange eye linspace empty_strided new_empty_strided zero".split()
 )
+
+CHECKERS = {"jaxtyping", "beartype"}
+"""Packages that stand between a function and its caller when they check annotations at run time."""
 
 Rule = Callable[["Tracer", tuple[Any, ...], dict[str, Any], Any], Any]
 
@@ -110,7 +114,8 @@ class Tracer(TorchDispatchMode):
             self.cells(args[0])
             return func(*args, **kwargs)
         known = name in ELEMENTWISE or name in FILLS or name in self._rules
-        if not known and not func._schema.is_mutable and (decomposition := _decomposition(func)):
+        in_place = func._schema.is_mutable and packet.endswith("_")
+        if not known and not in_place and (decomposition := _decomposition(func)):
             with self:
                 return decomposition(*args, **kwargs)
         out = func(*args, **kwargs)
@@ -242,14 +247,19 @@ def _decompositions() -> dict[Any, Callable[..., Any]]:
     # These tables take a third of a second to import, and most code needs none of them.
     from torch._decomp import core_aten_decompositions, decomposition_table
 
-    return {**decomposition_table, **core_aten_decompositions()}
+    return {**decomposition_table, **core_aten_decompositions(), torch.ops.prims.var.default: _variance}
+
+
+def _variance(x: Tensor, dims: list[int], correction: float = 1.0, **options: Any) -> Tensor:
+    squares = (x - x.mean(dims, keepdim=True)) ** 2
+    return squares.sum(dims) / (math.prod(x.shape[d] for d in dims) - correction)
 
 
 def _place() -> str:
     """The innermost line outside of torch and this room, for a message."""
     own = (str(_folder(torch)), str(_folder(sys.modules[__package__])))
     for frame in reversed(traceback.extract_stack()):
-        if not frame.filename.startswith(own):
+        if not frame.filename.startswith(own) and not CHECKERS & set(Path(frame.filename).parts):
             return f" (in {frame.name}, {frame.filename}:{frame.lineno}: {frame.line})"
     return ""
 

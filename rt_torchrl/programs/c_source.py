@@ -1,0 +1,184 @@
+"""Programs as C99: scalar functions of one file that share their constants."""
+
+import math
+import re
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+from rt_torchrl.programs.lowering import Lowering
+from rt_torchrl.programs.program import Program
+
+WIDTH = 110
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&&", "or": "||", "xor": "!="}
+COMPARISONS = {"ogt": ">", "olt": "<", "oge": ">=", "ole": "<=", "oeq": "==", "une": "!="}
+"""C's comparisons treat NaN as the program's do: all are false, but != is true."""
+RENAMED = {"abs": "fabs", "round": "rint"}
+"""Functions with another name in math.h; rint rounds halves to even, as torch does."""
+
+
+class CSource:
+    """The functions of a C file.
+
+    Args:
+        weights: the weights of the programs in their order, each with a name for a comment.
+    """
+
+    def __init__(self, weights: Sequence[tuple[str, Sequence[float]]] = ()):
+        self.functions: list[str] = []
+        self._tables: dict[str, str] = {}
+        self._weights = weights
+
+    def add(
+        self,
+        head: str,
+        program: Program,
+        inputs: Mapping[tuple[str, int], str],
+        outputs: Sequence[tuple[str, int]],
+        *,
+        last: Sequence[str] = (),
+    ) -> None:
+        """Add a function that reads all its inputs before it writes an output, so that both may be one array.
+
+        Args:
+            head: its declaration without the semicolon.
+            program: the program.
+            inputs: C expression of each input, by name and position.
+            outputs: places that are written, in C, with the values that they receive.
+            last: statements at its end.
+        """
+        values = [program.as_number(value) for _, value in outputs]
+        needed = [program.operations[i].attributes for i in program.needed(values) if _is_input(program, i)]
+        writer = CWriter(self._tables)
+        names = {key: f"{key[0]}_{key[1]}" for key in needed}
+        writer.lines += [f"const double {name} = {inputs[key]};" for key, name in names.items()]
+        lowering = Lowering(program, writer, names, "weights")
+        lowering.write(values)
+        found = [lowering.operand(value) for value in values]
+        writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, found, strict=True)]
+        self.write(head, [*writer.lines, *last])
+
+    def write(self, head: str, lines: Sequence[str]) -> None:
+        """Add a function of given statements."""
+        text = "\n".join(f"    {line}" for line in lines)
+        parameters = re.findall(r"(\w+)(?=[,)])", head)
+        unread = "".join(f"    (void){p};\n" for p in parameters if not re.search(rf"\b{p}\b", text))
+        self.functions.append(f"{head}\n{{\n{unread}{text}\n}}\n")
+
+    def text(self) -> str:
+        """The constants and the functions."""
+        functions = "\n".join(self.functions)
+        weights = [f"/* {name} */\n{_wrapped(x)}" for name, x in self._weights if x] if "weights[" in functions else []
+        tables = [_array(name, text) for text, name in self._tables.items()]
+        return "\n".join([*([_array("weights", ",\n".join(weights))] if weights else []), *tables, functions])
+
+
+class CWriter:
+    """Writes a lowered program in C99, one realisation; it is a :class:`~rt_torchrl.programs.lowering.Writer`.
+
+    Args:
+        tables: names of the constant arrays of the file, by their content.
+    """
+
+    def __init__(self, tables: dict[str, str]):
+        self.lines: list[str] = []
+        self._tables, self._places = tables, dict[tuple[str, int], str]()
+        self._count, self._depth = 0, 0
+
+    def _new(self, kind: str, text: str) -> str:
+        self._count += 1
+        self._emit(f"{kind} v{self._count}{text};")
+        return f"v{self._count}"
+
+    def _emit(self, line: str) -> None:
+        self.lines.append("    " * self._depth + line)
+
+    def constant(self, number: float, *, truth: bool, lanes: bool) -> str:
+        return str(int(number)) if truth else literal(number)
+
+    def compute(self, name: str, operands: Sequence[str], how: str, *, truth: bool, lanes: bool) -> str:
+        if name == "select":
+            text = "{} ? {} : {}".format(*operands)
+        elif len(operands) == 2 and (symbol := INFIX.get(name) or COMPARISONS.get(how)):
+            text = f"{operands[0]} {symbol} {operands[1]}"
+        elif name in ("neg", "not"):
+            text = f"{'-' if name == 'neg' else '!'}{operands[0]}"
+        else:
+            text = f"{RENAMED.get(name, name)}({', '.join(operands)})"
+        if self._depth:  # what a loop computes is read once
+            return f"({text})"
+        return self._new("const int" if truth else "const double", f" = {text}")
+
+    def spread(self, operand: str, *, truth: bool) -> str:
+        return operand
+
+    def table(self, numbers: Sequence[float]) -> str:
+        return self._tables.setdefault(_wrapped(numbers), f"table_{len(self._tables)}")
+
+    def local(self, size: int) -> str:
+        return self._new("double", f"[{size}]")
+
+    def index(self, base: int, terms: Sequence[tuple[int, str]]) -> str:
+        found = []
+        for stride, i in terms:
+            if i.isdigit():
+                base += stride * int(i)
+            else:
+                found.append(i if stride == 1 else f"{stride} * {i if i.isidentifier() else f'({i})'}")
+        return " + ".join([*found, *([str(base)] if base or not found else [])])
+
+    def load(self, array: str, index: str, *, lanes: bool, stored_lanes: bool) -> str:
+        return f"{array}[{index}]"
+
+    def store(self, array: str, index: str, operand: str) -> None:
+        self._emit(f"{array}[{index}] = {operand};")
+
+    def look_up(self, table: str, size: int, place: str, offset: int) -> str:
+        """The number at a place of a table; outside of it, and for NaN, a look-up is NaN."""
+        if (place, size) not in self._places:
+            inside = f"{place} >= 0.0 && {place} < {literal(float(size))}"
+            self._places[place, size] = self._new("const int", f" = {inside} ? (int){place} : -1")
+        at = self._places[place, size]
+        return self._new("const double", f" = {at} < 0 ? NAN : {table}[{self.index(offset, [(1, at)])}]")
+
+    @contextmanager
+    def loop(self, count: int) -> Iterator[str]:
+        if count == 1:
+            yield "0"
+            return
+        self._count += 1
+        index = f"i{self._count}"
+        self._emit(f"for (int {index} = 0; {index} < {count}; ++{index}) {{")
+        self._depth += 1
+        yield index
+        self._depth -= 1
+        self._emit("}")
+
+    def variable(self, start: str) -> str:
+        return self._new("double", f" = {start}")
+
+    def get(self, variable: str) -> str:
+        return variable
+
+    def put(self, variable: str, operand: str) -> None:
+        self._emit(f"{variable} = {operand};")
+
+
+def literal(number: float) -> str:
+    """A number in C, which is read back to the bit."""
+    if not math.isfinite(number):
+        return "NAN" if math.isnan(number) else "INFINITY" if number > 0 else "(-INFINITY)"
+    return f"({number!r})" if math.copysign(1.0, number) < 0 else repr(number)
+
+
+def _is_input(program: Program, value: int) -> bool:
+    return program.operations[value].name == "input"
+
+
+def _wrapped(numbers: Sequence[float]) -> str:
+    text = ", ".join(literal(x).strip("()") for x in numbers)
+    return textwrap.indent("\n".join(textwrap.wrap(text, WIDTH, break_on_hyphens=False)), "    ")
+
+
+def _array(name: str, content: str) -> str:
+    return f"static const double {name}[] = {{\n{content}\n}};\n"

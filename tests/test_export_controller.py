@@ -1,0 +1,364 @@
+"""The controller in C: in closed loop against the plant, the controller in torch, and exact filters."""
+
+import ctypes
+import math
+import re
+import shutil
+import subprocess
+
+import pytest
+import torch
+from linear_quadratic import LinearGain, LinearQuadratic
+from scipy.linalg import expm
+from torch import nn
+
+from rt_torchrl import check_plant, export_controller, shipped_plants
+from rt_torchrl.contract.check import PlantContractError
+from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export import c_compiler
+from rt_torchrl.export.controller import Controller
+from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.programs.c_source import CSource
+from rt_torchrl.trajectories.rollout import Rollout
+
+COMPILER = next(filter(None, map(shutil.which, c_compiler.COMPILERS)), None)
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
+CLOSE = 1e-9
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def state_type(n_actions, n_memory, n_last):
+    sizes = {"command": n_actions, "memory": n_memory, "last": n_last}
+    fields = [("steps", ctypes.c_ulonglong), *((name, ctypes.c_double * n) for name, n in sizes.items() if n)]
+    return type("State", (ctypes.Structure,), {"_fields_": fields})
+
+
+class InC:
+    """A controller in C, compiled and called without this library's loader."""
+
+    def __init__(self, path, n_actions, n_memory, n_signals):
+        library = path.with_suffix(".so")
+        subprocess.run([COMPILER, "-std=c99", *STRICT, "-shared", "-fPIC", path, "-o", library, "-lm"], check=True)
+        loaded = ctypes.CDLL(str(library))
+        self.init, self.advance = (getattr(loaded, f"{path.stem}_{part}") for part in ("init", "step"))
+        self.state, self.action = state_type(n_actions, n_memory, n_signals)(), (ctypes.c_double * n_actions)()
+
+    def start(self, *signals):
+        self.init(ctypes.byref(self.state), (ctypes.c_double * len(signals))(*signals))
+
+    def step(self, *signals):
+        self.advance(ctypes.byref(self.state), (ctypes.c_double * len(signals))(*signals), self.action)
+        return list(self.action)
+
+
+def flown(plant, state, exogenous, act):
+    """The states and commands of an episode of the plant under ``act(k, state)``."""
+    states, commands = [state], []
+    with torch.no_grad():
+        for k in range(exogenous.shape[1]):
+            commands.append(act(k, state))
+            t = torch.tensor([k * plant.dt], dtype=torch.float64)
+            state = plant.step(t, state, commands[-1], exogenous[:, k], plant.closure).state
+            states.append(state)
+    return torch.cat(states), torch.cat(commands)
+
+
+def law(plant):
+    """A policy that holds the turbine near its reference, so that speed and wind move all filters."""
+    policy = SaturatedAffine(len(plant.observations), plant.actions, generator=generator(3))
+    with torch.no_grad():
+        policy.linear.weight[:] = 0.0
+        policy.linear.weight[:, :2] = torch.tensor([[1.0, 0.4], [0.6, 0.3]], dtype=torch.float64)
+        policy.linear.bias.copy_(torch.tensor([0.5, -1.0], dtype=torch.float64))
+    return policy
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", [WindTurbine, InstrumentedTurbine])
+def test_a_turbine_flies_an_episode_by_its_controller_in_c(kind, tmp_path, monkeypatch):
+    """Rotor speed and wind go in; the loops of C and of torch are closed one by one."""
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 50)
+    plant = kind()
+    policy = law(plant)
+    n_memory = len(plant.states) - 1
+    agreement = export_controller(policy, tmp_path / "turbine.c", plant, name="turbine")
+    assert agreement.difference < CLOSE and agreement.intervals == 50
+    start, exogenous = plant.draw_initial_state(1, generator(1)), plant.draw_exogenous(1, generator(2))
+    in_c = InC(tmp_path / "turbine.c", 2, n_memory, 2)
+    in_c.start(start[0, 0].item(), exogenous[0, 0, 0].item())
+    in_c.state.memory[:] = start[0, 1:].tolist()
+
+    def by_c(k, state):
+        return torch.tensor([in_c.step(state[0, 0].item(), exogenous[0, k, 0].item())], dtype=torch.float64)
+
+    controller, held = Controller(plant, policy), {}
+
+    def by_torch(k, state):
+        t, speed, memory = torch.tensor([k * plant.dt], dtype=torch.float64), state[:, :1], start[:, 1:]
+        if k:
+            memory = controller.advance(t - plant.dt, *held["before"], speed)
+        command, _ = controller.act(t, memory, speed, exogenous[:, k])
+        held["before"] = (memory, speed, exogenous[:, k], command)
+        return command
+
+    states, actions = flown(plant, start, exogenous, by_c)
+    assert len(actions) == 1200 and actions.std(0).min() > 0.0
+    expected, _ = flown(plant, start, exogenous, by_torch)
+    size = expected.abs().amax(0)
+    assert ((states - expected).abs() / size).max() < CLOSE
+    # The memory of the actuators is that of the plant; the filters differ by the curvature of the speed in an interval.
+    found = torch.tensor(list(in_c.state.memory), dtype=torch.float64)
+    torch.testing.assert_close(found[3:5], states[-2, 4:6], rtol=CLOSE, atol=CLOSE)
+    ideal = Rollout(plant, plant.closure, policy, engine="autograd")(start, exogenous).states[0].detach()
+    assert 1e-9 < ((states - ideal).abs() / size).max() < 2e-3
+
+
+@needs_compiler
+def test_commands_are_given_beside_the_limited_actions(tmp_path, monkeypatch):
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 10)
+    plant = WindTurbine()
+    export_controller(law(plant), tmp_path / "turbine.c", plant, name="turbine")
+    in_c = InC(tmp_path / "turbine.c", 2, 5, 2)
+    in_c.start(1.0, 11.0)
+    # Settled filters: ω̂ = N_g ω_r, û = u, e_2 = e_1; the torque is K ω_g².
+    reference = min(max(97.0 * plant.best_tip_speed_ratio * 11.0 / 63.0, 70.16), 122.9096)
+    e = (97.0 - reference) / 20.0
+    torque = min(plant.optimal_gain * 97.0**2, 43_093.55)
+    assert list(in_c.state.memory) == pytest.approx([97.0, 11.0, e, torque, 0.0], rel=1e-12)
+    action = in_c.step(1.0, 11.0)
+    torque_command = 0.5 * (math.tanh(1.4 * e + 0.5) + 1.0) * 43_093.55
+    pitch_command = 0.5 * (math.tanh(0.9 * e - 1.0) + 1.0) * 30.0
+    assert list(in_c.state.command) == pytest.approx([torque_command, pitch_command], rel=1e-12)
+    limited = torque + min(max(torque_command - torque, -7500.0), 7500.0), min(pitch_command, 4.0)
+    assert action == pytest.approx(limited, rel=1e-12)
+
+
+class Lagged(LinearQuadratic):
+    """The oracle plant with a filter f of the position and an integral i of the time, which stand between the others.
+
+    df/dt = x − f, di/dt = cos t; observed are f, v, i and sin 3t.
+    """
+
+    states = (
+        Signal(symbol="f", name="filtered_position", unit="m"),
+        *LinearQuadratic.states,
+        Signal(symbol="i", name="integral", unit="s"),
+    )
+    observations = tuple(Signal(symbol="e", name=f"e_{k}", unit="-") for k in range(4))
+    controller_states = ("integral", "filtered_position")
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state[..., 1:3], action, exogenous, closure)
+        f, x = state[..., 0], state[..., 1]
+        return torch.cat([(x - f).unsqueeze(-1), rates, (torch.cos(t) + 0.0 * f).unsqueeze(-1)], -1)
+
+    def observe(self, t, state, exogenous):
+        f, _, v, i = state.unbind(-1)
+        return torch.stack([f, v, i, torch.sin(3.0 * t) + 0.0 * f], -1)
+
+    def draw_initial_state(self, batch, generator):
+        return torch.tensor([[0.0, 1.0, 1.0, 0.0]], dtype=torch.float64).repeat(batch, 1)
+
+
+GAINS = [[0.4, 0.3, 0.2, 0.5]]
+
+
+@needs_compiler
+def test_filters_clock_and_order_of_the_states(tmp_path):
+    """The filter of a straight line is known: f(t+h) = y₁ − r + (f − y₀ + r)e^{−h} with the slope r and h = Δt."""
+    plant = Lagged(dt=0.1)
+    agreement = export_controller(LinearGain(GAINS), tmp_path / "lag.c", plant, name="lag")
+    assert agreement.difference < CLOSE
+    in_c = InC(tmp_path / "lag.c", 1, 2, 2)
+    positions = torch.cumsum(torch.randn(50, generator=generator(), dtype=torch.float64), 0).tolist()
+    in_c.start(positions[0], 0.0)
+    f, before = 0.0, positions[0]
+    for k, x in enumerate(positions):
+        t, v = 0.1 * k, 0.1 * x
+        if k:
+            rate = (x - before) / 0.1
+            f = x - rate + (f - before + rate) * math.exp(-0.1)
+        before = x
+        expected = -(0.4 * f + 0.3 * v + 0.2 * math.sin(t) + 0.5 * math.sin(3.0 * t))
+        # One Runge-Kutta step of 0.1 time constants errs by 0.1⁵/120 of what the filter has to go.
+        assert in_c.step(x, v)[0] == pytest.approx(expected, abs=2e-6)
+    assert in_c.state.steps == 50
+
+
+@needs_compiler
+def test_the_error_of_the_filters_is_of_second_order(tmp_path):
+    found = [
+        export_controller(LinearGain(GAINS), tmp_path / "lag.c", Lagged(dt=dt, horizon=5.0)).from_plant
+        for dt in (0.1, 0.05, 0.025)
+    ]
+    assert found[0] > 1e-7
+    for coarse, fine in zip(found, found[1:], strict=False):
+        assert coarse / fine == pytest.approx(4.0, rel=0.5)
+
+
+@needs_compiler
+def test_linear_dynamics_against_the_matrix_exponential(tmp_path):
+    """A controller without states is the policy; the loop that it closes is that of the closed form."""
+    plant = LinearQuadratic(dt=0.01, horizon=2.0, noise=0.0)
+    export_controller(LinearGain([[0.3, 0.2]]), tmp_path / "gain.c", plant, name="gain")
+    in_c = InC(tmp_path / "gain.c", 1, 0, 2)
+    start = torch.tensor([[1.0, -0.5]], dtype=torch.float64)
+    in_c.start(*start[0].tolist())
+    states, _ = flown(
+        plant,
+        start,
+        torch.zeros(1, 200, 1, dtype=torch.float64),
+        lambda k, state: torch.tensor([in_c.step(*state[0].tolist())], dtype=torch.float64),
+    )
+    A, B, C = (torch.tensor(x, dtype=torch.float64) for x in (plant.A, plant.B, plant.true_closure))
+    block = torch.zeros(3, 3, dtype=torch.float64)
+    block[:2, :2], block[:2, 2:] = A + C, B
+    held = torch.from_numpy(expm(0.01 * block.numpy()))
+    step = held[:2, :2] - held[:2, 2:] @ torch.tensor([[0.3, 0.2]], dtype=torch.float64)
+    # 200 steps of the fourth order.
+    torch.testing.assert_close(states[-1], torch.linalg.matrix_power(step, 200) @ start[0], rtol=0.0, atol=1e-9)
+
+
+def every_controller():
+    for name, kind in shipped_plants().items():
+        plant = kind()
+        yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
+        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=generator())
+        yield pytest.param(plant, mlp, id=f"{name}-mlp")
+    plant = InstrumentedTurbine()
+    yield pytest.param(plant, plant.make_policy(generator()), id="gain-scheduled")
+
+
+@needs_compiler
+@pytest.mark.parametrize(("plant", "policy"), list(every_controller()))
+def test_controllers_of_the_plants(plant, policy, tmp_path, monkeypatch):
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 100)
+    assert export_controller(policy, tmp_path / "it.c", plant, name="it").difference < CLOSE
+    header = (tmp_path / "it.h").read_text()
+    for signal in plant.actions:
+        assert re.search(rf"action\[\d\] +{signal.name} +\[{re.escape(signal.unit)}\]", header)
+    InC(tmp_path / "it.c", len(plant.actions), len(plant.controller_states), 9)  # without a warning
+
+
+@needs_compiler
+def test_only_signals_that_matter_are_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 10)
+    tank = shipped_plants()["cryogenic_tank"]()
+    export_controller(tank.make_policy(generator()), tmp_path / "tank.c", tank, name="tank")
+    lines = (tmp_path / "tank.h").read_text().splitlines()
+    assert [line.split()[1:3] for line in lines if line.startswith(" * measured[")] == [["measured[0]", "pressure"]]
+
+
+@needs_compiler
+def test_a_program_in_c_that_includes_the_header(tmp_path, monkeypatch):
+    """The calls of the header's comment, in a program that a user would write."""
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 10)
+    export_controller(law(WindTurbine()), tmp_path / "turbine.c", WindTurbine(), name="turbine")
+    comment = (tmp_path / "turbine.h").read_text().partition("*/")[0].splitlines()
+    calls = [line.removeprefix(" *").strip() for line in comment if line.endswith(";")]
+    declared, arrays, init, step = calls
+    read = "measured[0] = 1.2; measured[1] = 11.0;"
+    (tmp_path / "main.c").write_text(
+        f'#include "turbine.h"\n#include <stdio.h>\nint main(void) {{ {declared} {arrays} {read} {init}\n'
+        f'    for (int k = 0; k < 3; ++k) {{ {step} }} printf("%.17g %.17g", action[0], action[1]); return 0; }}\n'
+    )
+    sources = [tmp_path / "main.c", tmp_path / "turbine.c"]
+    subprocess.run([COMPILER, "-std=c99", *STRICT, *sources, "-o", tmp_path / "main", "-lm"], check=True)
+    printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True).stdout
+    in_c = InC(tmp_path / "turbine.c", 2, 5, 2)
+    in_c.start(1.2, 11.0)
+    found = [in_c.step(1.2, 11.0) for _ in range(3)]
+    assert [float(x) for x in printed.split()] == found[-1]
+
+
+class Guessed(Lagged):
+    """A plant whose filter depends on the closure."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state, action, exogenous, closure)
+        return torch.cat([rates[..., :1] + closure(state[..., 1:3])[..., 1:], rates[..., 1:]], -1)
+
+
+class Misnamed(LinearQuadratic):
+    controller_states = ("speed_error",)
+
+
+class Branching(LinearQuadratic):
+    def observe(self, t, state, exogenous):
+        return state if state.sum() > 0.0 else -state
+
+
+class Misstarted(Lagged):
+    def controller_start(self, measured, exogenous):
+        return measured[..., :1]
+
+
+class Turning(Lagged):
+    """The position is an angle, and the filter follows it."""
+
+    states = (
+        Lagged.states[0],
+        Signal(symbol="x", name="position", unit="m", low=-math.pi, high=math.pi, periodic=True),
+        *Lagged.states[2:],
+    )
+
+
+def test_an_angle_goes_the_short_way():
+    """From 3.1 over π to −3.1 is an advance of 2π − 6.2, which the filter df/dt = x − f follows."""
+    controller = Controller(Turning(dt=0.1), LinearGain(GAINS))
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    before, after = (torch.tensor([[x, 0.0]], dtype=torch.float64) for x in (3.1, -3.1))
+    memory = torch.tensor([[0.0, 3.0]], dtype=torch.float64)
+    _, found = controller.advance(zero, memory, before, one, one, after)[0].tolist()
+    rate = (2.0 * math.pi - 6.2) / 0.1
+    exact = 3.1 + 0.1 * rate - rate + (3.0 - 3.1 + rate) * math.exp(-0.1)
+    assert found == pytest.approx(exact, abs=1e-6)
+
+
+REFUSED = {
+    "a state that depends on the closure": (Guessed, GAINS, r"integral, filtered_position\) depend on the closure"),
+    "a name that is no state": (Misnamed, [[1.0, 1.0]], "names speed_error; its states are position, velocity"),
+    "another number of first states": (Misstarted, GAINS, r"returns shape \(1, 1\); its last dimension must be 2"),
+    "a branch": (Branching, [[1.0, 1.0]], "controller of plant 'linear_quadratic' .* a branch of Python .*in observe"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_controller_is_refused(name, tmp_path):
+    kind, gains, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        export_controller(LinearGain(gains), tmp_path / "it.c", kind(dt=0.1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_check_of_a_plant_finds_a_misnamed_state():
+    with pytest.raises(PlantContractError, match="controller_states: 'speed_error' is no state"):
+        check_plant(Misnamed(dt=0.1), traced=False)
+
+
+@needs_compiler
+def test_a_wrong_translation_is_not_written(tmp_path, monkeypatch):
+    right = CSource.text
+    monkeypatch.setattr(CSource, "text", lambda source: right(source).replace("0.25", "0.2500004"))
+    with pytest.raises(ValueError, match="the controller it in C differs from that in torch"):
+        export_controller(LinearGain([[0.25, 1.0]]), tmp_path / "it.c", LinearQuadratic(), name="it")
+    assert not list(tmp_path.iterdir())
+
+
+class Frozen(nn.Module):
+    """A policy that numpy computes, which no program can follow."""
+
+    def forward(self, e):
+        return torch.from_numpy(-0.1 * e.detach().numpy()[..., :1])
+
+
+@needs_compiler
+def test_numbers_that_leave_torch_are_found(tmp_path):
+    with pytest.raises(ValueError, match="differs from that in torch"):
+        export_controller(Frozen(), tmp_path / "it.c", LinearQuadratic())
