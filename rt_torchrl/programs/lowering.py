@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from rt_torchrl.programs.program import UNIFORM, Access, Program
 
@@ -13,6 +13,7 @@ SHORT = 16
 """Number of elements from which a run of gradients is added by a loop."""
 
 
+@runtime_checkable
 class Writer(Protocol):
     """A language for lowered programs. Operands, indices and arrays are texts of that language.
 
