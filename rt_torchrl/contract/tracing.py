@@ -12,7 +12,7 @@ from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines.compilation import raised_limits
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise
-from rt_torchrl.trajectories.engines.programs import Programs, point_near
+from rt_torchrl.trajectories.engines.programs import Programs, point_of
 
 REMEDY = (
     "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
@@ -70,9 +70,10 @@ def untraceable(calls: Calls) -> str | None:
     policy = plant.make_policy(seeded(calls.seed))
     initial_state = torch.nn.functional.pad(arguments["state"][0], (0, 1))  # the cost is one more state
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"][..., :0])
-    point = point_near(initial_state, drive, lanes.number)
+    point = point_of(initial_state, drive, lanes.number)
     try:
-        Programs(CostInterval(Interval(plant, calls.closure, policy)), point, lanes, ()).sweep(False)
+        interval = CostInterval(Interval(plant, calls.closure, policy))
+        Programs(interval, point, lanes).prepare_sweep(interval, False)
     except UntraceableError as error:
         return str(error)
     return None

@@ -21,8 +21,25 @@ def _one_minus_square(p: Program, a: int) -> int:
     return p.sub(p.constant(1.0), p.mul(a, a))
 
 
+def _remainder(p: Program, a: int, b: int) -> int:
+    """What is left of a division, with the sign of the divisor; exact, however large the quotient is."""
+    a, b, zero = p.as_number(a), p.as_number(b), p.constant(0.0)
+    left = p.binary("fmod", a, b)
+    opposite = p.logic("xor", p.compare("olt", left, zero), p.compare("olt", b, zero))
+    return p.select(p.logic("and", opposite, p.compare("une", left, zero)), p.add(left, b), left)
+
+
+def _number_of(how: str) -> Scalar:
+    """Minimum or maximum that prefers a number to NaN."""
+    return lambda p, a, b: p.select(p.logic("or", p.compare(how, a, b), p.compare("une", b, b)), a, b)
+
+
 def _unary(name: str) -> Scalar:
     return lambda p, a: p.unary(name, a)
+
+
+def _binary(name: str) -> Scalar:
+    return lambda p, a, b: p.binary(name, a, b)
 
 
 def _comparison(how: str) -> Scalar:
@@ -45,8 +62,9 @@ ELEMENTWISE: dict[str, Scalar] = {
     "where": Program.select,
     "minimum": lambda p, a, b: p.extreme("minimum", a, b),
     "maximum": lambda p, a, b: p.extreme("maximum", a, b),
-    "atan2": lambda p, a, b: p.new("atan2", p.as_number(a), p.as_number(b)),
-    "hypot": lambda p, a, b: p.unary("sqrt", p.add(p.mul(a, a), p.mul(b, b))),
+    **{name: _binary(name) for name in ("atan2", "hypot", "fmod")},
+    "fmin": _number_of("olt"),
+    "fmax": _number_of("ogt"),
     "reciprocal": lambda p, a: p.div(p.constant(1.0), a),
     "rsqrt": lambda p, a: p.div(p.constant(1.0), p.unary("sqrt", a)),
     "square": lambda p, a: p.mul(a, a),
@@ -55,7 +73,7 @@ ELEMENTWISE: dict[str, Scalar] = {
     "sign": _sign,
     "sgn": _sign,
     "sigmoid": _sigmoid,
-    "remainder": lambda p, a, b: p.sub(a, p.mul(p.unary("floor", p.div(a, b)), b)),
+    "remainder": _remainder,
     "tanh_backward": lambda p, g, y: p.mul(g, _one_minus_square(p, y)),
     "sigmoid_backward": lambda p, g, y: p.mul(g, p.mul(y, p.sub(p.constant(1.0), y))),
 }

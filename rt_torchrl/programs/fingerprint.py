@@ -1,20 +1,34 @@
 """Fingerprints of modules: equal where the traced programs are equal."""
 
+import copyreg
 import hashlib
 import io
 import pickle
+import random
 import types
+from collections import OrderedDict
+from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+
+from rt_torchrl.programs.outer_names import DATA, Name, read_by, read_by_class
+
+GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
+"""Objects that change whenever they are used, and that no program depends on."""
+
+
+DICTIONARIES = (dict, OrderedDict)
+PLAIN = frozenset({str, int, float, bool, type(None), tuple, list, dict, OrderedDict, bytes, torch.Size})
 
 
 def fingerprint(module: nn.Module) -> tuple[bytes, tuple[object, ...]]:
     """A digest of everything in a module but the values of its parameters, which a program takes when it runs.
 
-    Constants and buffers become a part of a program. A module with another constant has another fingerprint, so that
-    it is traced anew.
+    Constants and buffers become a part of a program, and so do the global variables that the code of the module reads.
+    A module with another constant has another fingerprint, so that it is traced anew.
 
     Returns:
         the digest, and objects that the digest knows by their address; whoever keeps the digest keeps them alive.
@@ -22,6 +36,7 @@ def fingerprint(module: nn.Module) -> tuple[bytes, tuple[object, ...]]:
     text = io.BytesIO()
     pickler = _Pickler(text)
     pickler.dump(module)
+    pickler.dump_classes()
     return hashlib.sha256(text.getvalue()).digest(), tuple(pickler.alive)
 
 
@@ -31,27 +46,65 @@ class _Pickler(pickle.Pickler):
     def __init__(self, file: io.BytesIO):
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self.alive: list[object] = []
+        self._parameters: dict[int, int] = {}
+        self._classes: dict[type, None] = {}
+
+    def dump_classes(self) -> None:
+        """Pickle what the methods of all classes read."""
+        for kind in list(self._classes):
+            for read in read_by_class(kind):
+                self.dump([read.version, *self._values(read.names)])
 
     def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, nn.Parameter):
-            return "parameter", tuple(obj.shape), str(obj.dtype), obj.requires_grad
+        if type(obj) in PLAIN:
+            return None
+        if isinstance(obj, nn.Parameter):  # one that is shared is one input of a program
+            number = self._parameters.setdefault(id(obj), len(self._parameters))
+            return "parameter", number, tuple(obj.shape), str(obj.dtype), obj.requires_grad
         if isinstance(obj, Tensor):
             content = obj.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
-            return "tensor", tuple(obj.shape), str(obj.dtype), hashlib.sha256(content).digest()
-        if isinstance(obj, (type, types.FunctionType, types.BuiltinFunctionType, types.ModuleType)):
+            return "tensor", tuple(obj.shape), str(obj.dtype), obj.requires_grad, hashlib.sha256(content).digest()
+        if isinstance(obj, type):
+            self._classes[obj] = None
+            return self._by_address(obj)
+        if isinstance(obj, (types.BuiltinFunctionType, types.ModuleType, *GENERATORS)):
             return self._by_address(obj)
         return None
 
     def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, nn.Module):  # most of its dictionaries are for hooks, and empty
+            self._classes[type(obj)] = None
+            return (
+                _Known,
+                self._by_address(type(obj)),
+                {k: v for k, v in vars(obj).items() if type(v) not in DICTIONARIES or v},
+            )
+        if isinstance(obj, types.FunctionType):
+            held = [_content(cell) for cell in obj.__closure__ or ()], obj.__defaults__, obj.__kwdefaults__
+            return _Known, self._by_address(obj.__code__), [*held, vars(obj), *self._values(read_by(obj))]
         try:
-            obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
-        except (TypeError, pickle.PicklingError):
+            reduce = copyreg.dispatch_table.get(type(obj))
+            reduced = reduce(obj) if reduce else obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+        except Exception:  # an object may refuse with any error
             return _Known, self._by_address(obj)
-        return NotImplemented
+        # A text names a global, which may not be there, as in a function.
+        return (_Known, self._by_address(obj)) if isinstance(reduced, str) else reduced
+
+    def _values(self, names: Iterable[Name]) -> list[object]:
+        """The present values of outer names: data by their content, anything else by its address."""
+        found = [held.get(name) for held, name in names]
+        return [x if isinstance(x, DATA) else self._by_address(x)[1] for x in found]
 
     def _by_address(self, obj: object) -> tuple[str, int]:
         self.alive.append(obj)
         return type(obj).__name__, id(obj)
+
+
+def _content(cell: types.CellType) -> object:
+    try:
+        return cell.cell_contents
+    except ValueError:  # the variable has no value yet
+        return None
 
 
 class _Known(tuple[str, int]):

@@ -11,12 +11,15 @@ from rt_torchrl.programs.vector_functions import FUNCTIONS, INTRINSICS, Lanes, s
 ARITHMETIC = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv contract"}
 """Products and sums may be contracted into one rounding; nothing else of floating-point arithmetic is relaxed."""
 WIDTH = "align 8"  # torch aligns rows to doubles
+STACK = 2**17
+"""Bytes of arrays that lie on the stack, which is 512 KiB in the threads of some systems; others are allocated."""
 
 
 class LaneWriter:
     """Writes a lowered program in LLVM's language; it is a :class:`~rt_torchrl.programs.lowering.Writer`.
 
-    ``prologue`` holds what is computed once, ``body`` what every step computes, ``entry`` the memory of both.
+    ``prologue`` holds what is computed once, ``body`` what every step computes, ``entry`` the memory of both, which
+    ``exit`` frees.
 
     Args:
         lanes: number of lanes and the source of their functions.
@@ -27,11 +30,12 @@ class LaneWriter:
         self.lanes, self._prefix, n = lanes, prefix, lanes.number
         self.vector, self.mask = f"<{n} x double>", f"<{n} x i1>"
         self.entry: list[str] = []
+        self.exit: list[str] = []
         self.prologue: list[str] = []
         self.body: list[str] = []
         self.globals: dict[str, str] = {}
         self.declarations: dict[str, str] = {}
-        self._count = 0
+        self._count = self._stack = 0
         self._places: dict[str, str] = {}
 
     def fresh(self) -> str:
@@ -66,7 +70,7 @@ class LaneWriter:
         if name in ("and", "or", "xor"):
             return self.emit(f"{name} {mask} {', '.join(operands)}", once=not lanes)
         if name == "not":
-            every = self.constant(True, truth=True, lanes=lanes)
+            every = self.constant(1.0, truth=True, lanes=lanes)
             return self.emit(f"xor {mask} {operands[0]}, {every}", once=not lanes)
         arguments = ", ".join(f"{number} {a}" for a in operands)
         return self.emit(f"call {number} @{self._function(name, lanes)}({arguments})", once=not lanes)
@@ -118,8 +122,15 @@ class LaneWriter:
         return name
 
     def local(self, size: int) -> str:
-        name = self.fresh()
-        self.entry.append(f"{name} = alloca [{size} x {self.vector}], align 64")
+        name, size_in_bytes = self.fresh(), 8 * size * self.lanes.number
+        if self._stack + size_in_bytes <= STACK:
+            self._stack += size_in_bytes
+            self.entry.append(f"{name} = alloca [{size} x {self.vector}], align 64")
+        else:
+            self.declarations["malloc"] = "declare noalias ptr @malloc(i64)"
+            self.declarations["free"] = "declare void @free(ptr)"
+            self.entry.append(f"{name} = call ptr @malloc(i64 {size_in_bytes})")
+            self.exit.append(f"call void @free(ptr {name})")
         return name
 
     def index(self, base: int, terms: Sequence[tuple[int, str]]) -> str:
@@ -268,7 +279,7 @@ def _function(name: str, parameters: str, write: Callable[[LaneWriter], None], l
         step,
     ]
     tail = ["br label %bottom", "bottom:", "%next = add nsw i64 %i, 1", "%more = icmp slt i64 %next, %n"]
-    tail += ["br i1 %more, label %top, label %done", "done:", "ret void"]
+    tail += ["br i1 %more, label %top, label %done", "done:", *writer.exit, "ret void"]
     lines = [*writer.entry, *writer.prologue, *head, *writer.body, *tail]
     text = "\n".join(line if line.endswith(":") else f"  {line}" for line in lines)
     globals_ = "\n".join([*writer.globals.values(), *writer.declarations.values()])

@@ -27,15 +27,14 @@ class ObjectCode:
 
     def __init__(self, text: str, name: str, arguments: tuple[type, ...]):
         publish_scalar_functions()
-        machine = _machine()
-        code = llvm.ObjectFileRef.from_data(_compiled(text, machine))
-        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        code = llvm.ObjectFileRef.from_data(_compiled(text))
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         self._engine.add_object_file(code)
         self._engine.finalize_object()
         self.call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(name))
 
 
-def _compiled(text: str, machine: llvm.TargetMachine) -> bytes:
+def _compiled(text: str) -> bytes:
     """Object code of a text: from the disk, where its name is the digest of everything it depends on, or made anew.
 
     A file begins with the digest of its code; one that is damaged is made again.
@@ -48,7 +47,7 @@ def _compiled(text: str, machine: llvm.TargetMachine) -> bytes:
         held = b""
     if held and hashlib.sha256(held[DIGEST:]).digest() == held[:DIGEST]:
         return held[DIGEST:]
-    code = _compile(text, machine)
+    code = _compile(text)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, hashlib.sha256(code).digest() + code)
@@ -62,7 +61,8 @@ def cache_folder() -> Path:
     return user_cache_path("rt_torchrl") / "native"
 
 
-def _compile(text: str, machine: llvm.TargetMachine) -> bytes:
+def _compile(text: str) -> bytes:
+    machine = _machine()
     module = llvm.parse_assembly(text)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=OPTIMISATION)
@@ -72,13 +72,19 @@ def _compile(text: str, machine: llvm.TargetMachine) -> bytes:
     return bytes(machine.emit_object(module))
 
 
-@cache
 def _machine() -> llvm.TargetMachine:
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    target = llvm.Target.from_default_triple()
+    """A new description of this processor, because the code that is loaded with one frees it."""
+    target = _target()
     return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=OPTIMISATION, jit=True)
 
 
+@cache
+def _target() -> llvm.Target:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple()
+
+
+@cache
 def _features() -> str:
     return str(llvm.get_host_cpu_features().flatten())

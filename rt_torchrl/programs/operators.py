@@ -7,73 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rt_torchrl.programs.copies import COPIES, Arguments, Options
 from rt_torchrl.programs.program import VARYING, Program
 from rt_torchrl.programs.tracer import STRAIGHT, Rule, Tracer
 
 STRAIGHT_PRODUCT = 200
 """Greatest number of multiplications of a product of matrices that becomes straight-line code."""
-Arguments = tuple[Any, ...]
-Options = dict[str, Any]
-
-# Copies, which are carried out on the cells
-
-
-def _copy_by(operator: Any) -> Rule:
-    def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
-        def celled(x: Any) -> Any:
-            if isinstance(x, Tensor):
-                return tracer.cells(x)
-            return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
-
-        kept = {key: value for key, value in options.items() if key != "memory_format"}
-        return operator(*(celled(a) for a in args), **kept)
-
-    return rule
-
-
-def _copy(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return tracer.cells(args[0])
-
-
-def _overwrite(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return tracer.cells(args[1])
-
-
-def _pick_by(operator: Any) -> Rule:
-    """Copies from places that are known: ``gather`` and ``index_select``."""
-
-    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-        if tracer.numbers(tracer.cells(args[2])) is None:
-            raise tracer.refuse(f"{operator} by an index that varies")
-        picked: Tensor = operator(tracer.cells(args[0]), *args[1:])
-        return picked
-
-    return rule
-
-
-def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    if tracer.numbers(tracer.cells(args[2])) is None:
-        raise tracer.refuse("scatter by an index that varies")
-    source = tracer.cells(args[3]).expand(args[2].shape)
-    return tracer.cells(args[0]).scatter(args[1], args[2], source)
-
-
-def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    filling = tracer.program.constant(float(args[2]) if len(args) > 2 else 0.0)
-    return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
-
-
-def _slice_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    gradient, sizes, dim, start, end, step = args
-    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
-    index = torch.arange(sizes[dim])[slice(start, min(end, sizes[dim]), step)]
-    return zeros.index_copy(dim, index, tracer.cells(gradient))
-
-
-def _select_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    gradient, sizes, dim, index = args
-    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
-    return zeros.index_copy(dim, torch.tensor([index % sizes[dim]]), tracer.cells(gradient).unsqueeze(dim))
 
 
 def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
@@ -119,7 +58,9 @@ def _degrees_to_radians(tracer: Tracer, args: Arguments, options: Options, out: 
 
 
 def _reversed_sub(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return tracer.pointwise("sub", [tracer.cells(args[1]), tracer.cells(args[0])], out.shape)
+    factor = tracer.cells((*args[2:], options.get("alpha", 1))[0])
+    scaled = tracer.pointwise("mul", [tracer.cells(args[0]), factor], args[0].shape)
+    return tracer.pointwise("sub", [tracer.cells(args[1]), scaled], out.shape)
 
 
 # Sums, products and folds
@@ -132,7 +73,7 @@ def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
     if m * n > 4 * STRAIGHT:
         ones = torch.full((n, 1), p.constant(1.0))
         return matrix_product(tracer, rows, ones).view(out.shape)
-    found = [_folded(p.add, row, p.constant(0.0)) for row in rows.tolist()]
+    found = [_folded(p.add, rest, first) for first, *rest in rows.tolist()] if n else [p.constant(0.0)] * m
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
@@ -141,11 +82,43 @@ def _mean(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Ten
     return tracer.pointwise("div", [_sum(tracer, args, options, out), count], out.shape)
 
 
+def _variance(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    p, correction = tracer.program, (*args[2:], options.get("correction", 1))[0]
+    found = []
+    for row in _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist():
+        mean = p.div(_folded(p.add, row[1:], row[0]), p.constant(float(len(row))))
+        squares = [p.mul(d, d) for d in (p.sub(x, mean) for x in row)]
+        found.append(p.div(_folded(p.add, squares[1:], squares[0]), p.constant(max(0.0, len(row) - correction))))
+    return torch.tensor(found, dtype=torch.int64).view(out.shape)
+
+
 def _fold(step: Callable[[Program, int, int], int]) -> Rule:
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
         rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
         found = [_folded(lambda a, b: step(tracer.program, a, b), rest, first) for first, *rest in rows]
         return torch.tensor(found, dtype=torch.int64).view(out.shape)
+
+    return rule
+
+
+def _with_place(how: str) -> Rule:
+    """Greatest or least number of each row, and its place; NaN counts as greatest and least."""
+
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
+        p, found = tracer.program, []
+        name = "maximum" if how == "ogt" else "minimum"
+        if isinstance(out, Tensor) and len(args) == 1:
+            return _fold(lambda p, a, b: p.extreme(name, a, b))(tracer, args, options, out)
+        if isinstance(out, Tensor):
+            return tracer.pointwise(name, [tracer.cells(a) for a in args], out.shape)
+        for first, *rest in _rows(tracer.cells(args[0]), args[1]).tolist():
+            value, place = first, p.constant(0.0)
+            for k, x in enumerate(rest, 1):
+                news = p.logic("and", p.compare("une", x, x), p.compare("oeq", value, value))
+                better = p.logic("or", p.compare(how, x, value), news)
+                value, place = p.select(better, x, value), p.select(better, p.constant(float(k)), place)
+            found.append((value, place))
+        return [torch.tensor(cells, dtype=torch.int64).view(out[0].shape) for cells in zip(*found, strict=True)]
 
     return rule
 
@@ -179,8 +152,7 @@ def _folded(step: Callable[[int, int], int], row: Sequence[int], first: int) -> 
 def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = None) -> Tensor:
     """The cells of ``start`` + a b: straight-line code, or one loop for large matrices."""
     p, (m, k), n = tracer.program, a.shape, b.shape[1]
-    zero = p.constant(0.0)
-    first = torch.full((m, n), zero) if start is None else start.expand(m, n)
+    first = torch.full((m, n), p.constant(-0.0)) if start is None else start.expand(m, n)
     if m * k * n <= STRAIGHT_PRODUCT:
         found = []
         for row, starts in zip(a.tolist(), first.tolist(), strict=True):
@@ -234,18 +206,25 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
     found = []
     for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
         place = p.constant(0.0)
-        for index, stride in zip(at, strides, strict=False):
-            place = p.add(place, p.mul(index, p.constant(float(stride))))
-        found += [p.new("look_up", table, place, attributes=(r,)) for r in range(rest)]
+        for index, size, stride in zip(at, source.shape, strides, strict=False):
+            inside = p.logic(
+                "and",
+                p.compare("oge", index, p.constant(-float(size))),
+                p.compare("olt", index, p.constant(float(size))),
+            )
+            wrapped = p.select(p.compare("olt", index, p.constant(0.0)), p.add(index, p.constant(float(size))), index)
+            safe = p.select(inside, wrapped, p.constant(math.nan))
+            place = p.add(place, p.mul(safe, p.constant(float(stride))))
+        found += [p.new("look_up", table, place, attributes=(r,), level=VARYING) for r in range(rest)]
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
 def _bucketize(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    p, how = tracer.program, "oge" if options.get("right", False) else "ogt"
+    p, how = tracer.program, "ogt" if options.get("right", False) else "oge"
     knots = tracer.cells(args[1]).tolist()
     found = []
     for x in tracer.cells(args[0]).flatten().tolist():
-        passed = [p.as_number(p.compare(how, x, knot)) for knot in knots]
+        passed = [p.as_number(p.logic("not", p.compare(how, knot, x))) for knot in knots]  # NaN passes all
         found.append(_folded(p.add, passed, p.constant(0.0)))
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
@@ -257,20 +236,10 @@ def _searchsorted(tracer: Tracer, args: Arguments, options: Options, out: Tensor
     return _bucketize(tracer, (args[1], args[0]), {"right": right}, out)
 
 
-COPIES = (
-    "cat stack flip roll repeat expand_copy diag_embed slice_scatter select_scatter unfold_copy view_copy permute_copy "
-    "_unsafe_view alias_copy"
-).split()
 RULES: dict[str, Rule] = {
-    **{name: _copy_by(getattr(torch.ops.aten, name)) for name in COPIES},
-    **dict.fromkeys(("clone", "contiguous", "lift_fresh", "lift_fresh_copy"), _copy),
-    **dict.fromkeys(("copy", "fill"), _overwrite),
-    **{name: _pick_by(getattr(torch.ops.aten, name)) for name in ("gather", "index_select")},
+    **COPIES,
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
-    "scatter": _scatter,
-    "constant_pad_nd": _pad,
-    "slice_backward": _slice_backward,
-    "select_backward": _select_backward,
+    "var": _variance,
     "_to_copy": _convert,
     "clamp_max": _clamp_max,
     "masked_fill": _masked_fill,
@@ -280,6 +249,8 @@ RULES: dict[str, Rule] = {
     "mean": _mean,
     "amax": _fold(lambda p, a, b: p.extreme("maximum", a, b)),
     "amin": _fold(lambda p, a, b: p.extreme("minimum", a, b)),
+    "max": _with_place("ogt"),
+    "min": _with_place("olt"),
     "prod": _fold(Program.mul),
     "cumsum": _cumulate(Program.add),
     "cumprod": _cumulate(Program.mul),

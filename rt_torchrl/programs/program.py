@@ -12,10 +12,12 @@ CONSTANT, UNIFORM, VARYING = 0, 1, 2
 
 UNARY = frozenset(
     "exp exp2 expm1 log log1p log2 log10 sin cos tan tanh sinh cosh asin acos atan asinh acosh atanh erf sqrt floor "
-    "ceil trunc round abs neg".split()
+    "ceil trunc round abs neg erfc".split()
 )
 COMPARISONS = {"gt": "ogt", "lt": "olt", "ge": "oge", "le": "ole", "eq": "oeq", "ne": "une"}
 """Comparisons of torch, by the names that LLVM gives to comparisons of numbers: NaN is unequal to everything."""
+LEAST_DIVISOR = 2.0**-1022
+"""Least divisor whose reciprocal is finite."""
 HIGHEST_POWER = 8
 """Greatest integer exponent of a power that becomes a product."""
 
@@ -151,8 +153,9 @@ class Program:
         x, y = self.number(a), self.number(b)
         if x is not None and y is not None:
             return self.constant(x + y)
-        if x == 0.0 or y == 0.0:
-            return b if x == 0.0 else a
+        for zero, other in ((x, b), (y, a)):
+            if zero == 0.0 and (self.differentiating or math.copysign(1.0, zero) < 0.0):  # −0 + 0 is 0
+                return other
         for negated, other in ((b, a), (a, b)):
             if self.operations[negated].name == "neg":
                 return self.sub(other, self.operations[negated].operands[0])
@@ -163,9 +166,9 @@ class Program:
         x, y = self.number(a), self.number(b)
         if x is not None and y is not None:
             return self.constant(x - y)
-        if y == 0.0:
+        if y == 0.0 and (self.differentiating or math.copysign(1.0, y) > 0.0):
             return a
-        if x == 0.0:
+        if x == 0.0 and (self.differentiating or math.copysign(1.0, x) < 0.0):  # 0 − 0 is 0, and not −0
             return self.neg(b)
         if self.operations[b].name == "neg":
             return self.add(a, self.operations[b].operands[0])
@@ -194,7 +197,9 @@ class Program:
             return self.constant(x / y)
         if x == 0.0 and self.differentiating:
             return a
-        if y is not None and abs(math.frexp(y)[0]) == 0.5:  # the reciprocal of a power of two is exact
+        if (
+            y is not None and abs(math.frexp(y)[0]) == 0.5 and abs(y) >= LEAST_DIVISOR
+        ):  # the reciprocal of a power of two is exact
             return self.mul(a, self.constant(1.0 / y))
         return self.new("div", a, b)
 
@@ -205,12 +210,12 @@ class Program:
         if y is not None and abs(y) == 0.5:
             root = self.unary("sqrt", a)
             return root if y > 0 else self.div(one, root)
-        if y is not None and y == int(y) and abs(y) <= HIGHEST_POWER:
+        if y is not None and abs(y) <= HIGHEST_POWER and y == int(y):
             if y == 0.0:
                 return one
             product = self._integer_power(a, int(abs(y)))
             return product if y > 0 else self.div(one, product)
-        return self.new("pow", a, b)
+        return self.binary("pow", a, b)
 
     def _integer_power(self, a: int, exponent: int) -> int:
         if exponent == 1:
@@ -228,12 +233,20 @@ class Program:
             return self.constant(float(getattr(torch, name)(torch.tensor(x, dtype=torch.float64))))
         return self.new(name, a)
 
+    def binary(self, name: str, a: int, b: int) -> int:
+        """A mathematical function of two numbers."""
+        a, b = self.as_number(a), self.as_number(b)
+        x, y = (None if v is None else torch.tensor(v, dtype=torch.float64) for v in (self.number(a), self.number(b)))
+        return self.new(name, a, b) if x is None or y is None else self.constant(float(getattr(torch, name)(x, y)))
+
     def extreme(self, name: str, a: int, b: int) -> int:
         """Minimum or maximum; NaN if one of the two is NaN."""
         a, b = self.as_number(a), self.as_number(b)
         how = "olt" if name == "minimum" else "ogt"
         if self.number(b) is not None:
             a, b = b, a
+        if self.number(a) != self.number(a):
+            return a
         if self.number(a) is not None:  # where b is NaN the comparison fails and b is chosen
             return self.select(self.compare(how, a, b), a, b)
         return self.select(self.logic("or", self.compare(how, a, b), self.compare("une", a, a)), a, b)

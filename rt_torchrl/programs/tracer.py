@@ -1,19 +1,17 @@
 """Tracing: one execution of torch code, for one realisation, becomes a program."""
 
 import math
-import sys
-import traceback
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
+from rt_torchrl.programs.places import Places
 from rt_torchrl.programs.program import CONSTANT, UNIFORM, VARYING, Access, Program, UntraceableError
 
 STRAIGHT = 24
@@ -24,9 +22,6 @@ FILLS = frozenset(
     "zeros ones full empty zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty "
     "scalar_tensor arange eye linspace empty_strided new_empty_strided zero".split()
 )
-
-CHECKERS = {"jaxtyping", "beartype"}
-"""Packages that stand between a function and its caller when they check annotations at run time."""
 
 Rule = Callable[["Tracer", tuple[Any, ...], dict[str, Any], Any], Any]
 
@@ -41,9 +36,12 @@ class Tracer(TorchDispatchMode):
         rules: operators that neither copy nor act elementwise, by name.
     """
 
+    supports_higher_order_operators = True  # to refuse them with a message
+
     def __init__(self, rules: dict[str, Rule]):
         super().__init__()
         self.program = Program()
+        self.places = Places()
         self._rules = rules
         self._cells: dict[int, Tensor] = {}
         self._alive: list[Tensor] = []  # a storage that is freed could give its address to another one
@@ -56,10 +54,12 @@ class Tracer(TorchDispatchMode):
             return torch.tensor(self.program.constant(x))
         key = _storage_of(x)
         if key not in self._cells:  # a tensor from outside is a constant
-            size = x.untyped_storage().nbytes() // x.element_size()
-            values = torch.as_strided(x.detach(), (size,), (1,), 0).tolist()
             if x.is_complex():
                 raise self.refuse("complex numbers")
+            if x.requires_grad and x.is_leaf and x.numel():
+                raise self.refuse("a tensor that requires a gradient but is no parameter of the modules")
+            size = x.untyped_storage().nbytes() // x.element_size()
+            values = torch.as_strided(x.detach(), (size,), (1,), 0).tolist()
             self._cells[key] = torch.tensor([self.program.constant(v) for v in values], dtype=torch.int64)
             self._alive.append(x)
         return torch.as_strided(self._cells[key], x.shape, x.stride(), x.storage_offset())
@@ -67,7 +67,8 @@ class Tracer(TorchDispatchMode):
     def assign(self, x: Tensor, cells: Tensor) -> None:
         """Let a new tensor hold values of the program."""
         cell = torch.zeros(x.untyped_storage().nbytes() // max(1, x.element_size()), dtype=torch.int64)
-        torch.as_strided(cell, x.shape, x.stride(), x.storage_offset()).copy_(cells)
+        once = tuple(slice(1) if stride == 0 else slice(None) for stride in x.stride())
+        torch.as_strided(cell, x.shape, x.stride(), x.storage_offset())[once].copy_(cells[once])
         self._cells[_storage_of(x)] = cell
         self._alive.append(x)
 
@@ -93,7 +94,7 @@ class Tracer(TorchDispatchMode):
 
     def refuse(self, what: str) -> UntraceableError:
         """The error of code that cannot become a program, with the line of the caller's code."""
-        return UntraceableError(f"{what}{_place()}")
+        return UntraceableError(f"{what}{self.places.now()}")
 
     # Operators
 
@@ -101,30 +102,81 @@ class Tracer(TorchDispatchMode):
         self, func: Any, types: Iterable[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
+        if not isinstance(func, OpOverload):
+            raise self.refuse(f"torch operator {func} has no translation")
         self.program.differentiating = torch._C._current_autograd_node() is not None
-        packet = func._schema.name.split("::")[1]
-        name = packet if packet.startswith("_") else packet.rstrip("_")
-        if packet in DECISIONS:
-            if self.numbers(self.cells(args[0])) is None:
-                raise self.refuse("a number or a branch of Python is taken from a tensor that varies")
-            return func(*args, **kwargs)
-        if torch.Tag.nondeterministic_seeded in func.tags:
-            raise self.refuse(f"{packet} draws random numbers")
-        if func.is_view:  # a view shares the cells
-            self.cells(args[0])
-            return func(*args, **kwargs)
-        known = name in ELEMENTWISE or name in FILLS or name in self._rules
-        in_place = func._schema.is_mutable and packet.endswith("_")
-        if not known and not in_place and (decomposition := _decomposition(func)):
-            with self:
-                return decomposition(*args, **kwargs)
+        with torch._C.DisableTorchFunction():  # the mode of escapes is for the caller's code alone
+            self.places.note()
+            packet = func._schema.name.split("::")[1]
+            name = packet if packet.startswith("_") else packet.rstrip("_")
+            if packet in DECISIONS or torch.Tag.nondeterministic_seeded in func.tags:
+                return self._decided(func, packet, args, kwargs)
+            known = name in ELEMENTWISE or name in FILLS or name in self._rules
+            if not known and func._can_decompose():  # into views or copies, depending on the strides
+                with self:
+                    return func.decompose(*args, **kwargs)
+            if func.is_view:  # a view shares the cells
+                self.cells(args[0])
+                out = func(*args, **kwargs)
+                if any(o.dtype != args[0].dtype for o in tensors_in([out])):
+                    raise self.refuse(f"{func} reads numbers as another type")
+                return out
+            if not func._schema.is_mutable and self._foldable(args):
+                return self._folded(func, args, kwargs)
+            in_place = func._schema.is_mutable and packet.endswith("_")
+            if not known and not in_place and (decomposition := _decomposition(func)):
+                with self:
+                    return decomposition(*args, **kwargs)
+            return self._executed(func, name, args, kwargs)
+
+    def _foldable(self, args: tuple[Any, ...]) -> bool:
+        """Whether all tensors among arguments hold known numbers, which are those of torch."""
+        exact = not self.program.differentiating  # 0·x may be NaN for torch
+        return all((exact or not x.is_floating_point()) and self._known(x) for x in tensors_in(args))
+
+    def _known(self, x: Tensor) -> bool:
+        cells = self.cells(x)
+        return not cells.numel() or self.program.number(int(cells.flatten()[0])) is not None is not self.numbers(cells)
+
+    def _folded(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """What an operator makes of known numbers: known numbers, whatever the operator is."""
         out = func(*args, **kwargs)
+        for x in tensors_in([out]):
+            if x.is_complex():
+                raise self.refuse("complex numbers")
+            found = [self.program.constant(v) for v in x.detach().flatten().tolist()]
+            self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
+        return out
+
+    def _decided(self, func: Any, packet: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """What Python takes from tensors, which must hold known numbers."""
+        if packet not in DECISIONS:
+            raise self.refuse(f"{packet} draws random numbers")
+        self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
+        return func(*args, **kwargs)
+
+    def require_known(self, what: str, args: Iterable[Any]) -> None:
+        """Refuse tensors whose numbers are not known when the program is made."""
+        if any(self.numbers(self.cells(x)) is None for x in tensors_in(args)):
+            raise self.refuse(what)
+
+    def _executed(self, func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """What an operator returns, with the cells of what it computes."""
+        out = func(*args, **kwargs)
+        outs = list(tensors_in([out]))
+        if any(o.is_complex() for o in outs):
+            raise self.refuse("complex numbers")
+        try:
+            found = self._computed(func, name, args, kwargs, args[0] if func._schema.is_mutable else out)
+        except UntraceableError:
+            raise
+        except Exception as error:
+            raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
         if func._schema.is_mutable:
-            cells = self._computed(func, name, args, kwargs, args[0])
-            self.cells(args[0]).copy_(cells.expand(args[0].shape))
+            if not func._schema.arguments[0].is_write or len(outs) != 1:
+                raise self.refuse(f"{func} writes into its argument out")
+            self.cells(args[0]).copy_(found.expand(args[0].shape))
             return out
-        outs = [o for o in ([out] if isinstance(out, Tensor) else out) if isinstance(o, Tensor)]
-        found = self._computed(func, name, args, kwargs, out)
         for o, cells in zip(outs, found if isinstance(found, (tuple, list)) else [found], strict=True):
             self.assign(o, cells)
         return out
@@ -144,8 +196,11 @@ class Tracer(TorchDispatchMode):
     def _elementwise(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Tensor) -> Tensor:
         if out.is_floating_point() and out.dtype != torch.float64:
             raise self.refuse(f"{name} computes in {out.dtype}; trajectories need torch.float64")
+        unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "rounding_mode", "dtype"))]
+        if unknown or (name.startswith("bitwise") and out.dtype != torch.bool):
+            raise self.refuse(f"{name} of {out.dtype} with {unknown or 'bits'}")
         operands = [self.cells(a) for a in args[: ARITY[name]]]
-        alpha = kwargs.get("alpha", 1) if name in ("add", "sub") else 1
+        alpha = kwargs.get("alpha", 1)
         if alpha != 1:
             operands[1] = self.pointwise("mul", [operands[1], self.cells(alpha)], operands[1].shape)
         found = self.pointwise(name, operands, out.shape)
@@ -176,8 +231,8 @@ class Tracer(TorchDispatchMode):
         numbers = [self.uniform_number(o) for o in operands]
         if name == "mul" and self.program.differentiating and 0.0 in numbers:
             return operands[numbers.index(0.0)]
-        for plain, neutral in (("mul", 1.0), ("add", 0.0)):
-            if name == plain and neutral in numbers:
+        for plain, neutral in (("mul", 1.0), ("add", 0.0 if self.program.differentiating else None)):
+            if name == plain and neutral is not None and neutral in numbers:
                 return operands[1 - numbers.index(neutral)]
         return operands[0] if (name, numbers[-1]) in (("sub", 0.0), ("div", 1.0)) else None
 
@@ -236,9 +291,6 @@ def _storage_of(x: Tensor) -> int:
 @cache
 def _decomposition(func: Any) -> Callable[..., Any] | None:
     """The way to compute an operator by simpler ones; None if torch knows none."""
-    if func._can_decompose():
-        own: Callable[..., Any] = func.decompose
-        return own
     return _decompositions().get(func)
 
 
@@ -247,22 +299,4 @@ def _decompositions() -> dict[Any, Callable[..., Any]]:
     # These tables take a third of a second to import, and most code needs none of them.
     from torch._decomp import core_aten_decompositions, decomposition_table
 
-    return {**decomposition_table, **core_aten_decompositions(), torch.ops.prims.var.default: _variance}
-
-
-def _variance(x: Tensor, dims: list[int], correction: float = 1.0, **options: Any) -> Tensor:
-    squares = (x - x.mean(dims, keepdim=True)) ** 2
-    return squares.sum(dims) / (math.prod(x.shape[d] for d in dims) - correction)
-
-
-def _place() -> str:
-    """The innermost line outside of torch and this room, for a message."""
-    own = (str(_folder(torch)), str(_folder(sys.modules[__package__])))
-    for frame in reversed(traceback.extract_stack()):
-        if not frame.filename.startswith(own) and not CHECKERS & set(Path(frame.filename).parts):
-            return f" (in {frame.name}, {frame.filename}:{frame.lineno}: {frame.line})"
-    return ""
-
-
-def _folder(module: ModuleType) -> str:
-    return str(module.__file__).removesuffix("__init__.py")
+    return {**decomposition_table, **core_aten_decompositions()}

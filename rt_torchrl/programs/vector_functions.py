@@ -13,9 +13,8 @@ INTRINSICS = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc"
 """Functions that are instructions of most processors, by their names in LLVM."""
 FUNCTIONS = {
     **dict.fromkeys("exp exp2 expm1 log log1p log2 log10 sin cos tan tanh sinh cosh asin acos atan".split(), 1),
-    **dict.fromkeys("asinh acosh atanh erf".split(), 1),
-    "pow": 2,
-    "atan2": 2,
+    **dict.fromkeys("asinh acosh atanh erf erfc".split(), 1),
+    **dict.fromkeys("pow atan2 hypot fmod".split(), 2),
 }
 """Functions of the C library and the numbers of their arguments."""
 
@@ -58,9 +57,9 @@ def symbol(name: str, lanes: Lanes) -> str | None:
 
 @cache
 def publish_scalar_functions() -> None:
-    """Make the C library's functions of one number known to LLVM."""
+    """Make the C library's functions of one number, and those of memory, known to LLVM."""
     library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
-    for name in (*FUNCTIONS, *(n for n in INTRINSICS.values() if n != "fabs")):
+    for name in (*FUNCTIONS, *(n for n in INTRINSICS.values() if n != "fabs"), "malloc", "free"):
         _publish(library, name)
 
 

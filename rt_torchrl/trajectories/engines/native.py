@@ -63,8 +63,7 @@ class Native(GradientEngine):
 
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
-        wanted, driven = _wanted(interval, initial_state, drive)
-        programs = programs_of(interval, initial_state, drive, sweep=wanted, driven=driven)
+        programs = programs_of(interval, initial_state, drive)
         if programs is None:
             return self._substitute.end_states(interval, initial_state, drive)
         task = _Task(programs, interval, self.memory)
@@ -78,20 +77,14 @@ class Native(GradientEngine):
         """
         costed = CostInterval(interval)
         state = torch.cat([initial_state, initial_state.new_zeros(len(initial_state), 1)], -1)
-        wanted, driven = _wanted(interval, initial_state, drive)
-        programs = programs_of(costed, state, drive, sweep=wanted, driven=driven)
+        programs = programs_of(costed, state, drive)
         if programs is None:
             return None
         task = _Task(programs, costed, self.memory)
-        found: Tensor = _Costs.apply(task, wanted, state, *drive, *task.learned)
+        leaves = (state, *drive, *task.learned)
+        wanted = torch.is_grad_enabled() and any(x.requires_grad for x in leaves)
+        found: Tensor = _Costs.apply(task, wanted, *leaves)
         return found
-
-
-def _wanted(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[bool, bool]:
-    """Whether a gradient is wanted, and whether that by the drive is."""
-    enabled = torch.is_grad_enabled()
-    driven = enabled and any(x.requires_grad for x in drive)
-    return driven or enabled and any(x.requires_grad for x in (initial_state, *interval.parameters())), driven
 
 
 class _Task:

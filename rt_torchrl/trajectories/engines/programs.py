@@ -3,6 +3,7 @@
 import threading
 import warnings
 from collections import OrderedDict
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,9 +17,7 @@ from rt_torchrl.trajectories.engines.traced_interval import March, Point, Sweep
 KEPT = 256
 """Number of kinds of intervals whose programs are kept."""
 NUDGE = 1e-3
-"""Relative change of the states at which machine code is compared with torch, so that no two of them are equal."""
-_kept: "OrderedDict[tuple[object, ...], Programs | UntraceableError]" = OrderedDict()
-_lock = threading.RLock()
+"""Relative change of the signals at which machine code is compared with torch, so that no two of them are equal."""
 
 
 class Programs:
@@ -28,11 +27,10 @@ class Programs:
         interval: the map Φ.
         point: a point at which it is traced, and compared with torch.
         lanes: lanes of the processor.
-        alive: objects that the fingerprint of the interval knows by their address.
     """
 
-    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes, alive: tuple[object, ...]):
-        self.interval, self.point, self.lanes, self._alive = interval, point, lanes, alive
+    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
+        self.point, self.lanes = point, lanes
         self._march = March(interval, point, lanes)
         self._sweeps: dict[bool, Sweep] = {}
 
@@ -45,25 +43,38 @@ class Programs:
         """The recurrence."""
         return self._march
 
+    def prepare_sweep(self, interval: nn.Module, driven: bool) -> None:
+        """Make the reverse sweep of an interval of this kind, unless it is there.
+
+        Raises:
+            UntraceableError: if it cannot become a program.
+        """
+        if driven not in self._sweeps:
+            self._sweeps[driven] = Sweep(interval, self.point, self.lanes, driven=driven)
+
     def sweep(self, driven: bool) -> Sweep:
-        """The reverse sweep, with or without the gradients by the drive."""
-        with _lock:
-            if driven not in self._sweeps:
-                self._sweeps[driven] = Sweep(self.interval, self.point, self.lanes, driven=driven)
-            return self._sweeps[driven]
+        """The reverse sweep, with or without the gradients by the drive; it has been prepared."""
+        return self._sweeps[driven]
 
 
-def programs_of(
-    interval: nn.Module, initial_state: Tensor, drive: Drive, *, sweep: bool = False, driven: bool = False
-) -> Programs | None:
+class _Entry(NamedTuple):
+    """What is kept of one kind of interval: its programs or why there are none, for any of its sweeps.
+
+    ``alive`` holds the objects that its fingerprint knows by their address.
+    """
+
+    programs: Programs | UntraceableError
+    alive: tuple[object, ...]
+
+
+_kept: "OrderedDict[tuple[object, ...], _Entry]" = OrderedDict()
+_lock = threading.RLock()
+
+
+def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Programs | None:
     """The programs of an interval; None where it is not on the CPU or, with one warning, cannot become a program.
 
-    Args:
-        interval: the map Φ.
-        initial_state: initial states, near which machine code is compared with torch.
-        drive: the drive of the trajectory.
-        sweep: whether a gradient is wanted.
-        driven: whether the gradient by the drive is wanted.
+    Where a gradient is wanted, the sweep is prepared too: later the interval may be another one.
     """
     if initial_state.device.type != "cpu":
         return None
@@ -71,28 +82,41 @@ def programs_of(
         lanes = lanes_of_this_machine()
         digest, alive = fingerprint(interval)
         key = (digest, lanes, initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1])
-        found = _kept.get(key)
+        found = _kept[key].programs if key in _kept else None
         if not isinstance(found, UntraceableError):
             try:
-                found = found or Programs(interval, point_near(initial_state, drive, lanes.number), lanes, alive)
-                if sweep:
-                    found.sweep(driven)
-            except UntraceableError as error:
-                found = error
-                warnings.warn(f"engine 'parallel' takes the place of 'native': {error}.", stacklevel=2)
-            _kept[key] = found
+                found = found or Programs(interval, point_of(initial_state, drive, lanes.number), lanes)
+                leaves = (initial_state, *drive, *interval.parameters())
+                if torch.is_grad_enabled() and any(x.requires_grad for x in leaves):
+                    found.prepare_sweep(interval, any(x.requires_grad for x in drive))
+            except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
+                found = _reason(error)
+                warnings.warn(f"engine 'parallel' takes the place of 'native': {found}.", stacklevel=2)
+            _kept[key] = _Entry(found, _kept[key].alive if key in _kept else alive)
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
         return found if isinstance(found, Programs) else None
 
 
+def _reason(error: Exception) -> UntraceableError:
+    """Why there is no program, without the traceback, which would keep the traced tensors."""
+    if isinstance(error, UntraceableError):
+        return error.with_traceback(None)
+    return UntraceableError(f"an interval of one realisation raises {type(error).__name__}: {str(error).rstrip('.')}")
+
+
 @torch.no_grad()
-def point_near(initial_state: Tensor, drive: Drive, lanes: int) -> Point:
+def point_of(initial_state: Tensor, drive: Drive, lanes: int) -> Point:
     """States and drive of one interval for every lane, near the initial states and at times over the whole drive."""
     n, batch, lane = len(drive.t), len(initial_state), torch.arange(lanes)
-    state = initial_state.detach()[lane % batch]
-    state = state + NUDGE * (lane.unsqueeze(-1) / lanes) * (state.abs() + 1e-3 * (state == 0.0))
     at = (lane * n) // lanes
     t = drive.t[at, lane % batch if drive.t.shape[1] > 1 else 0]
-    return Point(state, Drive(t, drive.exogenous[at, lane % batch], drive.command[at, lane % batch]))
+    driving = (_nudged(x[at, lane % batch]) for x in (drive.exogenous, drive.command))
+    return Point(_nudged(initial_state.detach()[lane % batch]), Drive(t, *driving))
+
+
+def _nudged(x: Tensor) -> Tensor:
+    """Rows of which no two are equal."""
+    share = torch.arange(len(x)).unsqueeze(-1) / len(x)
+    return x + NUDGE * share * (x.abs() + (x == 0.0))

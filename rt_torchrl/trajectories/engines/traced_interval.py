@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.programs.escapes import Escapes
 from rt_torchrl.programs.machine_code import march_text, sweep_text
 from rt_torchrl.programs.object_code import ObjectCode
 from rt_torchrl.programs.operators import new_tracer
@@ -46,7 +47,7 @@ class March:
     def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
         tracer = new_tracer()
         state, drive, weights = _traced_inputs(tracer, interval, point)
-        with torch.no_grad(), tracer:
+        with torch.no_grad(), Escapes(tracer), tracer:
             end = torch.func.functional_call(interval, weights, (state, drive))
         ends = tracer.cells(end).flatten().tolist()
         sizes = {"x": _width(point.drive), "s": state.shape[-1]}
@@ -93,7 +94,7 @@ class Sweep:
         with torch.enable_grad():
             for leaf in leaves:
                 leaf.requires_grad_()
-            with tracer:
+            with Escapes(tracer), tracer:
                 end = torch.func.functional_call(interval, weights, (state, drive))
                 found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
         cells = [_gradient(tracer, g, leaf) for g, leaf in zip(found or [None] * len(leaves), leaves, strict=True)]
@@ -158,7 +159,7 @@ class Sweep:
 def packed(drive: Drive) -> np.ndarray:
     """The drive of one interval as one row, ``1 n_x lanes``."""
     rows = np.concatenate([drive.t[None].numpy(), drive.exogenous.numpy().T, drive.command.numpy().T])
-    return np.ascontiguousarray(rows)[None]  # NumPy keeps the order of transposed parts
+    return np.ascontiguousarray(rows[None])  # of transposed arrays NumPy makes a transposed one
 
 
 def weights_of(interval: nn.Module) -> np.ndarray:
@@ -183,8 +184,11 @@ def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.nda
 
 
 def _traced_inputs(tracer: Tracer, interval: nn.Module, point: Point) -> tuple[Tensor, Drive, dict[str, Tensor]]:
-    """State, drive and weights of the first realisation, as inputs of a program."""
-    state, drive = point.state[:1].clone(), Drive(*(x[:1].clone() for x in point.drive))
+    """State, drive and weights as inputs of a program, of the last realisation.
+
+    A number that code takes from the first realisation of all then differs from the one that was traced.
+    """
+    state, drive = point.state[-1:].clone(), Drive(*(x[-1:].clone() for x in point.drive))
     tracer.input(state, "s")
     offset = 0
     for x in drive:

@@ -1,0 +1,127 @@
+"""Translations of torch's operators that copy: carried out on the cells of a tracer."""
+
+from itertools import product
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rt_torchrl.programs.tracer import Rule, Tracer
+
+Arguments = tuple[Any, ...]
+Options = dict[str, Any]
+
+
+def _copy_by(operator: Any) -> Rule:
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
+        def celled(x: Any) -> Any:
+            if isinstance(x, Tensor):
+                return tracer.cells(x)
+            return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
+
+        kept = {key: value for key, value in options.items() if key != "memory_format"}
+        return operator(*(celled(a) for a in args), **kept)
+
+    return rule
+
+
+def _copy(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.cells(args[0])
+
+
+def _overwrite(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.cells(args[1])
+
+
+def _pick_by(operator: Any) -> Rule:
+    """Copies from places that are known: ``gather`` and ``index_select``."""
+
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+        if tracer.numbers(tracer.cells(args[2])) is None:
+            raise tracer.refuse(f"{operator} by an index that varies")
+        picked: Tensor = operator(tracer.cells(args[0]), *args[1:])
+        return picked
+
+    return rule
+
+
+def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    if "reduce" in options:
+        raise tracer.refuse("scatter with an operation")
+    cells, (dim, index), p = tracer.cells(args[0]), args[1:3], tracer.program
+    source = tracer.cells(args[3]).expand(index.shape)
+    if tracer.numbers(tracer.cells(index)) is not None:
+        return cells.scatter(dim, index, source)
+    found = cells.movedim(dim, -1).clone()
+    chosen, values = (x.movedim(dim, -1) for x in (tracer.cells(index), source))
+    for at in product(*map(range, chosen.shape)):
+        for j in range(found.shape[-1]):
+            hit = p.compare("oeq", int(chosen[at]), p.constant(float(j)))
+            there = (*at[:-1], j)
+            found[there] = p.select(hit, int(values[at]), int(found[there]))
+    return found.movedim(-1, dim)
+
+
+def _scatter_add(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    tracer.require_known("scatter_add by an index that varies", args[2:3])
+    places = torch.arange(args[0].numel()).view(args[0].shape)
+    window = places[tuple(slice(n) if d != args[1] % places.ndim else slice(None) for d, n in enumerate(args[2].shape))]
+    return _added(tracer, args[0], window.gather(args[1], args[2]), tracer.cells(args[3]))
+
+
+def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    tracer.require_known("an assignment to places that vary", args[1])
+    target, indices, values = args[:3]
+    places = torch.ops.aten.index.Tensor(torch.arange(target.numel()).view(target.shape), indices)
+    source = tracer.cells(values).expand(places.shape)
+    if (*args[3:], options.get("accumulate", False))[0]:
+        return _added(tracer, target, places, source)
+    cells = tracer.cells(target).clone(memory_format=torch.contiguous_format)
+    cells.view(-1)[places.flatten()] = source.flatten()
+    return cells
+
+
+def _added(tracer: Tracer, target: Tensor, places: Tensor, values: Tensor) -> Tensor:
+    """The cells of a tensor with values added at places, of which several may be the same."""
+    found = tracer.cells(target).flatten().tolist()
+    for place, value in zip(
+        places.flatten().tolist(), values[tuple(map(slice, places.shape))].flatten().tolist(), strict=True
+    ):
+        found[place] = tracer.program.add(found[place], value)
+    return torch.tensor(found, dtype=torch.int64).view(target.shape)
+
+
+def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    filling = tracer.program.constant(float(args[2]) if len(args) > 2 else 0.0)
+    return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
+
+
+def _slice_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    gradient, sizes, dim, start, end, step = args
+    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
+    index = torch.arange(sizes[dim])[slice(start, min(end, sizes[dim]), step)]
+    return zeros.index_copy(dim, index, tracer.cells(gradient))
+
+
+def _select_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    gradient, sizes, dim, index = args
+    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
+    return zeros.index_copy(dim, torch.tensor([index % sizes[dim]]), tracer.cells(gradient).unsqueeze(dim))
+
+
+PLAIN = (
+    "cat stack flip roll repeat expand_copy diag_embed slice_scatter select_scatter unfold_copy view_copy permute_copy "
+    "_unsafe_view alias_copy"
+).split()
+COPIES: dict[str, Rule] = {
+    **{name: _copy_by(getattr(torch.ops.aten, name)) for name in PLAIN},
+    **dict.fromkeys(("clone", "contiguous", "lift_fresh", "lift_fresh_copy"), _copy),
+    **dict.fromkeys(("copy", "fill"), _overwrite),
+    **{name: _pick_by(getattr(torch.ops.aten, name)) for name in ("gather", "index_select")},
+    "scatter": _scatter,
+    "scatter_add": _scatter_add,
+    **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),
+    "constant_pad_nd": _pad,
+    "slice_backward": _slice_backward,
+    "select_backward": _select_backward,
+}

@@ -1,0 +1,115 @@
+"""User code as machine code: equal to eager torch in states and gradients, or refused with the line of the code."""
+
+import re
+
+import operator_snippets
+import pytest
+import snippets
+import torch
+from torch import nn
+from traced_function import Snippet, compared, gap, signals, traced
+
+from rt_torchrl.programs.program import UntraceableError
+
+CASES = snippets.CASES | operator_snippets.OPERATORS
+REFUSED = {
+    "linalg.solve 3x3": "_linalg_solve_ex",
+    "linalg.inv": "linalg_inv_ex",
+    "dropout in training": "random",
+    "learned table, look-up": "learned",
+    "func.jvp inside": "_has_same_storage_numel",
+    "float32 inside": "float32",
+    "complex inside": "complex",
+    "lgamma": "lgamma",
+    "sort": "sort",
+    "argmax one-hot": "argmax",
+    "random": "random",
+    "branch on a state": "branch",
+    "branch on t": "branch",
+    ".item()": "number",
+    ".numpy()": "numpy",
+    "torch.cond": "cond",
+    "out=": "out",
+    "int view": "another type",
+    "equal": "branch",
+    "round decimals": "decimals",
+    "bitwise int": "bits",
+    "copysign": "signbit",
+    "addmm alpha": "alpha",
+    "hardtanh etc": "hardshrink_backward",
+    "logcumsumexp": "logcumsumexp",
+    "cumprod": "gather",
+    "det": "_linalg_det",
+    "matrix_exp": "linalg_matrix_exp",
+    "cdist": "_cdist",
+    "external leaf": "no parameter",
+    "np.asarray": "__array__",
+    "tolist": "tolist",
+    "conv1d": "convolution",
+    "bilinear": "_trilinear",
+    "batchnorm eval": "batch_norm",
+    "spectral param": "_weight_norm",
+    "complex abs": "another type",
+    "erfinv": "erf_inv",
+    "checkpoint": "no parameter",
+    "quantile/median": "median",
+    "topk": "topk",
+    "pad replicate": "replication_pad1d_backward",
+    "interp grid": "upsample_linear1d_backward",
+}
+"""Code that is refused, with a word of the message."""
+MIXED = ("batch mean", "batch size", "meshgrid")
+"""Code in which a realisation depends on the others; it differs from torch, which the comparison finds."""
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case not in REFUSED and case not in MIXED])
+def test_equals_eager(case):
+    # Rounding, summed in another order: a Newton iteration amplifies it most.
+    for found, exact in compared(CASES[case], *signals(11, 3)):
+        assert gap(found, exact) < 1e-10
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_with_the_line_of_the_code(case):
+    with pytest.raises(UntraceableError, match=re.escape(REFUSED[case])) as refusal:
+        traced(CASES[case], *signals(11, 3))
+    assert re.search(r"snippets\.py:\d+: .", str(refusal.value)), refusal.value
+
+
+@pytest.mark.parametrize("case", MIXED)
+@pytest.mark.parametrize("batch", [1, 11])
+def test_realisations_that_depend_on_each_other_are_refused(case, batch):
+    with pytest.raises(UntraceableError, match="differs from what torch computes"):
+        traced(CASES[case], *signals(batch, 1))
+
+
+@pytest.mark.slow
+def test_wide_perceptrons_need_no_wide_stack():
+    """Each of the arrays of hidden units and of gradients by weights, 4 MiB, lies beyond the stack of a thread."""
+    network = nn.Sequential(nn.Linear(3, 256), nn.Tanh(), nn.Linear(256, 256), nn.Tanh(), nn.Linear(256, 3))
+    snippet = Snippet(lambda m, s, d: sum(m.modules_[0](s * k) for k in (1.0, 2.0, 3.0)), network)
+    for found, exact in compared(snippet, *signals(3, 2)):
+        assert gap(found, exact) < 1e-12
+
+
+def test_refusals_hold_no_tensors():
+    """The traceback of a refusal would keep everything that was traced."""
+    from rt_torchrl.trajectories.engines import programs
+
+    case, (state, drive) = CASES["sort"], signals(2, 2)
+    with pytest.warns(UserWarning, match="sort"):
+        assert programs.programs_of(case, state, drive) is None
+    assert programs.programs_of(case, state, drive) is None  # without another warning
+    (entry,) = (
+        e for e in programs._kept.values() if isinstance(e.programs, UntraceableError) and "sort" in str(e.programs)
+    )
+    assert entry.programs.__traceback__ is None
+
+
+def test_code_may_compute_with_known_numbers_as_it_likes():
+    def counted(m, s, d):
+        sizes = torch.tensor([3.0, 1.0, 2.0]).sort().values
+        return s * sizes.double() * m.w0 if sizes.tolist()[0] < 2 and sizes.numpy()[1] == 2 else -s
+
+    for found, exact in compared(Snippet(counted), *signals(11, 3)):
+        assert gap(found, exact) < 1e-12

@@ -1,0 +1,136 @@
+"""NaN, infinity and signed zeros in machine code, over every kind of lanes, as torch has them."""
+
+import math
+
+import llvmlite.binding as llvm
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+from traced_function import Snippet, compared, gap, marched, signals
+
+from rt_torchrl.programs.machine_code import march_text
+from rt_torchrl.programs.operators import new_tracer
+from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
+from rt_torchrl.trajectories.engines import native
+from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.programs import Programs
+from rt_torchrl.trajectories.engines.traced_interval import Point
+
+LANES = [Lanes(8, "e"), Lanes(4, "d"), Lanes(2, "b"), Lanes(2, "")]
+SPECIAL = torch.tensor(
+    [0.0, -0.0, 1.0, -1.0, 0.5, 2.0, -2.5, 3.0, 1e-300, -1e200, 1e16, 0.7, math.inf, -math.inf, math.nan, math.pi],
+    dtype=torch.float64,
+)
+TABLE = torch.tensor([1.0, -2.0, 4.0, 0.0], dtype=torch.float64)
+UNARY = {
+    **{f: getattr(torch, f) for f in "exp log sin tanh sqrt abs floor round sign neg relu sigmoid isnan erf".split()},
+    **{f: getattr(torch, f) for f in "log1p expm1 atan rsqrt reciprocal square trunc isinf isfinite erfc".split()},
+    "zero times": lambda x: 0.0 * x,
+    "plus zero": lambda x: x + 0.0,
+    "zero minus": lambda x: 0.0 - x,
+    "minus zero": lambda x: x - 0.0,
+    "clamp": lambda x: x.clamp(-1.0, 1.0),
+    "clamp from below": lambda x: x.clamp(min=0.5),
+    "clamp by NaN": lambda x: x.clamp(max=math.nan),
+    "where": lambda x: torch.where(x > 0.0, x.sqrt(), x.log()),
+    "look-up": lambda x: TABLE[torch.bucketize(x, TABLE.sort().values).clamp(0, 3)],
+    "square root by power": lambda x: x**0.5,
+    "cube": lambda x: x**3,
+    "inverse square": lambda x: x**-2,
+    "fractional power": lambda x: x**1.7,
+    "remainder": lambda x: torch.remainder(x, 0.7),
+    "remainder of a negative": lambda x: torch.remainder(x, -0.7),
+    "nan_to_num": lambda x: torch.nan_to_num(x, 1.0, 2.0, 3.0),
+    "halves": lambda x: x / 4.0,
+    "tiny divisor": lambda x: x / 5e-324,
+}
+BINARY = {
+    f: getattr(torch, f) for f in "add sub mul div minimum maximum fmin fmax atan2 hypot remainder fmod pow".split()
+}
+BINARY |= {f: getattr(torch, f) for f in "gt lt ge le eq ne logaddexp".split()}
+
+
+def trees():
+    """Random expressions of two signals."""
+    leaf = st.sampled_from([lambda x, y: x, lambda x, y: y])
+
+    def grown(inner):
+        one = st.builds(lambda f, a: lambda x, y: UNARY[f](a(x, y)).double(), st.sampled_from(sorted(UNARY)), inner)
+        two = st.builds(
+            lambda f, a, b: lambda x, y: BINARY[f](a(x, y), b(x, y)).double(),
+            st.sampled_from(sorted(BINARY)),
+            inner,
+            inner,
+        )
+        return one | two
+
+    return st.recursive(leaf, grown, max_leaves=4)
+
+
+def assert_same(f, lanes=None):
+    """Equal values over all pairs of special numbers."""
+    x, y = (v.flatten() for v in torch.meshgrid(SPECIAL, SPECIAL, indexing="ij"))
+    snippet = Snippet(lambda m, s, d: torch.stack([f(s[..., 0], s[..., 1]), s[..., 1]], -1), share=1.0)
+    snippet.forward = lambda state, drive: snippet.f(snippet, state, drive)
+    _, drive = signals(len(x), 1)
+    state, lanes = torch.stack([x, y], -1), lanes or lanes_of_this_machine()
+    n = lanes.number
+    usual = Point(
+        torch.linspace(0.3, 0.8, 2 * n).double().view(n, 2), Drive(drive.t[0].expand(n), *(z[0, :n] for z in drive[1:]))
+    )
+    programs = Programs(snippet, usual, lanes)
+    with torch.no_grad():
+        task = native._Task(programs, snippet, native.MEMORY)
+        found = native._EndStates.apply(task, state, *drive, *task.learned)[0, :, 0]
+        exact = marched(snippet, state, *drive)[0, :, 0]
+    torch.testing.assert_close(found, exact, rtol=1e-12, atol=1e-300, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", [*UNARY, *BINARY])
+def test_special_values_of_operators(name):
+    assert_same((lambda x, y: UNARY[name](x).double()) if name in UNARY else (lambda x, y: BINARY[name](x, y).double()))
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(trees())
+def test_special_values_of_expressions(tree):
+    assert_same(tree)
+
+
+def all_functions(m, s, d):
+    x = m.modules_[0](s).tanh() + 0.3
+    y = x.exp().log1p() + x.sin() * x.cos() + x.abs().pow(1.3) + torch.atan2(x, s[..., :1]) + x.erf()
+    return (y + torch.hypot(x, y) + torch.remainder(x, 0.7) + x.clamp(-0.5, 0.5))[..., :3] * m.w0 + x.sum(
+        -1, keepdim=True
+    )
+
+
+@pytest.mark.parametrize("width", [3, 40])
+@pytest.mark.parametrize("lanes", LANES, ids=str)
+def test_every_kind_of_lanes(lanes, width):
+    features = llvm.get_host_cpu_features()
+    if not features.get({"e": "avx512dq", "d": "avx2"}.get(lanes.variant, "sse2"), False):
+        pytest.skip("this processor lacks these lanes")
+    torch.manual_seed(0)
+    for found, exact in compared(Snippet(all_functions, nn.Linear(3, width)), *signals(11, 3), lanes=lanes):
+        assert gap(found, exact) < 1e-12
+
+
+def test_the_text_compiles_for_other_processors():
+    tracer = new_tracer()
+    state = torch.rand(1, 3, dtype=torch.float64)
+    tracer.input(state, "s")
+    snippet = nn.Sequential(nn.Linear(3, 40), nn.Tanh(), nn.Linear(40, 3)).double().requires_grad_(False)
+    with torch.no_grad(), tracer:
+        end = snippet(state) + state.sin()
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    text = march_text(tracer.program, tracer.cells(end).flatten().tolist(), {"x": 1, "s": 3}, Lanes(2, ""))
+    for triple in ("aarch64-unknown-linux-gnu", "arm64-apple-macosx", "x86_64-pc-windows-msvc"):
+        machine = llvm.Target.from_triple(triple).create_target_machine(opt=2)
+        module = llvm.parse_assembly(text)
+        module.triple = triple
+        module.verify()
+        assert len(machine.emit_object(module)) > 1000

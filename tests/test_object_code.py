@@ -1,0 +1,132 @@
+"""Object code: kept on disk, made again where it is damaged, loaded by any number of processes."""
+
+import ctypes
+import gc
+import hashlib
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from rt_torchrl.programs import object_code
+from rt_torchrl.programs.object_code import DIGEST, ObjectCode
+
+POINTER = ctypes.c_void_p
+
+
+def text(number):
+    """A function that stores a number where its argument points."""
+    return f"define void @put(ptr %x) {{\n  store double {number:.6e}, ptr %x\n  ret void\n}}\n"
+
+
+def put_by(code):
+    found = np.zeros(1)
+    code.call(found.ctypes.data)
+    return found[0]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(object_code, "cache_folder", lambda: tmp_path / "native")
+    return tmp_path / "native"
+
+
+def loaded(number):
+    return ObjectCode(text(number), "put", (POINTER,))
+
+
+def test_code_can_be_freed_and_other_code_stays():
+    first, second, third = (loaded(x) for x in (1.0, 2.0, 3.0))
+    del second
+    gc.collect()
+    assert [put_by(first), put_by(third), put_by(loaded(4.0))] == [1.0, 3.0, 4.0]
+    del first, third
+    gc.collect()
+
+
+@pytest.fixture
+def compilations(monkeypatch):
+    """The texts that were compiled."""
+    seen, compile_ = [], object_code._compile
+    monkeypatch.setattr(object_code, "_compile", lambda text: seen.append(text) or compile_(text))
+    return seen
+
+
+def test_kept_code_is_not_compiled_again(folder, compilations):
+    assert put_by(loaded(1.0)) == put_by(loaded(1.0)) == 1.0
+    assert len(compilations) == len(list(folder.iterdir())) == 1
+
+
+SECOND = """
+import ctypes, sys
+from pathlib import Path
+import numpy as np
+from rt_torchrl.programs import object_code
+
+object_code.cache_folder = lambda: Path(sys.argv[1])
+if sys.argv[2] == "reads":
+    object_code._compile = None
+code, found = object_code.ObjectCode(sys.argv[3], "put", (ctypes.c_void_p,)), np.zeros(1)
+code.call(found.ctypes.data)
+print(found[0])
+"""
+
+
+def second(*arguments):
+    return subprocess.run(
+        [sys.executable, "-c", SECOND, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+
+
+def test_another_process_loads_what_is_kept(folder):
+    loaded(7.0)
+    done = second(folder, "reads", text(7.0))
+    assert done.stdout.split() == ["7.0"], done.stderr[-2000:]
+
+
+def test_processes_write_at_once(folder):
+    with ThreadPoolExecutor(4) as pool:
+        done = list(pool.map(lambda _: second(folder, "writes", text(8.0)), range(4)))
+    assert [d.stdout.split() for d in done] == [["8.0"]] * 4, done[0].stderr[-2000:]
+    (kept,) = folder.iterdir()  # no partial file is left
+    content = kept.read_bytes()
+    assert hashlib.sha256(content[DIGEST:]).digest() == content[:DIGEST]
+
+
+@pytest.mark.parametrize("damage", ["empty", "half", "one byte", "longer"])
+def test_damaged_code_is_made_again(damage, folder, compilations):
+    loaded(1.0)
+    (kept,) = folder.iterdir()
+    whole = kept.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    kept.write_bytes(
+        {"empty": b"", "half": whole[: len(whole) // 2], "one byte": flipped, "longer": whole + b"1"}[damage]
+    )
+    assert put_by(loaded(1.0)) == 1.0
+    assert len(compilations) == 2 and kept.read_bytes() == whole
+
+
+def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, compilations):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(object_code, "cache_folder", lambda: tmp_path / "file" / "native")
+    assert put_by(loaded(1.0)) == put_by(loaded(1.0)) == 1.0
+    assert len(compilations) == 2
+
+
+@pytest.mark.parametrize("changed", ["processor", "features", "llvm", "llvmlite"])
+def test_other_processors_and_versions_have_files_of_their_own(changed, folder, monkeypatch):
+    loaded(1.0)
+    llvm = object_code.llvm
+    changes = {
+        "processor": (llvm, "get_host_cpu_name", lambda: "x86-64"),
+        "features": (object_code, "_features", lambda: "-avx512f"),
+        "llvm": (llvm, "llvm_version_info", (1, 0, 0)),
+        "llvmlite": (object_code, "version", lambda name: "0.1"),
+    }
+    monkeypatch.setattr(*changes[changed])
+    monkeypatch.setattr(object_code, "_compile", lambda text: b"other code")
+    object_code._compiled(text(1.0))
+    assert len(list(folder.iterdir())) == 2
