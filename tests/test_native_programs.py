@@ -47,7 +47,6 @@ REFUSED = {
     "tolist": "tolist",
     "conv1d": "convolution",
     "bilinear": "_trilinear",
-    "batchnorm eval": "batch_norm",
     "spectral param": "_weight_norm",
     "complex abs": "another type",
     "erfinv": "erf_inv",
