@@ -48,7 +48,7 @@ class March:
         tracer = new_tracer()
         state, drive, weights = _traced_inputs(tracer, interval, point)
         with torch.no_grad(), Escapes(tracer), tracer:
-            end = torch.func.functional_call(interval, weights, (state, drive))
+            end = _with_weights(interval, weights, state, drive)
         ends = tracer.cells(end).flatten().tolist()
         sizes = {"x": _width(point.drive), "s": state.shape[-1]}
         if len(ends) != sizes["s"]:
@@ -95,7 +95,7 @@ class Sweep:
             for leaf in leaves:
                 leaf.requires_grad_()
             with Escapes(tracer), tracer:
-                end = torch.func.functional_call(interval, weights, (state, drive))
+                end = _with_weights(interval, weights, state, drive)
                 tracer.program.differentiating = True
                 found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
         cells = [_gradient(tracer, g, leaf) for g, leaf in zip(found or [None] * len(leaves), leaves, strict=True)]
@@ -144,7 +144,7 @@ class Sweep:
         weights = {name: w.detach().clone().requires_grad_(name in names) for name, w in interval.named_parameters()}
         leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
         with torch.enable_grad():
-            end = torch.func.functional_call(interval, weights, (leaves[0], Drive(*leaves[1:])))
+            end = _with_weights(interval, weights, leaves[0], Drive(*leaves[1:]))
             given = [*leaves, *(weights[name] for name in names)]
             exact = torch.autograd.grad(end, given, torch.from_numpy(costate.T), allow_unused=True)
         wanted = [torch.zeros_like(x) if g is None else g for g, x in zip(exact, given, strict=True)]
@@ -203,6 +203,22 @@ def _traced_inputs(tracer: Tracer, interval: nn.Module, point: Point) -> tuple[T
         tracer.weight(weights[name], first)
         first += w.numel()
     return state, drive, weights
+
+
+def _with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor, drive: Drive) -> Tensor:
+    """The interval with tensors in place of its weights, in every module that holds one.
+
+    PyTorch's own search for weights that are shared leaves the tensors in a module that is held twice, such as the
+    plant's own closure.
+    """
+    names = {id(w): name for name, w in interval.named_parameters()}
+    held = {
+        f"{path}.{name}".lstrip("."): weights[names[id(w)]]
+        for path, module in interval.named_modules()
+        for name, w in module.named_parameters(recurse=False, remove_duplicate=False)
+    }
+    end: Tensor = torch.func.functional_call(interval, held, (state, drive), tie_weights=False)
+    return end
 
 
 def _width(drive: Drive) -> int:
