@@ -228,6 +228,16 @@ def test_shared_weights():
     assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
 
 
+@pytest.mark.parametrize("driver", ["commands", "policy"])
+def test_the_own_closure_of_a_plant_keeps_its_weights(driver):
+    """The interval holds it twice."""
+    task = Task(closure="true", driver=driver)
+    before = list(task.interval.parameters())
+    assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
+    assert all(a is b for a, b in zip(task.interval.parameters(), before, strict=True))
+    assert isinstance(task.plant.closure.matrix, nn.Parameter) and task.plant.closure.matrix.requires_grad
+
+
 def test_a_sweep_belongs_to_the_interval_that_wants_it():
     """The recurrence was made for an interval of the same kind, which has changed since."""
     task, other = Task(), Task()

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
 from rt_torchrl.trajectories.engines.linearisation import linearise_by_rows, over_all
 from rt_torchrl.trajectories.rollout import drive_of
 
@@ -46,7 +46,7 @@ class TangentInterval(nn.Module):
         t = drive.t.expand(s.shape[:1])
 
         def end(values: dict[str, Tensor], s: Tensor, *drive: Tensor) -> Tensor:
-            return torch.func.functional_call(self.interval, values, (s, Drive(*drive)))
+            return with_weights(self.interval, values, s, Drive(*drive))
 
         jacobians = torch.func.vmap(torch.func.jacrev(end, argnums=(0, 1)), in_dims=(None, 0, 0, 0, 0))
         by_weights, A = jacobians(weights, s, t, drive.exogenous, drive.command)

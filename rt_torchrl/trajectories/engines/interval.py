@@ -60,3 +60,21 @@ class CostInterval(nn.Module):
         applied = plant.actuate(s, self.interval.command(s, drive))
         cost = state[..., -1] + plant.running_cost(drive.t, s, applied, drive.exogenous)
         return torch.cat([self.interval(s, drive), cost.unsqueeze(-1)], -1)
+
+
+def with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor, drive: Drive) -> Tensor:
+    """The end of an interval with tensors in place of some of its weights, in every module that holds one.
+
+    PyTorch's own search for weights that are shared leaves the tensors in a module that is held twice, such as the
+    plant's own closure.
+    """
+    everywhere = dict(interval.named_parameters(remove_duplicate=False))
+    given = {id(everywhere[name]): tensor for name, tensor in weights.items()}
+    held = {
+        f"{path}.{name}".lstrip("."): given[id(w)]
+        for path, module in interval.named_modules()  # each module once
+        for name, w in module.named_parameters(recurse=False, remove_duplicate=False)
+        if id(w) in given
+    }
+    end: Tensor = torch.func.functional_call(interval, held, (state, drive), tie_weights=False)
+    return end

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.trajectories.engines.compilation import marked_dynamic, plain
-from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.interval import Drive, with_weights
 
 PIECE = 2048
 """Number of intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one
@@ -77,7 +77,7 @@ def linearise(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive
 
     def end(state: Tensor, *values: Tensor) -> Tensor:
         replaced = {f"closure.{name}": value for name, value in zip(names, values, strict=True)}
-        return torch.func.functional_call(interval, replaced, (state, drive))
+        return with_weights(interval, replaced, state, drive)
 
     def column(direction: Tensor) -> Tensor:
         by_state, *by_weights = direction.split(sizes)
@@ -92,7 +92,7 @@ def linearise_by_rows(interval: nn.Module, names: tuple[str, ...], starts: Tenso
     weights = {f"closure.{name}": interval.get_parameter(f"closure.{name}").detach() for name in names}
 
     def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
-        return torch.func.functional_call(interval, values, (state, Drive(*drive)))
+        return with_weights(interval, values, state, Drive(*drive))
 
     rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
     by_state, by_weights = rows(weights, starts, *drive)

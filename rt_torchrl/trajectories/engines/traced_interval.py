@@ -16,7 +16,7 @@ from rt_torchrl.programs.operators import new_tracer
 from rt_torchrl.programs.program import Program, UntraceableError
 from rt_torchrl.programs.tracer import Tracer
 from rt_torchrl.programs.vector_functions import Lanes
-from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.interval import Drive, with_weights
 
 POINTER = ctypes.c_void_p
 MARCH = (POINTER, POINTER, POINTER, ctypes.c_int64)
@@ -48,7 +48,7 @@ class March:
         tracer = new_tracer()
         state, drive, weights = _traced_inputs(tracer, interval, point)
         with torch.no_grad(), Escapes(tracer), tracer:
-            end = torch.func.functional_call(interval, weights, (state, drive))
+            end = with_weights(interval, weights, state, drive)
         ends = tracer.cells(end).flatten().tolist()
         sizes = {"x": _width(point.drive), "s": state.shape[-1]}
         if end.shape != state.shape:
@@ -95,7 +95,7 @@ class Sweep:
             for leaf in leaves:
                 leaf.requires_grad_()
             with Escapes(tracer), tracer:
-                end = torch.func.functional_call(interval, weights, (state, drive))
+                end = with_weights(interval, weights, state, drive)
                 found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
         cells = [_gradient(tracer, g, leaf) for g, leaf in zip(found or [None] * len(leaves), leaves, strict=True)]
         by_state, by_drive, by_weights = cells[0], sum(cells[1:4], []) if driven else [], cells[4 if driven else 1 :]
@@ -143,7 +143,7 @@ class Sweep:
         weights = {name: w.detach().clone().requires_grad_(name in names) for name, w in interval.named_parameters()}
         leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
         with torch.enable_grad():
-            end = torch.func.functional_call(interval, weights, (leaves[0], Drive(*leaves[1:])))
+            end = with_weights(interval, weights, leaves[0], Drive(*leaves[1:]))
             given = [*leaves, *(weights[name] for name in names)]
             exact = torch.autograd.grad(end, given, torch.from_numpy(costate.T), allow_unused=True)
         wanted = [torch.zeros_like(x) if g is None else g for g, x in zip(exact, given, strict=True)]
