@@ -37,7 +37,7 @@ def _same_state(state: Array, applied: Array) -> Array:
 
 
 def _field(plant: FlappingWing):
-    radius, strip_mass = plant.radius.numpy(), plant.strip_mass.numpy()
+    radius, strip_mass = plant.wings.radius.numpy(), plant.wings.strip_mass.numpy()
     mass, weight = float(plant.mass), float(plant.weight[1])
     rate, epsilon = 2.0 * math.pi * plant.frequency, plant.smallest_airspeed**2
     body = 0.5 * plant.air_density * plant.body_drag_area
