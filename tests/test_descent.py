@@ -53,6 +53,31 @@ def test_lbfgs_reaches_the_minimum_of_a_quadratic_in_few_gradients():
     torch.testing.assert_close(point.at.detach(), MINIMUM, rtol=0, atol=7e-5)
 
 
+@pytest.mark.parametrize("iterations", [3, 100])
+def test_lbfgs_evaluates_nothing_beside_its_gradients(iterations):
+    """Its line search has evaluated where it ends; Adam has not evaluated its last step."""
+    costs = {optimiser: Bowl(Point()) for optimiser in ("lbfgs", "adam")}
+    for optimiser, cost in costs.items():
+        found = Descent(cost.point, DescentConfig(optimiser=optimiser, rate=0.1)).run(cost, iterations)
+        assert len(cost.seen) == cost.with_gradient + (optimiser == "adam") == found.iterations + (optimiser == "adam")
+        assert found.best == min(value for value, _ in cost.seen)
+
+
+def test_lbfgs_stops_where_a_step_gains_less_than_the_tolerance():
+    """Σ x_i⁴ has no curvature at its minimum, so that every step gains a smaller share of the start than the last."""
+    found = {}
+    for tolerance in (1e-2, 1e-4, 1e-6):
+        point = Point((1.0, 2.0, 3.0))
+        config = DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=tolerance)
+        found[tolerance] = Descent(point, config).run(lambda point=point: (point.at**4).sum(), 100)
+    first, second, third = found.values()
+    assert first.start == 98.0  # 1 + 16 + 81
+    assert first.iterations < second.iterations < third.iterations < 100
+    # Newton's step on x⁴ leaves (2/3)⁴ of it, and L-BFGS is slower: what is left is some times the last gain.
+    for tolerance, descended in found.items():
+        assert descended.best < 10.0 * tolerance * descended.start
+
+
 def test_gradient_reported_is_not_the_clipped_one():
     point = Point()
     found = Descent(point, DescentConfig(gradient_limit=0.1)).run(Bowl(point), 1)

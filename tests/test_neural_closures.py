@@ -227,8 +227,8 @@ def test_the_command_line_trains_a_closure_by_its_own_defaults(monkeypatch):
     for options in ([], ["--closure", "mlp"], ["--closure", "mlp", "--twinning.records", "3"]):
         monkeypatch.setattr("sys.argv", ["wind_turbine.py", *options])
         main_of(recipe.Config, seen.append)
-    paper, neural, chosen = (config.twinning for config in seen)
-    assert paper == recipe.PAPER and neural == recipe.NEURAL != paper
+    default, neural, chosen = (config.twinning for config in seen)
+    assert default == recipe.CONVERGED and neural == recipe.NEURAL != default
     assert chosen.records == 3 and chosen.assimilation == neural.assimilation
     assert [type(c.make_closure(PLANTS[0], seeded())).__name__ for c in seen[:2]] == [
         "SaintDrenan",

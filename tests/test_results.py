@@ -17,6 +17,7 @@ from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.cloning import of_each_role
 
 
 def refused(name):
@@ -86,3 +87,20 @@ def test_on_a_real_system_the_better_policy_is_the_live_one():
     algorithm = Mock(spec=ReinforcementTwinning, referee=Mock(live="model_free"))
     assert results.better_of(algorithm, RealEpisodes(system, 2)) == ("model_free", "twin")
     system.rollout.assert_not_called()
+
+
+def test_clones_are_flown_once_and_other_policies_each():
+    """Policies that start with the same weights, or that end as clones, share their flights, with the same numbers."""
+    first, second, other = LinearGain([-0.8, -1.1]), LinearGain([-0.8, -1.1]), LinearGain([-0.8, -1.2])
+    unseen, flown = UnseenEpisodes(LinearQuadratic(horizon=2.0), 3), []
+
+    def costs(policy):
+        flown.append(policy)
+        return unseen.control_costs(policy)
+
+    shared = of_each_role({"model_based": first, "model_free": second}, costs)
+    assert flown == [first] and torch.equal(shared["model_free"], unseen.control_costs(second))
+    flown.clear()
+    each = of_each_role({"model_based": first, "model_free": other}, costs)
+    assert flown == [first, other] and torch.equal(each["model_free"], unseen.control_costs(other))
+    assert not torch.equal(each["model_free"], each["model_based"])

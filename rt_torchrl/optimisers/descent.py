@@ -31,12 +31,15 @@ class DescentConfig:
         gradient_limit: greatest norm of the (relative) gradient that Adam sees, infinite for no limit; L-BFGS has
             its line search instead.
         second_moment: β₂ of Adam.
+        tolerance: decrease of the (relative) cost in a step of L-BFGS, or greatest change of a weight, below which
+            L-BFGS stops early; Adam never does.
     """
 
     optimiser: Optimiser = "adam"
     rate: float = 0.1
     gradient_limit: float = 1.0
     second_moment: float = 0.9
+    tolerance: float = 1e-9
 
     def __post_init__(self) -> None:
         check_options(self, infinite=("gradient_limit",))
@@ -45,6 +48,8 @@ class DescentConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
         if not 0.0 <= self.second_moment < 1.0:
             raise ValueError(f"second_moment={self.second_moment} must lie in [0, 1).")
+        if not self.tolerance >= 0.0:
+            raise ValueError(f"tolerance={self.tolerance} of the descent must not be negative.")
 
 
 class Descended(NamedTuple):
@@ -79,7 +84,9 @@ class Descent:
         if self.config.optimiser == "adam":
             self._optimiser = torch.optim.Adam(weights, lr=self.config.rate, betas=(0.9, self.config.second_moment))
         else:
-            self._optimiser = torch.optim.LBFGS(weights, lr=self.config.rate, line_search_fn="strong_wolfe")
+            self._optimiser = torch.optim.LBFGS(
+                weights, lr=self.config.rate, tolerance_change=self.config.tolerance, line_search_fn="strong_wolfe"
+            )
 
     def run(self, cost: Callable[[], Tensor], iterations: int, *, stop_below: float = 0.0) -> Descended:
         """Take ``iterations`` gradients of ``cost`` and keep the best weights.
@@ -98,11 +105,11 @@ class Descent:
                 # Another episode has another cost: the curvature of the last one would mislead the line search.
                 self.restart()
                 self._optimiser.param_groups[0].update(max_iter=iterations, max_eval=iterations)
-                self._optimiser.step(seen.or_infinite)
+                self._optimiser.step(seen.or_infinite)  # its line search has evaluated the weights that it ends at
             else:
                 for _ in range(iterations):
                     self._adam_step(seen)
-            seen.note_last()
+                seen.note_last()
         except _Finished:
             pass
         self.module.load_state_dict(seen.best_weights)
@@ -208,7 +215,7 @@ class _Seen:
         return relative, value, norm
 
     def note_last(self) -> None:
-        """Consider the weights of the last step too; the optimiser has not evaluated them."""
+        """Consider the weights of Adam's last step too; Adam has not evaluated them."""
         if not self.count:
             return
         try:

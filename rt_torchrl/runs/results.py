@@ -13,6 +13,7 @@ from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, mean_w
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.cloning import of_each_role
 from rt_torchrl.twinning.referees import Role
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
@@ -67,7 +68,7 @@ def summarise(
     """
     closure, live = algorithm.twin.closure, algorithm.referee.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
-    before = {role: unseen.control_costs(initial_policies[role]) for role in ROLES}
+    before = of_each_role(initial_policies, unseen.control_costs)
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
     after = {role: judged[role].control_costs.mean().item() for role in ROLES}
     better, chosen_on = better_of(algorithm, unseen)
@@ -110,7 +111,7 @@ def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple
     validation = unseen.validation()
     if validation is None:
         return algorithm.referee.live, "twin"
-    costs = {role: validation.control_costs(algorithm.policies[role]).mean().item() for role in ROLES}
+    costs = of_each_role(algorithm.policies, lambda policy: validation.control_costs(policy).mean().item())
     return min(ROLES, key=costs.__getitem__), "validation episodes"
 
 

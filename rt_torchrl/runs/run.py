@@ -36,6 +36,7 @@ from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.cloning import of_each_role
 from rt_torchrl.twinning.referees import Role
 
 CHECKED_STEPS = 10
@@ -52,8 +53,8 @@ class Run:
         config: options of the run.
         plant: the real system in simulation, and the twin's physics.
         env: the real system, if it is not a plant in simulation. Policies are judged on ``plant`` with ``env.closure``.
-            If that closure is not known, they are judged on real episodes: four times ``unseen`` (both policies before
-            and after the training), and one for each of the ``untrained`` random starts.
+            If that closure is not known, they are judged on real episodes: at most four times ``unseen`` (both policies
+            before and after the training, clones once), and one for each of the ``untrained`` random starts.
         believed: physics of the twin, if it differs from that of the real system; None if it does not.
         plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
@@ -160,7 +161,7 @@ class Run:
             self._drop_half_an_episode()
             bar.doing("judging on unseen episodes")
             self._follow_wear()
-            flights = {role: self.unseen.fly(self.algorithm.policies[role]) for role in results.ROLES}
+            flights = of_each_role(self.algorithm.policies, self.unseen.fly)
             judged = results.judge(self.unseen, flights, self.baselines)
             metrics = self._results(gap, flights, judged)
             if self.config.figures:

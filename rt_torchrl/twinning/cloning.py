@@ -1,9 +1,10 @@
 """The idle policy becomes a clone of the live one."""
 
 import copy
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
+import torch
 from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -11,7 +12,10 @@ from torch import Tensor, nn
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
 from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+
+Result = TypeVar("Result")
 
 
 class Cloning:
@@ -71,6 +75,26 @@ def same_architecture(first: nn.Module, second: nn.Module) -> bool:
     Shapes alone do not tell: perceptrons with different activations have weights of the same shapes.
     """
     return _structure(first) == _structure(second)
+
+
+def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module], Result]) -> dict[Role, Result]:
+    """What ``flown`` returns for each policy; it is called once if the two are clones of each other.
+
+    Args:
+        policies: both policies, by role.
+        flown: function of a policy's weights alone, such as its costs over given episodes.
+    """
+    first, second = policies
+    found = {first: flown(policies[first])}
+    return found | {second: found[first] if clones(*policies.values()) else flown(policies[second])}
+
+
+def clones(first: nn.Module, second: nn.Module) -> bool:
+    """Whether two policies are the same function with the same weights."""
+    if not same_architecture(first, second):
+        return False
+    pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
+    return all(torch.equal(one, other) for one, other in pairs)
 
 
 def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
