@@ -90,6 +90,6 @@ def test_checks_that_are_printed_are_what_ci_runs():
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     assert "uv run mypy" in script and any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
     rest = [command for command in commands() if command not in OF_A_RECIPE]
-    known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow"}
+    known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow", "uv run pytest -m nightly"}
     assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs"}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5

@@ -226,7 +226,7 @@ def learning_curves(seeds, update, **options):
     return np.array(curves)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 def test_learning_curves_of_ten_seeds_are_those_of_torchrl(algorithm, unchecked):
     expected, same, others = (
