@@ -19,6 +19,7 @@ from rt_torchrl.contract.tracing import forward_mode, tracing, untraceable
 from rt_torchrl.plants.plant import Plant
 
 Check = Callable[[Calls], Iterable[str]]
+ALWAYS = ("signals", "draws", "closures and policy")
 ON_FLIGHTS: dict[str, Check] = {
     "shapes and purity": methods,
     "costs": costs,
@@ -76,12 +77,11 @@ def check_plant(
     visit: signals and their ranges; shapes, precision and finiteness of every method under any leading dimensions;
     purity; draws and their generator; closures and policy; the applied action of the step against the actuators; costs;
     a turn of a periodic state, which must change nothing; gradients against finite differences; forward mode and one
-    graph, which the engines and the compiler need; and the stability of the Runge-Kutta step. A check is left out if
-    an earlier violation makes it impossible.
+    graph, which the engines and the compiler need; and the stability of the step. A check is left out if an earlier
+    violation makes it impossible.
 
     Args:
-        plant: the plant, with the time step of its training. A plant on another device is checked by a copy on the
-            CPU.
+        plant: the plant, with the time step of its training; one on another device is checked by a copy on the CPU.
         episodes: number of flights, at least 2.
         steps: number of control intervals of each flight, at least 2 and at most that of an episode.
         seed: seed of the draws and of the random commands.
@@ -92,8 +92,8 @@ def check_plant(
         The checks that were made; the function prints nothing.
 
     Raises:
-        PlantContractError: if the plant violates its contract. A message for each violation names the method, what was
-            found, what is expected, and what to change.
+        PlantContractError: if the plant violates its contract. Each message names the method, what was found, what is
+            expected, and what to change.
         ValueError: if ``episodes`` or ``steps`` is below 2.
     """
     for argument, value in (("episodes", episodes), ("steps", steps)):
@@ -106,9 +106,8 @@ def check_plant(
     found = found or _on_flights(plant, episodes, steps, seed, checks.values())
     if found:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
-    passed = ("signals", "draws", "closures and policy", *checks)
     reason = untraceable(Calls.at_the_start(plant, episodes, seed)) if traced else None
-    return ContractReport(plant.name, passed, episodes, steps, plant.dt, reason)
+    return ContractReport(plant.name, (*ALWAYS, *checks), episodes, steps, plant.dt, reason)
 
 
 def _on_cpu(plant: Plant) -> Plant:

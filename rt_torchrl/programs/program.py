@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor
 
 Kind = Literal["number", "truth", "array"]
 CONSTANT, UNIFORM, VARYING = 0, 1, 2
@@ -39,6 +40,16 @@ class Access(NamedTuple):
 
     base: int
     strides: tuple[int, ...]
+
+    @classmethod
+    def over(cls, places: Tensor) -> "Access | None":
+        """The way to walk through places on an even grid; None if they are on no such grid."""
+        base = int(places.flatten()[0])
+        firsts = [int(places.movedim(d, 0)[1].flatten()[0]) if n > 1 else base for d, n in enumerate(places.shape)]
+        grid, strides = torch.tensor(base), tuple(first - base for first in firsts)
+        for d, (n, stride) in enumerate(zip(places.shape, strides, strict=True)):
+            grid = grid + (torch.arange(n) * stride).view([-1 if e == d else 1 for e in range(places.ndim)])
+        return cls(base, strides) if torch.equal(grid.expand(places.shape), places) else None
 
 
 class Program:

@@ -248,7 +248,7 @@ class Tracer(TorchDispatchMode):
             return flat[0], None
         found = [p.operations[i] for i in flat]
         if all(o.name == "element" for o in found) and len({o.operands for o in found}) == 1:
-            walk = _walk(torch.tensor([o.attributes[0] for o in found]).view(cells.shape))
+            walk = Access.over(torch.tensor([o.attributes[0] for o in found]).view(cells.shape))
             if walk is not None:
                 return found[0].operands[0], walk
         numbers = self.numbers(cells)
@@ -270,18 +270,6 @@ def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
             yield value
         elif isinstance(value, (list, tuple)):
             yield from tensors_in(value)
-
-
-def _walk(places: Tensor) -> Access | None:
-    """The base and the strides of places on an even grid; None if they are on no such grid."""
-    base = int(places.flatten()[0])
-    strides = tuple(
-        int(places.movedim(d, 0)[1].flatten()[0]) - base if n > 1 else 0 for d, n in enumerate(places.shape)
-    )
-    grid = torch.tensor(base)
-    for d, (n, stride) in enumerate(zip(places.shape, strides, strict=True)):
-        grid = grid + (torch.arange(n) * stride).view([-1 if e == d else 1 for e in range(places.ndim)])
-    return Access(base, strides) if torch.equal(grid.expand(places.shape), places) else None
 
 
 def _storage_of(x: Tensor) -> int:

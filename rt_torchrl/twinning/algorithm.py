@@ -132,9 +132,8 @@ class ReinforcementTwinning:
         reward = episode["next", "reward"].mean()
         self.short_term.append(record)
         self.track_record.append(record, live, -reward.item())
-        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength).set_non_tensor(
-            "live", live
-        )
+        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        report.set_non_tensor("live", live)
         if refused:
             report.update(findings(episodes_refused=float(len(refused)))).set_non_tensor("refusal", "; ".join(refused))
         return report
@@ -288,8 +287,8 @@ class ReinforcementTwinning:
             ValueError: if the state of a component does not fit; it names the component.
         """
         state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
-        parts: dict[str, tuple[Any, Any]] = {}
-        parts |= {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
+        parts: dict[str, tuple[Any, Any]]
+        parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
         parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
         load_parts(parts)
@@ -297,6 +296,5 @@ class ReinforcementTwinning:
         self.episodes_done = state["episodes_done"]
 
 
-KEPT = ("virtual", "short_term", "track_record")
-"""Components that take the tensors of their state without moving them to another device."""
+KEPT = ("virtual", "short_term", "track_record")  # components that leave the tensors of their state on their device
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
