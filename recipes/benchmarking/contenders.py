@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from benchmarking.case import System
-from rt_torchrl import Engine, Rollout, Scenario, control_cost
+from rt_torchrl import Engine, Rollout, Scenario
 from rt_torchrl.trajectories.rollout import refusal
 
 Quantity = Literal["forward", "gradient"]
@@ -84,7 +84,7 @@ class _Torch:
         system, weights = self.system, self.system.weights()
 
         def cost() -> torch.Tensor:
-            return control_cost(system.plant, self.rollout(*scenario)).mean()
+            return self.rollout.costs(*scenario).mean()
 
         @torch.no_grad()
         def forward() -> float:
