@@ -88,7 +88,7 @@ def test_the_import_waits_for_nothing():
 
 
 def test_the_help_of_a_recipe_waits_for_pytorch_alone():
-    """The study is left out, because its help loads what it judges trainings with."""
+    """Study and benchmark are left out, because their help loads what they judge trainings and engines with."""
     code = (
         "import contextlib, runpy, sys\n"
         "for path in sys.argv[1:]:\n"
@@ -99,7 +99,7 @@ def test_the_help_of_a_recipe_waits_for_pytorch_alone():
         "        'torchrl', 'torchdiffeq')\n"
         "print([name for name in late if name in sys.modules])"
     )
-    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem != "study"]
+    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py")) if path.stem not in ("study", "benchmark")]
     done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
     helped = [line for line in done.stdout.splitlines() if line.startswith("usage: ")]
     assert (len(helped), done.stdout.splitlines()[-1]) == (len(recipes), "[]"), done.stdout + done.stderr

@@ -81,7 +81,7 @@ class _Torch:
         self.rollout = Rollout(system.plant, system.closure, system.policy, engine=engine, compiled=compiled)
 
     def calls(self, scenario: Scenario) -> Calls:
-        system, weights = self.system, self.system.weights()
+        weights = self.system.weights()
 
         def cost() -> torch.Tensor:
             return self.rollout.costs(*scenario).mean()
