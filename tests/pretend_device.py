@@ -22,6 +22,10 @@ class _Backend(_DummyBackendModule):
     def set_rng_state(self, state, device=None):
         """Nothing: its global generator is that of the CPU."""
 
+    def get_amp_supported_dtype(self):
+        """No type of lower precision; torch asks whenever it knows a device of this name."""
+        return []
+
 
 NAME = "pretend"
 _setup_privateuseone_for_python_backend(NAME, backend_module=_Backend())
