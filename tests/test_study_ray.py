@@ -182,7 +182,7 @@ STUDY = """
 from dataclasses import dataclass
 from pathlib import Path
 from mortal_tasks import Mortal, Waiting
-from rt_torchrl.runs.run import main_of
+from rt_torchrl import main_of
 from rt_torchrl.study.scheduling import side_by_side
 
 @dataclass(frozen=True, kw_only=True)
