@@ -59,6 +59,7 @@ def test_jax_that_is_not_installed_is_left_out(monkeypatch):
     assert NOTHING.refusal("parallel", system) is None
 
 
+@pytest.mark.slow
 def test_compilation_and_memory_are_measured_in_fresh_processes(tmp_path):
     done = fresh_process.run(RECIPE, "--log-dir", str(tmp_path), "--quick", "--no-compiled", *SMALL[3:-1], "--jax",
                              "--engines", "autograd")  # fmt: skip

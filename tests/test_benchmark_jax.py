@@ -10,8 +10,8 @@ from rt_torchrl import Rollout, control_cost
 STEPS, REALISATIONS = 60, 3
 
 
-@pytest.mark.parametrize("policy", ["affine", "mlp"])
-@pytest.mark.parametrize("closure", ["law", "mlp"])
+@pytest.mark.parametrize("policy", ["affine", pytest.param("mlp", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("closure", ["law", pytest.param("mlp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("plant", ["flapping_wing", "wind_turbine", "cryogenic_tank"])
 def test_jax_and_torch_agree(plant, closure, policy):
     pytest.importorskip("jax", reason="the plants in JAX need the extra bench")

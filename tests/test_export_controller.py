@@ -77,7 +77,7 @@ def law(plant):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", [WindTurbine, InstrumentedTurbine])
+@pytest.mark.parametrize("kind", [WindTurbine, pytest.param(InstrumentedTurbine, marks=pytest.mark.slow)])
 def test_a_turbine_flies_an_episode_by_its_controller_in_c(kind, tmp_path, monkeypatch):
     """Rotor speed and wind go in; the loops of C and of torch are closed one by one."""
     monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 50)
