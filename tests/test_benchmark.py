@@ -75,7 +75,8 @@ def test_engines_agree_over_a_whole_episode(tmp_path, plant):
     steps = {"wind_turbine": "1200", "flapping_wing": "10000", "cryogenic_tank": "14400"}[plant]
     sizes = ["--horizons", steps, "--at-horizon", steps, "--realisations", "2", "--at-realisations", "2"]
     common = ["--plants", plant, "--engines", "parallel", "odeint_adjoint", "--jax", "--threads", "1", "--repeats", "1"]
-    found = compared(tmp_path, *common, *sizes, "--eager", "--no-starts", "--episodes", "0", "--minutes", "0")
+    found = compared(tmp_path, *common, *sizes, "--eager", "--no-starts", "--episodes", "0", "--updates", "0",
+                     "--minutes", "0")  # fmt: skip
     assert found["odeint_adjoint", "gradient"]["gap"] < 1e-4
 
 
