@@ -12,6 +12,7 @@ from benchmarking.contenders import Contenders
 from benchmarking.sizes import Grid, Size
 from benchmarking.summary import DRONE, Summary
 from benchmarking.timing import Cell, Stopwatch
+from benchmarking.updates import milliseconds_of_update
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--plants", "wind_turbine", "--jax"]
@@ -67,6 +68,11 @@ def test_compilation_and_memory_are_measured_in_fresh_processes(tmp_path):
     assert found["autograd"]["cold"] >= 0.0 and found["autograd"]["warm"] >= 0.0
     # The tape of 60 intervals holds thousands of small tensors.
     assert found["autograd"].get("peak_mib", 1.0) > 0.1
+
+
+def test_an_iteration_of_step_2_is_timed_by_formula_and_by_torchrls_losses():
+    found = milliseconds_of_update("wind_turbine", iterations=20, repeats=1)
+    assert 0.0 < found["explicit"] < found["torchrl"] < 1e3
 
 
 @pytest.mark.slow
