@@ -16,14 +16,15 @@ from benchmarking.contenders import Contenders, Jax
 from benchmarking.figures import save_figures
 from benchmarking.sizes import Grid
 from benchmarking.summary import Summary
-from benchmarking.tables import start_table, time_table, training_table
+from benchmarking.tables import start_table, time_table, training_table, update_table
 from benchmarking.timing import Cell, Stopwatch
 from benchmarking.trainings import seconds_of_steps
+from benchmarking.updates import milliseconds_of_update
 
 from rt_torchrl import Engine, main_of
 from rt_torchrl.trajectories.rollout import ENGINES
 
-SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0}
+SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0, "updates": 1.0}
 """Shares of the minutes after which the parts of the benchmark begin nothing more."""
 
 
@@ -53,7 +54,9 @@ class Config:
         starts: whether to measure compilation and memory in fresh processes.
         episodes: number of episodes of a short training of each plant with the engine that the ratios are of; its steps
             are timed. 0 leaves the trainings out.
-        quick: whether to make a small benchmark with all its parts but the trainings.
+        updates: number of iterations of critic and policy in an update of step 2, which is timed with the learner of
+            each plant's recipe. 0 leaves the updates out.
+        quick: whether to make a small benchmark with all its parts but the trainings and updates.
         log_dir: folder of tables and figures; by default runs/benchmark/TIME.
     """
 
@@ -75,6 +78,7 @@ class Config:
     minutes: float = 10.0
     starts: bool = True
     episodes: int = 2
+    updates: int = 300
     quick: bool = False
     log_dir: Path | None = None
 
@@ -86,7 +90,7 @@ class Config:
         for name in ("horizons", "realisations", "threads"):
             if min(getattr(self, name)) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must all be at least 1.")
-        for name, least in (("at_horizon", 1), ("at_realisations", 1), ("repeats", 1), ("episodes", 0)):
+        for name, least in (("at_horizon", 1), ("at_realisations", 1), ("repeats", 1), ("episodes", 0), ("updates", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
         if max(self.threads) > cores.available():
@@ -99,7 +103,7 @@ class Config:
         if not self.quick:
             return self
         sizes = {"horizons": (20, 60), "realisations": (1, 2), "at_horizon": 20, "at_realisations": 2}
-        return dataclasses.replace(self, **sizes, repeats=1, episodes=0, quick=False)
+        return dataclasses.replace(self, **sizes, repeats=1, episodes=0, updates=0, quick=False)
 
     def grid(self) -> Grid:
         cases = [Case(p, c, a) for c in self.closures for a in self.policies for p in self.plants]
@@ -122,6 +126,7 @@ class Benchmark:
         self.stopwatch = Stopwatch(config.contenders(), config.repeats, config.limit, _tell)
         self.starts: dict[str, dict[str, dict[str, float]]] = {}
         self.trainings: dict[str, list[float]] = {}
+        self.updates: dict[str, dict[str, float]] = {}
         self.out_of_time: list[str] = []
 
     def run(self) -> None:
@@ -130,6 +135,8 @@ class Benchmark:
             self._starts()
         if self.config.episodes:
             self._trainings()
+        if self.config.updates:
+            self._updates()
 
     def _late(self, part: str, what: str) -> bool:
         late = 0 < 60.0 * self.config.minutes * SHARES[part] < time.monotonic() - self.began
@@ -184,11 +191,19 @@ class Benchmark:
                 steps = seconds_of_steps(plant, engine, Path(run), config.episodes, compiled=config.compiled)
             self.trainings[name] = steps
 
+    def _updates(self) -> None:
+        config = self.config
+        for plant in config.plants:
+            if not self._late("updates", f"update, {plant}"):
+                _tell(f"update, {plant}")
+                self.updates[plant] = milliseconds_of_update(plant, config.updates, config.repeats)
+
     def report(self) -> str:
         """The tables and the summary."""
         parts = [time_table(self.stopwatch.cells)]
         parts += [start_table(self.starts)] if self.starts else []
         parts += [training_table(self.trainings)] if self.trainings else []
+        parts += [update_table(self.updates)] if self.updates else []
         if self.out_of_time:
             parts.append(f"no time within minutes={self.config.minutes:g} for:\n  " + "\n  ".join(self.out_of_time))
         return "\n\n".join([*parts, "summary\n" + "\n".join(f"  {line}" for line in self.summary())])
@@ -206,7 +221,8 @@ class Benchmark:
         machine = {"machine": platform.platform(), "processor": platform.machine(), "cores": cores.available()}
         result: dict[str, Any] = {**machine, "python": platform.python_version(), "command": sys.argv}
         result |= {"cells": [cell.record() for cell in self.stopwatch.cells], "starts": self.starts}
-        result |= {"trainings": self.trainings, "out_of_time": self.out_of_time, "summary": self.summary()}
+        result |= {"trainings": self.trainings, "updates": self.updates}
+        result |= {"out_of_time": self.out_of_time, "summary": self.summary()}
         (self.folder / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         (self.folder / "benchmark.txt").write_text(self.report() + "\n", encoding="utf-8")
         save_figures(self.stopwatch.cells, self.folder)

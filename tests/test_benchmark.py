@@ -12,6 +12,7 @@ from benchmarking.contenders import Contenders
 from benchmarking.sizes import Grid, Size
 from benchmarking.summary import DRONE, Summary
 from benchmarking.timing import Cell, Stopwatch
+from benchmarking.updates import milliseconds_of_update
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--plants", "wind_turbine", "--jax"]
@@ -70,13 +71,19 @@ def test_compilation_and_memory_are_measured_in_fresh_processes(tmp_path):
     assert found["autograd"].get("peak_mib", 1.0) > 0.1
 
 
+def test_an_iteration_of_step_2_is_timed_by_formula_and_by_torchrls_losses():
+    found = milliseconds_of_update("wind_turbine", iterations=20, repeats=1)
+    assert 0.0 < found["explicit"] < found["torchrl"] < 1e3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
 def test_engines_agree_over_a_whole_episode(tmp_path, plant):
     steps = {"wind_turbine": "1200", "flapping_wing": "10000", "cryogenic_tank": "14400"}[plant]
     sizes = ["--horizons", steps, "--at-horizon", steps, "--realisations", "2", "--at-realisations", "2"]
     common = ["--plants", plant, "--engines", "parallel", "odeint_adjoint", "--jax", "--threads", "1", "--repeats", "1"]
-    found = compared(tmp_path, *common, *sizes, "--eager", "--no-starts", "--episodes", "0", "--minutes", "0")
+    found = compared(tmp_path, *common, *sizes, "--eager", "--no-starts", "--episodes", "0", "--updates", "0",
+                     "--minutes", "0")  # fmt: skip
     assert found["odeint_adjoint", "gradient"]["gap"] < 1e-4
 
 

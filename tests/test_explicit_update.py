@@ -16,13 +16,15 @@ from torch import nn
 from torch.utils._pytree import tree_flatten_with_path
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, mlp
+from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
-from rt_torchrl.twinning.learners.explicit import choice
+from rt_torchrl.twinning.learners.explicit import choice, row_function
 from rt_torchrl.twinning.learners.explicit.adam import AdamSteps
+from rt_torchrl.twinning.learners.explicit.critic_formulas import Ascent, CriticShape, TemporalDifferences
 from rt_torchrl.twinning.learners.explicit.perceptron import Perceptron
 from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
 
@@ -129,22 +131,68 @@ def test_one_way_goes_on_from_the_state_of_the_other(algorithm):
     assert_same(whole(found), whole(again))
 
 
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
+def test_torch_takes_the_place_of_machine_code(monkeypatch, algorithm):
+    monkeypatch.setattr(row_function, "LEAST_LANES", 99)
+    expected, found = (learner(update, algorithm, batch_size=27) for update in ("torchrl", "explicit"))
+    for each in (expected, found):
+        each.update()
+    assert_same(whole(expected), whole(found))
+
+
+@pytest.mark.parametrize("lanes", [Lanes(2, "b"), Lanes(4, "d"), Lanes(8, "e")])
+@pytest.mark.parametrize("hidden", [(), (6,), (40, 30)])
+@pytest.mark.parametrize("members", [1, 2])
+def test_machine_code_of_an_iteration_gives_what_autograd_gives(monkeypatch, lanes, hidden, members):
+    here = lanes_of_this_machine()
+    if lanes.number > here.number or (lanes.number < here.number and here.variant == "n"):
+        pytest.skip(f"this processor has {here.number} lanes")
+    monkeypatch.setattr(row_function, "lanes_of_this_machine", lambda: lanes)
+    monkeypatch.setattr(row_function, "LEAST_LANES", 2)
+    shape, generator = CriticShape(3, 2, hidden), seeded()
+    networks = [mlp(5, hidden, 1, generator=generator, activation=nn.SiLU) for _ in range(2 * members)]
+    rows = torch.randn(13, 13, generator=generator, dtype=torch.float64)
+    weights = torch.cat([w.detach().flatten() for network in networks for w in network.parameters()])
+    x, following, reward, discount, share = rows.split([5, 5, 1, 1, 1], -1)
+    with torch.no_grad():
+        target = reward + discount * torch.cat([network(following) for network in networks[members:]], -1).amin(
+            -1, True
+        )
+    expected = []
+    for network in networks[:members]:
+        outputs = list(itertools.accumulate(network, lambda h, module: module(h), initial=x.clone().requires_grad_()))
+        error = outputs[-1] - target
+        found = torch.autograd.grad((share * error**2).sum(), [error, *outputs[1:-1:2]])
+        expected += [error, found[0], *outputs[2::2], *found[1:]]
+    learning = row_function.RowFunction(TemporalDifferences(shape, members), len(rows), weights)
+    learning.rows.copy_(rows.t())
+    learning(weights)
+    for one, other in zip(learning.results, expected, strict=True):
+        torch.testing.assert_close(one.t(), other)
+    climbing = row_function.RowFunction(Ascent(shape), len(rows), weights)
+    climbing.rows.copy_(torch.cat([x, share], -1).t())
+    climbing(weights)
+    x = x.clone().requires_grad_()
+    value = share * networks[0](x)
+    torch.testing.assert_close(climbing.results[0].t(), value)
+    torch.testing.assert_close(-climbing.results[1].t(), torch.autograd.grad(value.sum(), x)[0][:, 3:])
+
+
 @pytest.mark.parametrize("hidden", [(), (6,), (6, 5)])
 @pytest.mark.parametrize("activation", [nn.SiLU, nn.Tanh])
 def test_gradients_of_a_perceptron_are_those_of_autograd(hidden, activation):
     network = mlp(3, hidden, 2, generator=seeded(), activation=activation)
-    x = torch.randn(11, 3, generator=seeded(1), dtype=torch.float64, requires_grad=True)
+    x = torch.randn(11, 3, generator=seeded(1), dtype=torch.float64)
     slope = torch.randn(11, 2, generator=seeded(2), dtype=torch.float64)
     linear = list(network)[::2]
-    expected = torch.autograd.grad(network(x), [x, *network.parameters()], slope)
+    expected = torch.autograd.grad(network(x), list(network.parameters()), slope)
     with torch.no_grad():
         found = Perceptron([(module.weight, module.bias) for module in linear], activation)
         out = [(torch.empty_like(module.weight), torch.empty_like(module.bias)) for module in linear]
         torch.testing.assert_close(found.forward(x), network(x))
         torch.testing.assert_close(found(x), network(x))
         found.weight_gradients(slope, out)
-        torch.testing.assert_close(found.input_gradient(slope, 1), expected[0][:, 1:])
-    for one, other in zip(itertools.chain(*out), expected[1:], strict=True):
+    for one, other in zip(itertools.chain(*out), expected, strict=True):
         torch.testing.assert_close(one, other)
 
 

@@ -47,3 +47,11 @@ def training_table(trainings: Mapping[str, Sequence[float]]) -> str:
     lines = [f"{'s per episode, steps 1 to 6':<31} " + " ".join(f"{step:>18}" for step in short)]
     lines += [f"{name:<31} " + " ".join(f"{value:18.3f}" for value in row) for name, row in trainings.items()]
     return "\n".join(lines)
+
+
+def update_table(updates: Mapping[str, Mapping[str, float]]) -> str:
+    """CPU milliseconds of an iteration of critic and policy, by formula and by TorchRL's losses."""
+    ways = list(dict.fromkeys(way for found in updates.values() for way in found))
+    lines = [f"{'CPU ms per iteration, step 2':<31} " + " ".join(f"{way:>10}" for way in ways)]
+    lines += [f"{plant:<31} " + " ".join(f"{found[way]:10.3f}" for way in ways) for plant, found in updates.items()]
+    return "\n".join(lines)

@@ -40,7 +40,7 @@ class AdamSteps:
             self._take(weights)
             return
         first, second, steps = self._moments
-        torch._foreach_add_(steps, 1.0)
+        self._count.add_(1.0)
         torch._fused_adam_(self._values, gradients, first, second, [], steps, **self._rates)
 
     def _take(self, weights: list[torch.nn.Parameter]) -> None:
@@ -51,6 +51,11 @@ class AdamSteps:
             beta1, beta2 = group["betas"]
             self._rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
             self._rates |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
+            # One addition counts the steps of all weights.
+            self._count = torch.stack(self._moments[2])
+            self._moments = (*self._moments[:2], list(self._count))
+            for weight, steps in zip(weights, self._moments[2], strict=True):
+                self._optimiser.state[weight]["step"] = steps
 
     def _ordinary_step(self, gradients: Sequence[Tensor]) -> None:
         self._optimiser.zero_grad(set_to_none=True)

@@ -1,6 +1,5 @@
 """DDPG's iterations by formula."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,13 +18,10 @@ class ExplicitDDPG(ExplicitIterations):
     def __init__(self, learner: ActorCritic):
         super().__init__(learner, "value_network_params")
 
-    def known_actions(self, following: Float[Tensor, "n n_o"]) -> Float[Tensor, "n n_known"]:
+    @property
+    def steady(self) -> bool:
         # A policy of somebody else may look at whole batches, or draw its actions.
-        if not isinstance(self.policy, ExplicitPolicy):
-            return following[:, :0]
-        return self.scaled(self.policy(following))
+        return isinstance(self.policy, ExplicitPolicy)
 
-    def next_values(self, following: Float[Tensor, "n n_following"]) -> Float[Tensor, " n"]:
-        if following.shape[1] == self.n_o:
-            following = torch.cat([following, self.scaled(self.policy(following))], -1)
-        return self.critics.targets[0](following).squeeze(-1)
+    def next_actions(self, following: Float[Tensor, "n n_o"]) -> Float[Tensor, "n n_a"]:
+        return self.policy(following)

@@ -39,7 +39,7 @@ class Perceptron:
         return functional.linear(x, *self.layers[-1])
 
     def forward(self, x: Float[Tensor, "n n_in"]) -> Float[Tensor, "n n_out"]:
-        """The output y, of which :meth:`weight_gradients` and :meth:`input_gradient` give gradients."""
+        """The output y, of which :meth:`weight_gradients` gives gradients."""
         self._inputs, self._linear = [x], list[Tensor]()
         for weight, bias in self.layers[:-1]:
             z = functional.linear(x, weight, bias)
@@ -62,17 +62,6 @@ class Perceptron:
                 torch.sum(slope, 0, out=bias)
             if l:
                 slope = self._slope(slope.mm(self.layers[l][0]), self._linear[l - 1], self._inputs[l])
-
-    def input_gradient(self, slope: Float[Tensor, "n n_out"], first: int = 0) -> Float[Tensor, "n n_some"]:
-        """The gradient dJ/dx with respect to the inputs from number ``first`` on.
-
-        Args:
-            slope: dJ/dy of each row.
-            first: number of the first input of interest.
-        """
-        for l in reversed(range(1, len(self.layers))):
-            slope = self._slope(slope.mm(self.layers[l][0]), self._linear[l - 1], self._inputs[l])
-        return slope.mm(self.layers[0][0][:, first:])
 
 
 def silu_slope(g: Tensor, z: Tensor, h: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from rt_torchrl.twinning.learners.explicit.perceptron import Layer, Perceptron
+from rt_torchrl.twinning.learners.explicit.critic_formulas import CriticShape, TemporalDifferences
+from rt_torchrl.twinning.learners.explicit.row_function import RowFunction
 
 
 class StackedCritics:
@@ -14,71 +15,79 @@ class StackedCritics:
     Args:
         loss: loss with critics of the class :class:`Critic` and with targets of them.
         name: name of the critics' weights in the loss.
+        n_a: number of actions.
+        n: number of transitions in a batch.
     """
 
-    def __init__(self, loss: LossModule, name: str):
+    def __init__(self, loss: LossModule, name: str, n_a: int, n: int):
         named = {key: weight for key, weight in loss.named_parameters() if key.startswith(f"{name}.")}
         held = dict(loss.named_buffers())
         self.weights = list(named.values())
-        self._targets = [held[f"target_{key}"] for key in named]
-        self._flat = torch.cat([torch.zeros_like(weight).flatten() for weight in self.weights])
-        parts = self._flat.split([weight.numel() for weight in self.weights])
-        self.gradients = [part.view(weight.shape) for part, weight in zip(parts, self.weights, strict=True)]
         self._values = [weight.detach() for weight in self.weights]
-        self.members = [Perceptron(layers) for layers in layers_of(self._values)]
-        self.targets = [Perceptron(layers) for layers in layers_of(self._targets)]
-        self._layers = layers_of(self.gradients)
-        self.n_inputs = self.weights[0].shape[-1]
+        self._targets = [held[f"target_{key}"] for key in named]
+        self._flat = torch.cat([torch.zeros_like(weight).flatten() for weight in self._values])
+        parts = self._flat.split([weight.numel() for weight in self._values])
+        self.gradients = [part.view(weight.shape) for part, weight in zip(parts, self._values, strict=True)]
+        members = members_of(self._values)
+        widths = [bias.numel() for bias in members[0][1::2]]
+        self.shape = CriticShape(members[0][0].shape[1] - n_a, n_a, tuple(widths[:-1]))
+        self._parts = [part.view(-1) for member in members + members_of(self._targets) for part in member]
+        self._row, self._old = torch.cat(self._parts), False
+        self._differences = RowFunction(TemporalDifferences(self.shape, len(members)), n, self._row)
+        self.rows = self._differences.rows
+        """Rows x, x', r, γ and w of a batch, to be written before :meth:`learn`."""
+        self._plan(len(members))
+
+    def _plan(self, count: int) -> None:
+        """Name the parts of the results, and the products of them that the gradients are."""
+        depth = len(self.shape.sizes)
+        width, x = 2 * depth, self.rows[: self.shape.n_x]
+        self._errors, self._scales, self._products = [], [], []
+        for k, gradients in enumerate(members_of(self.gradients)):
+            error, scale, *others = self._differences.results[k * width : (k + 1) * width]
+            self._errors.append(error[0])
+            self._scales.append(scale[0])
+            inputs, slopes = [x, *others[: depth - 1]], [*others[depth - 1 :], scale]
+            left = [part.t() for part in inputs]
+            self._products += list(zip(slopes, left, gradients[::2], gradients[1::2], strict=True))
+
+    @property
+    def row(self) -> Float[Tensor, " n_w"]:
+        """Present weights of all critics, and then those of their targets."""
+        if self._old:
+            torch.cat(self._parts, out=self._row)
+            self._old = False
+        return self._row
 
     @property
     def gradient_norm(self) -> Tensor:
         """Norm of the gradient that :meth:`learn` has found."""
         return torch.linalg.vector_norm(self._flat)
 
-    def learn(
-        self, x: Float[Tensor, "n n_x"], target: Float[Tensor, " n"], share: Float[Tensor, " n"]
-    ) -> tuple[Tensor, Float[Tensor, " n"]]:
-        """Write the gradients of the loss Σ_i Σ_k w_k (q_i(x_k) − y_k)² of all critics i.
-
-        Args:
-            x: observations and scaled actions.
-            target: targets y.
-            share: weights w.
+    def learn(self) -> tuple[Tensor, Float[Tensor, " n"]]:
+        """Write the gradients of the loss Σ_i Σ_k w_k δ_ik² of all critics i, whose weights change afterwards.
 
         Returns:
             The loss, and the greatest |δ| of all critics for each row.
         """
-        losses, errors = [], []
-        for critic, out in zip(self.members, self._layers, strict=True):
-            error = critic.forward(x).squeeze(-1).sub_(target)
-            slope = error * share
-            losses.append(torch.dot(slope, error))
-            critic.weight_gradients(slope.mul_(2.0).unsqueeze(-1), out)
-            errors.append(error.abs_())
-        if len(errors) == 1:
-            return losses[0], errors[0]
-        return torch.stack(losses).sum(), torch.stack(errors).amax(0)
-
-    def climb(
-        self, x: Float[Tensor, "n n_x"], share: Float[Tensor, " n"], first: int
-    ) -> tuple[Tensor, Float[Tensor, "n n_some"]]:
-        """The mean value of the first critic, and the slope of its negative.
-
-        Args:
-            x: observations and scaled actions.
-            share: weight of each row in the mean.
-            first: number of the first input whose slope is wanted.
-        """
-        value = torch.dot(self.members[0].forward(x).squeeze(-1), share)
-        return value, self.members[0].input_gradient(share.neg().unsqueeze(-1), first)
+        self._differences(self.row)
+        self._old = True
+        for slope, left, by_weight, by_bias in self._products:
+            torch.mm(slope, left, out=by_weight)
+            torch.sum(slope, 1, out=by_bias)
+        losses = [0.5 * torch.dot(scale, error) for scale, error in zip(self._scales, self._errors, strict=True)]
+        if len(losses) == 1:
+            return losses[0], self._errors[0].abs()
+        return torch.stack(losses).sum(), torch.stack(self._errors).abs_().amax(0)
 
     def follow(self, rate: float) -> None:
         """Let the targets follow at a rate."""
+        self._old = True
         torch._foreach_lerp_(self._targets, self._values, rate)
 
 
-def layers_of(weights: list[Tensor]) -> list[list[Layer]]:
-    """Layers of each critic, from weights and biases in turn that may be stacked."""
+def members_of(weights: list[Tensor]) -> list[list[Tensor]]:
+    """Weights and biases of each critic, in turn, from those of all, which may be stacked."""
     if weights[0].dim() == 2:
-        return [list(zip(weights[::2], weights[1::2], strict=True))]
-    return [[(w[k], b[k]) for w, b in zip(weights[::2], weights[1::2], strict=True)] for k in range(len(weights[0]))]
+        return [weights]
+    return [[weight[k] for weight in weights] for k in range(len(weights[0]))]

@@ -32,15 +32,14 @@ class ExplicitTD3(ExplicitIterations):
         self._generator = torch.Generator(device=learner.generator.device)
         super().__init__(learner, "qvalue_network_params")
 
-    def known_actions(self, following: Float[Tensor, "n n_o"]) -> Float[Tensor, "n n_known"]:
-        return following[:, :0]
+    @property
+    def steady(self) -> bool:
+        return False
 
-    def next_values(self, following: Float[Tensor, "n n_following"]) -> Float[Tensor, " n"]:
+    def next_actions(self, following: Float[Tensor, "n n_o"]) -> Float[Tensor, "n n_a"]:
         loss, action = self.learner.loss, self._next_policy(following)
         noise = (self._normal(action) * loss.policy_noise).clamp(-loss.noise_clip, loss.noise_clip)
-        x = torch.cat([following, self.scaled((action + noise).clamp(loss.min_action, loss.max_action))], -1)
-        one, other = (target(x) for target in self.critics.targets)
-        return torch.minimum(one, other).squeeze(-1)
+        return (action + noise).clamp(loss.min_action, loss.max_action)
 
     def _normal(self, like: Tensor) -> Tensor:
         """Normal numbers, the same as TorchRL draws from the global generator with the seed of :class:`TD3`."""
