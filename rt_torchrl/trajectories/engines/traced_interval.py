@@ -17,6 +17,7 @@ from rt_torchrl.programs.program import Program, UntraceableError
 from rt_torchrl.programs.tracer import Tracer
 from rt_torchrl.programs.vector_functions import Lanes
 from rt_torchrl.trajectories.engines.interval import Drive, with_weights
+from rt_torchrl.trajectories.engines.weights import Weights
 
 POINTER = ctypes.c_void_p
 MARCH = (POINTER, POINTER, POINTER, ctypes.c_int64)
@@ -67,7 +68,7 @@ class March:
     def _compare(self, interval: nn.Module, point: Point) -> None:
         states = np.empty((2, self.sizes["s"], self.lanes.number))
         states[0] = point.state.numpy().T
-        self(packed(point.drive), states, weights_of(interval), 1)
+        self(packed(point.drive), states, Weights(interval).row(), 1)
         require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
 
 
@@ -139,7 +140,7 @@ class Sweep:
         costate = 1.0 + 0.1 * np.arange(self.sizes["s"] * n_lanes, dtype=float).reshape(-1, n_lanes)
         source, x = np.zeros((1, self.sizes["s"], n_lanes)), packed(point.drive)
         found = costate.copy(), np.zeros((1, self.sizes["x"], n_lanes)), np.zeros((self.sizes["w"], n_lanes))
-        self(x, point.state.numpy().T[None].copy(), source, found[0], weights_of(interval), *found[1:], 1)
+        self(x, point.state.numpy().T[None].copy(), source, found[0], Weights(interval).row(), *found[1:], 1)
         weights = {name: w.detach().clone().requires_grad_(name in names) for name, w in interval.named_parameters()}
         leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
         with torch.enable_grad():
@@ -160,12 +161,6 @@ def packed(drive: Drive) -> np.ndarray:
     """The drive of one interval as one row, ``1 n_x lanes``."""
     rows = np.concatenate([drive.t[None].numpy(), drive.exogenous.numpy().T, drive.command.numpy().T])
     return np.ascontiguousarray(rows[None])  # of transposed arrays NumPy makes a transposed one
-
-
-def weights_of(interval: nn.Module) -> np.ndarray:
-    """All weights of an interval as one row of numbers."""
-    found = [w.detach().numpy().ravel() for w in interval.parameters()]
-    return np.concatenate(found) if found else np.zeros(1)
 
 
 def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
