@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from c_build import needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
-from test_export_controller import GAINS, Lagged, needs_compiler
+from test_export_controller import GAINS, Lagged
 from torch import nn
 
 from rt_torchrl import check_plant, export_controller

@@ -67,6 +67,8 @@ FURTHER = {
     "a list of an object": lambda m: m.part.table[1].append(3.0),
     "an object in a pair": lambda m: setattr(m.pair[0], "gain", 3.0),
     "the class of an object": lambda m: setattr(m.part, "__class__", Other),
+    "all attributes of an object": lambda m: setattr(m.part, "__dict__", {**vars(m.part), "gain": 3.0}),
+    "all attributes of the module": lambda m: setattr(m, "__dict__", {**vars(m), "scale": 3.0}),
     "the class of the module": lambda m: setattr(m, "__class__", Inner),
     "the first hook of a layer": lambda m: m.linear.register_forward_pre_hook(lambda *a: None),
     "a buffer that is not saved": lambda m: m.register_buffer("late", torch.zeros(1), persistent=False),

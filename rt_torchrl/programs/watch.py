@@ -3,8 +3,9 @@
 import copyreg
 import random
 import types
-from collections import OrderedDict
-from collections.abc import Collection
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Collection, Iterable
+from functools import partial
 from itertools import chain
 from operator import attrgetter, is_, methodcaller
 from pickle import PickleBuffer
@@ -24,13 +25,26 @@ CONSTANT = frozenset({str, int, float, complex, bool, type(None), bytes, tuple, 
 ALSO_CONSTANT = (*BY_ADDRESS, types.MethodType, torch.device, np.dtype, np.generic, PickleBuffer)
 """The same, with all types that extend them; the buffer of an array is noted with the array."""
 USUAL = ("__reduce_ex__", "__reduce__", "__getstate__")
-
-_values = methodcaller("values")
-_function = attrgetter("__code__", "__defaults__", "__kwdefaults__")
-_mro = attrgetter("__mro__")
-_content = attrgetter("cell_contents")
-_of_tensor = attrgetter("shape", "dtype", "requires_grad")
-_of_array = attrgetter("shape", "dtype")
+"""Methods by which pickle reads an object."""
+Readers = dict[str, Callable[[list[Any]], Iterable[object]]]
+IDENTITIES: Readers = {
+    "filled": chain.from_iterable,
+    "mappings": lambda held: chain.from_iterable(map(methodcaller("values"), held)),
+    "functions": lambda held: chain.from_iterable(map(attrgetter("__code__", "__defaults__", "__kwdefaults__"), held)),
+    "cells": partial(map, attrgetter("cell_contents")),
+    "classes": partial(map, attrgetter("__mro__")),
+    "instances": lambda held: chain(map(type, held), map(vars, held)),
+    "names": lambda names: [held.get(name) for held, name in names],
+}
+"""What must be the same objects, for each kind of things that are noted."""
+CONTENTS: Readers = {
+    "filled": partial(map, len),
+    "tensors": lambda held: chain(map(attrgetter("shape", "dtype", "requires_grad"), held), map(Tensor.stride, held)),
+    "memory": partial(map, Tensor.data_ptr),
+    "arrays": partial(map, attrgetter("shape", "dtype")),
+    "bytes": partial(map, np.ndarray.tobytes),
+}
+"""What must be equal."""
 
 
 class Watch:
@@ -45,17 +59,9 @@ class Watch:
     """
 
     def __init__(self, root: nn.Module):
-        self._root, self._kind, self._complete = id(root), type(root), True
+        self._root, self._own, self._complete = id(root), (type(root), vars(root)), True
         self._seen: dict[int, object] = {}
-        self._names: list[tuple[dict[str, Any], str]] = []
-        self._collections: list[Any] = []
-        self._classes: list[type] = []
-        self._instances: list[object] = []
-        self._functions: list[types.FunctionType] = []
-        self._cells: list[types.CellType] = []
-        self._tensors: list[Tensor] = []
-        self._arrays: list[np.ndarray] = []
-        self._views: list[np.ndarray] = []
+        self._noted = defaultdict[str, list[Any]](list)
 
     def note(self, obj: Any) -> None:
         """Note an object that the fingerprint reads."""
@@ -65,14 +71,15 @@ class Watch:
         if id(obj) != self._root:
             self._seen[id(obj)] = obj  # whose address no other object gets as long as this one is held
         if kind in (*DICTIONARIES, list, set):
-            self._collections.append(obj)
+            self._noted["collections"].append(obj)
         elif isinstance(obj, Tensor):
             self._note_tensor(obj)
         elif kind is np.ndarray and not obj.dtype.hasobject:
-            self._arrays.append(obj)
+            self._noted["arrays"].append(obj)
+            self._noted["bytes"].append(obj)
         elif isinstance(obj, types.FunctionType):
-            self._functions.append(obj)
-            self._cells += obj.__closure__ or ()
+            self._noted["functions"].append(obj)
+            self._noted["cells"] += obj.__closure__ or ()
         elif isinstance(obj, nn.Module) or _pickled_as_usual(kind):
             self._note_instance(obj)
         elif not isinstance(obj, ALSO_CONSTANT) and (not isinstance(obj, tuple) or hasattr(obj, "__dict__")):
@@ -80,76 +87,58 @@ class Watch:
 
     def note_name(self, held: dict[str, Any], name: str) -> None:
         """Note a global variable; its value may be noted too."""
-        self._names.append((held, name))
+        self._noted["names"].append((held, name))
 
     def note_class(self, kind: type) -> None:
         """Note the attributes of a class, as its own dictionary has them."""
-        self._classes.append(kind)
-        self._collections.append(vars(kind))
+        self._noted["classes"].append(kind)
+        self._noted["collections"].append(vars(kind))
 
     def _note_tensor(self, x: Tensor) -> None:
-        self._tensors.append(x)
         try:
             view = x.detach().numpy()
         except (RuntimeError, TypeError):  # on another device, or in a layout of its own
             self._complete = False
             return
+        self._noted["tensors"].append(x)
+        self._noted["memory"].append(x)
         if not isinstance(x, nn.Parameter):
-            self._views.append(view)
+            self._noted["bytes"].append(view)
 
     def _note_instance(self, obj: object) -> None:
+        held = getattr(obj, "__dict__", None)
+        if held is None:
+            return
         if id(obj) != self._root:
-            self._instances.append(obj)
-        held = getattr(obj, "__dict__", {})
-        self._collections.append(held)
+            self._noted["instances"].append(obj)
+        self._noted["collections"].append(held)
         for x in held.values():  # also those that are empty, which no fingerprint reads
             if type(x) in DICTIONARIES:
                 self.note(x)
 
     def begin(self) -> None:
         """Remember everything as it is now."""
-        self._empty = [held for held in self._collections if not held]  # such as those for hooks
-        self._filled = [held for held in self._collections if held]
-        self._mappings = [held for held in self._filled if not isinstance(held, (list, set))]
+        collections = self._noted.pop("collections")
+        self._empty = [held for held in collections if not held]  # such as those for hooks
+        self._noted["filled"] = [held for held in collections if held]
+        self._noted["mappings"] = [held for held in collections if held and not isinstance(held, (list, set))]
         try:
-            self._then = self._objects(), self._contents()
+            self._then = self._read(IDENTITIES), self._read(CONTENTS)
         except ValueError:  # a variable of a function has no value yet
             self._complete = False
 
     def holds(self, root: nn.Module) -> bool:
         """Whether everything is as it was."""
-        if not self._complete or type(root) is not self._kind or any(self._empty):
+        if not self._complete or any(self._empty) or not same((type(root), vars(root)), self._own):
             return False
         identities, contents = self._then
         try:
-            objects = self._objects()
+            return same(self._read(IDENTITIES), identities) and self._read(CONTENTS) == contents
         except ValueError:  # a variable of a function has lost its value
             return False
-        return same(objects, identities) and self._contents() == contents
 
-    def _objects(self) -> list[object]:
-        """What must be the same objects."""
-        return [
-            *chain.from_iterable(self._filled),
-            *chain.from_iterable(map(_values, self._mappings)),
-            *chain.from_iterable(map(_function, self._functions)),
-            *map(_content, self._cells),
-            *map(_mro, self._classes),
-            *map(type, self._instances),
-            *(held.get(name) for held, name in self._names),
-        ]
-
-    def _contents(self) -> list[object]:
-        """What must be equal."""
-        return [
-            *map(len, self._filled),
-            *map(_of_tensor, self._tensors),
-            *map(Tensor.data_ptr, self._tensors),
-            *map(Tensor.stride, self._tensors),
-            *map(np.ndarray.tobytes, self._views),
-            *map(_of_array, self._arrays),
-            *map(np.ndarray.tobytes, self._arrays),
-        ]
+    def _read(self, readers: Readers) -> list[object]:
+        return [*chain.from_iterable(read(self._noted[kind]) for kind, read in readers.items())]
 
 
 def same(objects: Collection[object], others: Collection[object]) -> bool:
