@@ -234,6 +234,7 @@ REFUSED = {
     ),
     "single precision": (lambda e, W, b: e.float().double()[..., :1], "a conversion to torch.float32"),
     "a branch": (lambda e, W, b: e[..., :1] if e.sum() > 0 else -e[..., :1], "a branch of Python is taken"),
+    "a number by NumPy": (lambda e, W, b: e[..., :1] * float(e.numpy()[0, 0]), r"\.numpy\(\) takes a number"),
     "random numbers": (lambda e, W, b: e[..., :1] + torch.randn(1, 1, dtype=torch.float64), "draws random numbers"),
 }
 

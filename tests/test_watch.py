@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import test_fingerprint
 import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
 from test_fingerprint import CHANGES, ODD, Inner, counting
 from torch import nn
 
 from rt_torchrl.programs.fingerprint import fingerprint
+from rt_torchrl.trajectories.engines import programs
+from rt_torchrl.trajectories.rollout import Rollout
 
 
 def watch_of(module):
@@ -228,3 +231,24 @@ def test_a_watch_keeps_no_module_alive():
     del module
     gc.collect()
     assert seen() is None and watch is not None
+
+
+def test_a_rollout_makes_a_fingerprint_once(monkeypatch):
+    """Until something of its interval changes; then its cost is that of the changed interval."""
+    made = []
+    monkeypatch.setattr(programs, "fingerprint", lambda module: made.append(module) or fingerprint(module))
+    plant, closure = LinearQuadratic(), LinearClosure(torch.zeros(2, 2))
+    generator = torch.Generator().manual_seed(0)
+    policy, scenario = (
+        plant.make_policy(generator),
+        (plant.draw_initial_state(3, generator), torch.ones(3, 4, 1).double()),
+    )
+    native, exact = (Rollout(plant, closure, policy, engine=engine) for engine in ("native", "autograd"))
+    for _ in range(3):
+        native.costs(*scenario).sum().backward()
+        torch.optim.SGD(policy.parameters(), lr=1e-3).step()
+        torch.testing.assert_close(native.costs(*scenario), exact.costs(*scenario))
+    assert len(made) == 1
+    plant._A.data.mul_(2.0)
+    torch.testing.assert_close(native.costs(*scenario), exact.costs(*scenario))
+    assert len(made) == 2
