@@ -12,6 +12,9 @@ from rt_torchrl.trajectories.rollout import Engine, Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory
 
+KEPT = 4
+"""Number of policies whose rollouts a twin keeps, such as those that are judged in turn."""
+
 
 class DigitalTwin:
     """Flies virtual episodes of a plant whose true closure it does not know.
@@ -30,7 +33,7 @@ class DigitalTwin:
         self._engine, self._compiled = engine, compiled
         self._replay = self._rollout(closure, None)
         self.sensitivities = Sensitivities(plant, closure)
-        self._planned: _Planned | None = None
+        self._planned: list[_Planned] = []
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
@@ -67,12 +70,14 @@ class DigitalTwin:
         return self._planning(policy).costs(initial_state, exogenous).mean()
 
     def _planning(self, policy: nn.Module) -> Rollout:
-        """The rollout of a policy under the closure held constant, kept until one of the two is another one."""
-        planned = self._planned
-        if planned is None or not planned.serves(self.closure, policy):
-            rollout = self._rollout(constant(self.closure), policy)
-            planned = self._planned = _Planned(nn.ModuleList([self.closure, policy]), rollout)
-        return planned.rollout
+        """The rollout of a policy under the closure held constant, kept as long as both are the same."""
+        for planned in self._planned:
+            if planned.serves(self.closure, policy):
+                return planned.rollout
+        modules = nn.ModuleList([self.closure, policy])
+        new = _Planned(modules, self._rollout(constant(self.closure), policy))
+        self._planned = [new, *self._planned[: KEPT - 1]]
+        return new.rollout
 
 
 class _Planned:
