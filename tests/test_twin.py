@@ -88,6 +88,14 @@ def test_a_twin_is_planned_on_with_the_closure_it_has_now(change):
     assert torch.equal(found, fresh) and (change == "a frozen weight" or not torch.equal(found, before))
 
 
+def test_a_twin_is_planned_on_with_the_plant_it_has_now():
+    twin, policy, episodes = twin_and_policy()
+    before = twin.cost(policy, *episodes)
+    twin.plant = LinearQuadratic(dt=0.5 * twin.plant.dt)
+    found = twin.cost(policy, *episodes)
+    assert torch.equal(found, DigitalTwin(twin.plant, twin.closure).cost(policy, *episodes)) and found != before
+
+
 def test_a_policy_in_single_precision_is_refused_also_later():
     twin, policy, episodes = twin_and_policy()
     twin.cost(policy, *episodes)

@@ -72,7 +72,7 @@ class DigitalTwin:
     def _planning(self, policy: nn.Module) -> Rollout:
         """The rollout of a policy under the closure held constant, kept as long as both are the same."""
         for planned in self._planned:
-            if planned.serves(self.closure, policy):
+            if planned.rollout.plant is self.plant and planned.serves(self.closure, policy):
                 return planned.rollout
         modules = nn.ModuleList([self.closure, policy])
         new = _Planned(modules, self._rollout(constant(self.closure), policy))
