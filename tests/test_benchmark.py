@@ -45,6 +45,7 @@ def test_every_engine_is_timed_and_compared(tmp_path):
     assert "parallel" in (tmp_path / "benchmark.txt").read_text()
 
 
+@pytest.mark.slow
 def test_jax_takes_part(tmp_path):
     pytest.importorskip("jax", reason="the plants in JAX need the extra bench")
     found = compared(tmp_path, *SMALL, "jax_scan", "jax_sweep", "--engines", "parallel")

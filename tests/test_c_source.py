@@ -2,19 +2,15 @@
 
 import ctypes
 import math
-import shutil
-import subprocess
 
 import pytest
 import torch
+from c_build import library, needs_compiler
 
-from rt_torchrl.export.c_compiler import COMPILERS
 from rt_torchrl.programs.c_source import CSource
 from rt_torchrl.programs.operators import new_tracer
 
-COMPILER = next(filter(None, map(shutil.which, COMPILERS)), None)
-pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror", "-shared", "-fPIC", "-lm")
+pytestmark = needs_compiler
 EDGES = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-310, 0.5, 1.5, 2.5, -0.5, -1.5, 1e300, -3.0, 7.0, 49.0, 50.0]
 
 
@@ -23,10 +19,10 @@ def compiled(function, x, folder, weight=None):
     tracer, given = new_tracer(), x.clone()
     tracer.input(given, "x")
     if weight is not None:
-        tracer.weight(weight, 0)
+        tracer.weight(weight)
     with torch.no_grad(), tracer:
         out = function(given)
-    values = tracer.cells(out).flatten().tolist()
+    values = tracer.outputs(out)
     source = CSource([] if weight is None else [("weight", weight.flatten().tolist())])
     inputs = {("x", k): f"x[{k}]" for k in range(x.numel())}
     source.add(
@@ -34,13 +30,12 @@ def compiled(function, x, folder, weight=None):
     )
     file = folder / "f.c"
     file.write_text(f"#include <math.h>\nvoid f(const double *x, double *y);\n{source.text()}")
-    subprocess.run([COMPILER, file, *STRICT, "-o", folder / "f.so"], check=True)
-    library = ctypes.CDLL(str(folder / "f.so"))
+    f = library(file).f
 
     def run(x):
         size = max(len(values), x.numel())
         array = (ctypes.c_double * size)(*x.flatten().tolist())
-        library.f(array, array)
+        f(array, array)
         return torch.tensor(list(array)[: len(values)], dtype=torch.float64).view(out.shape)
 
     return run

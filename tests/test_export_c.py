@@ -1,13 +1,11 @@
 """The C file: against the policy in torch, in closed form, and in a C program that includes it."""
 
-import ctypes
 import math
 import re
-import shutil
-import subprocess
 
 import pytest
 import torch
+from c_build import c_array, generator, library, needs_compiler, printed
 from linear_quadratic import LinearGain, LinearQuadratic
 from torch import nn
 
@@ -17,15 +15,8 @@ from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.programs.c_source import CSource, literal
 
-COMPILER = next(filter(None, map(shutil.which, c_compiler.COMPILERS)), None)
-needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
-STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 # The same operations in double precision; sums in another order and another libm: a few ulp per operation.
 ROUNDING = 1e-12
-
-
-def generator():
-    return torch.Generator().manual_seed(0)
 
 
 def plant_of(n_observations, actions):
@@ -38,16 +29,9 @@ def unbounded(n):
     return [Signal(symbol="a", name=f"action_{k}", unit="N") for k in range(n)]
 
 
-def build(path, function):
-    """A library of the C file, compiled with all warnings as errors and called without this library's loader."""
-    library = path.with_suffix(".so")
-    subprocess.run([COMPILER, "-std=c99", *STRICT, "-shared", "-fPIC", path, "-o", library, "-lm"], check=True)
-    return getattr(ctypes.CDLL(str(library)), function)
-
-
 def called(function, observation, n_actions):
-    action = (ctypes.c_double * n_actions)()
-    function((ctypes.c_double * len(observation))(*observation), action)
+    action = c_array([0.0] * n_actions)
+    function(c_array(observation), action)
     return torch.tensor(action, dtype=torch.float64)
 
 
@@ -68,7 +52,7 @@ def test_policies_of_the_plants(plant, policy, tmp_path):
         for weight in policy.parameters():  # biases too, as a training leaves them
             weight.add_(0.5 * torch.randn(weight.shape, generator=generator(), dtype=torch.float64))
     assert export_c(policy, tmp_path / "policy.c", plant, function="act") < ROUNDING
-    function = build(tmp_path / "policy.c", "act")
+    function = library(tmp_path / "policy.c").act
     low, high = bounds(plant.actions)
     for observation in 2.0 * torch.randn(50, len(plant.observations), generator=generator(), dtype=torch.float64):
         error = (called(function, observation.tolist(), len(plant.actions)) - policy(observation)).abs() / (high - low)
@@ -83,7 +67,7 @@ def test_an_affine_law_is_its_closed_form(tmp_path):
         policy.linear.weight.copy_(torch.tensor([[1.0, -2.0], [0.5, 3.0]]))
         policy.linear.bias.copy_(torch.tensor([0.25, -1.0]))
     export_c(policy, tmp_path / "policy.c", plant)
-    function = build(tmp_path / "policy.c", "wind_turbine_policy")
+    function = library(tmp_path / "policy.c").wind_turbine_policy
     torque, pitch = called(function, [0.3, 0.1], 2).tolist()
     assert torque == pytest.approx(0.5 * (math.tanh(0.3 - 0.2 + 0.25) + 1.0) * 43_093.55, rel=ROUNDING)
     assert pitch == pytest.approx(0.5 * (math.tanh(0.15 + 0.3 - 1.0) + 1.0) * 30.0, rel=ROUNDING)
@@ -108,10 +92,8 @@ def test_a_program_in_c_that_includes_the_header(tmp_path):
         f"int main(void) {{ const double e[FLY_OBSERVATIONS] = {{{observation}}}; double a[FLY_ACTIONS]; fly(e, a);\n"
         '    printf("%.9g, %.9g", a[0], a[1]); return 0; }\n'
     )
-    sources = [tmp_path / "main.c", tmp_path / "wing.c"]
-    subprocess.run([COMPILER, "-std=c99", *STRICT, *sources, "-o", tmp_path / "main", "-lm"], check=True)
-    printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True).stdout
-    assert [float(x) for x in printed.split(",")] == pytest.approx([float(x) for x in action.split(",")], rel=1e-8)
+    found = printed(tmp_path, "main.c", "wing.c")
+    assert [float(x) for x in found.split(",")] == pytest.approx([float(x) for x in action.split(",")], rel=1e-8)
 
 
 class Formula(nn.Module):
@@ -174,7 +156,7 @@ def test_formulas(tmp_path):
     policy = Formula(lambda e, W, b: torch.cat(list(every(e, W, b).values()), -1))
     plant = plant_of(4, named(every(torch.zeros(1, 4, dtype=torch.float64), policy.W, policy.b)))
     assert export_c(policy, tmp_path / "formulas.c", plant) < ROUNDING
-    build(tmp_path / "formulas.c", "linear_quadratic_policy")
+    assert library(tmp_path / "formulas.c").linear_quadratic_policy
 
 
 ACTIVATIONS = [
@@ -206,7 +188,7 @@ def test_activations_and_normalisations(tmp_path):
     policy = Layers().eval()
     plant = plant_of(2, named(policy.every(torch.zeros(1, 2, dtype=torch.float64))))
     assert export_c(policy, tmp_path / "layers.c", plant) < ROUNDING
-    build(tmp_path / "layers.c", "linear_quadratic_policy")
+    assert library(tmp_path / "layers.c").linear_quadratic_policy
 
 
 @needs_compiler
@@ -220,7 +202,7 @@ def test_a_users_own_perceptron_with_normalised_inputs(tmp_path):
     plant = LinearQuadratic()
     policy = nn.Sequential(normalisation, *layers, SmoothClip(plant.actions))
     assert export_c(policy, tmp_path / "own.c", plant) < ROUNDING
-    function = build(tmp_path / "own.c", "linear_quadratic_policy")
+    function = library(tmp_path / "own.c").linear_quadratic_policy
     e = torch.tensor([[0.7, -0.8]], dtype=torch.float64)
     hidden = (e - mean) / (variance + 1e-5).sqrt() @ layers[0].weight.T + layers[0].bias
     expected = 2.0 * torch.tanh((hidden * hidden.sigmoid()) @ layers[2].weight.T)
@@ -232,7 +214,7 @@ def test_a_broken_sensor_is_not_hidden(tmp_path):
     activations = nn.ReLU(), nn.Hardtanh(), nn.Softplus(), nn.ReLU6(), nn.LeakyReLU(), nn.ELU()
     policy = Formula(lambda e, W, b: torch.cat([module(e) for module in activations] + [torch.maximum(e, b[:2])], -1))
     export_c(policy, tmp_path / "policy.c", plant_of(2, unbounded(14)), function="act")
-    found = called(build(tmp_path / "policy.c", "act"), [math.nan, 0.5], 14)
+    found = called(library(tmp_path / "policy.c").act, [math.nan, 0.5], 14)
     assert found[::2].isnan().all()
     expected = policy(torch.tensor([[0.5, 0.5]], dtype=torch.float64))[0, 1::2]
     torch.testing.assert_close(found[1::2], expected.detach(), rtol=ROUNDING, atol=0)
@@ -252,6 +234,7 @@ REFUSED = {
     ),
     "single precision": (lambda e, W, b: e.float().double()[..., :1], "a conversion to torch.float32"),
     "a branch": (lambda e, W, b: e[..., :1] if e.sum() > 0 else -e[..., :1], "a branch of Python is taken"),
+    "a number by NumPy": (lambda e, W, b: e[..., :1] * float(e.numpy()[0, 0]), r"\.numpy\(\) takes a number"),
     "random numbers": (lambda e, W, b: e[..., :1] + torch.randn(1, 1, dtype=torch.float64), "draws random numbers"),
 }
 

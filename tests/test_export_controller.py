@@ -3,31 +3,22 @@
 import ctypes
 import math
 import re
-import shutil
-import subprocess
 
 import pytest
 import torch
+from c_build import c_array, generator, library, needs_compiler, printed
 from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.linalg import expm
 
 from rt_torchrl import export_controller, shipped_plants
 from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.export import c_compiler
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.rollout import Rollout
 
-COMPILER = next(filter(None, map(shutil.which, c_compiler.COMPILERS)), None)
-needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
-STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 CLOSE = 1e-9
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def state_type(n_actions, n_memory, n_last):
@@ -40,17 +31,15 @@ class InC:
     """A controller in C, compiled and called without this library's loader."""
 
     def __init__(self, path, n_actions, n_memory, n_signals):
-        library = path.with_suffix(".so")
-        subprocess.run([COMPILER, "-std=c99", *STRICT, "-shared", "-fPIC", path, "-o", library, "-lm"], check=True)
-        loaded = ctypes.CDLL(str(library))
+        loaded = library(path)
         self.init, self.advance = (getattr(loaded, f"{path.stem}_{part}") for part in ("init", "step"))
         self.state, self.action = state_type(n_actions, n_memory, n_signals)(), (ctypes.c_double * n_actions)()
 
     def start(self, *signals):
-        self.init(ctypes.byref(self.state), (ctypes.c_double * len(signals))(*signals))
+        self.init(ctypes.byref(self.state), c_array(signals))
 
     def step(self, *signals):
-        self.advance(ctypes.byref(self.state), (ctypes.c_double * len(signals))(*signals), self.action)
+        self.advance(ctypes.byref(self.state), c_array(signals), self.action)
         return list(self.action)
 
 
@@ -265,10 +254,8 @@ def test_a_program_in_c_that_includes_the_header(tmp_path, monkeypatch):
         f'#include "turbine.h"\n#include <stdio.h>\nint main(void) {{ {declared} {arrays} {read} {init}\n'
         f'    for (int k = 0; k < 3; ++k) {{ {step} }} printf("%.17g %.17g", action[0], action[1]); return 0; }}\n'
     )
-    sources = [tmp_path / "main.c", tmp_path / "turbine.c"]
-    subprocess.run([COMPILER, "-std=c99", *STRICT, *sources, "-o", tmp_path / "main", "-lm"], check=True)
-    printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True).stdout
+    in_a_program = printed(tmp_path, "main.c", "turbine.c")
     in_c = InC(tmp_path / "turbine.c", 2, 5, 2)
     in_c.start(1.2, 11.0)
     found = [in_c.step(1.2, 11.0) for _ in range(3)]
-    assert [float(x) for x in printed.split()] == found[-1]
+    assert [float(x) for x in in_a_program.split()] == found[-1]

@@ -1,11 +1,10 @@
 """The twin in C: one interval of every plant against torch and against closed forms."""
 
 import ctypes
-import shutil
-import subprocess
 
 import pytest
 import torch
+from c_build import c_array, generator, library, needs_compiler
 from linear_quadratic import LinearClosure, LinearQuadratic
 from scipy.linalg import expm
 from torch import nn
@@ -14,25 +13,16 @@ from rt_torchrl import export_twin, shipped_plants
 from rt_torchrl.export import c_compiler
 from rt_torchrl.programs.c_source import CSource
 
-COMPILER = next(filter(None, map(shutil.which, c_compiler.COMPILERS)), None)
-needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
-STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 CLOSE = 1e-9
 
 
-def generator():
-    return torch.Generator().manual_seed(0)
-
-
 def build(path):
-    """The function of the C file, compiled with all warnings as errors and called without this library's loader."""
-    library = path.with_suffix(".so")
-    subprocess.run([COMPILER, "-std=c99", *STRICT, "-shared", "-fPIC", path, "-o", library, "-lm"], check=True)
-    step = getattr(ctypes.CDLL(str(library)), f"{path.stem}_step")
+    """The function of the C file."""
+    step = getattr(library(path), f"{path.stem}_step")
 
     def run(t, *arrays):
         """The next state, written where the state was read."""
-        arrays = [(ctypes.c_double * max(1, len(x)))(*x) for x in arrays]
+        arrays = [c_array(x) for x in arrays]
         step(ctypes.c_double(t), *arrays, arrays[0])
         return torch.tensor(list(arrays[0]), dtype=torch.float64)
 

@@ -206,7 +206,7 @@ def test_objects_known_by_address_are_kept_alive():
     module, seen, kept = Inner(), set(), []
     for _ in range(50):  # the address of a lock that is freed would be taken by the next one
         module.odd = threading.Lock()
-        found, alive = fingerprint(module)
+        found, alive, _ = fingerprint(module)
         kept.append(alive)
         assert found not in seen
         seen.add(found)

@@ -21,7 +21,7 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.autograd import Autograd
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.native import LEAST_MEMORY, Native
-from rt_torchrl.trajectories.engines.traced_interval import weights_of
+from rt_torchrl.trajectories.engines.weights import Weights
 
 PLANTS = {
     "linear_quadratic": LinearQuadratic,
@@ -292,4 +292,4 @@ def test_states_that_leave_the_numbers_are_kept():
 
 
 def test_weights_are_one_row():
-    assert weights_of(nn.Linear(2, 1).double()).shape == (3,)
+    assert Weights(nn.Linear(2, 1).double()).row().shape == (3,)

@@ -17,6 +17,7 @@ from rt_torchrl.trajectories.engines import native
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.engines.programs import Programs
 from rt_torchrl.trajectories.engines.traced_interval import Point
+from rt_torchrl.trajectories.engines.weights import Weights
 
 LANES = [Lanes(8, "e"), Lanes(4, "d"), Lanes(2, "b"), Lanes(2, "")]
 SPECIAL = torch.tensor(
@@ -82,8 +83,8 @@ def assert_same(f, lanes=None):
     )
     programs = Programs(snippet, usual, lanes)
     with torch.no_grad():
-        task = native._Task(programs, snippet, native.MEMORY)
-        found = native._EndStates.apply(task, state, *drive, *task.learned)[0, :, 0]
+        task = native._Task(programs, Weights(snippet), state, drive, native.MEMORY)
+        found = native._EndStates.apply(task, state, *drive, *task.weights.learned)[0, :, 0]
         exact = marched(snippet, state, *drive)[0, :, 0]
     torch.testing.assert_close(found, exact, rtol=1e-12, atol=1e-300, equal_nan=True)
 

@@ -23,7 +23,7 @@ def text(number):
 
 def put_by(code):
     found = np.zeros(1)
-    code.call(found.ctypes.data)
+    code(found)
     return found[0]
 
 
@@ -69,7 +69,7 @@ object_code.cache_folder = lambda: Path(sys.argv[1])
 if sys.argv[2] == "reads":
     object_code._compile = None
 code, found = object_code.ObjectCode(sys.argv[3], "put", (ctypes.c_void_p,)), np.zeros(1)
-code.call(found.ctypes.data)
+code(found)
 print(found[0])
 """
 

@@ -72,6 +72,7 @@ def test_wheel_has_the_version_that_the_package_states(wheel):
     assert f"\nVersion: {rt_torchrl.__version__}\n" in metadata and "\nClassifier: Typing :: Typed\n" in metadata
 
 
+@pytest.mark.slow
 def test_wheel_works_without_the_checkout(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
     # The extracted wheel stands before a checkout that may be installed.

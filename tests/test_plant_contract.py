@@ -147,5 +147,6 @@ def checking():
     return fresh_process.run(CHECK)
 
 
+@pytest.mark.slow
 def test_fulfils_the_contract_and_is_one_graph(plant, checking):
     assert f"fulfilled by {plant.name}\n" in checking.stdout, checking.stderr[-3000:]

@@ -27,6 +27,7 @@ def test_its_files_exist():
         assert (ROOT / path).exists(), path
 
 
+@pytest.mark.slow
 def test_the_tutorial_runs_as_it_is_printed(tmp_path):
     """In a process of its own, as a user runs it: the check of the plant traces, which this process could not."""
     code = "\n".join(re.findall(r"```python\n(.*?)```", TUTORIAL, re.DOTALL))

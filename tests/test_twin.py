@@ -2,6 +2,7 @@
 
 import copy
 
+import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
@@ -57,3 +58,55 @@ def test_a_twin_is_planned_on_with_the_weights_it_has_now():
         for weight in twin.closure.parameters():
             weight.add_(0.1)
     assert twin.cost(policy, *episodes) != before
+
+
+class Scaled(LinearClosure):
+    """A closure with a number that is no weight."""
+
+    scale = 1.0
+
+    def forward(self, features):
+        return self.scale * super().forward(features)
+
+
+CHANGES = {
+    "an attribute": lambda closure: setattr(closure, "scale", 2.0),
+    "another weight": lambda closure: setattr(closure, "matrix", nn.Parameter(2.0 * closure.matrix.detach())),
+    "a frozen weight": lambda closure: closure.requires_grad_(False),
+    "a hook": lambda closure: closure.register_forward_hook(lambda module, features, found: 2.0 * found),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_twin_is_planned_on_with_the_closure_it_has_now(change):
+    twin, policy, episodes = twin_and_policy()
+    twin.closure = Scaled(twin.closure.matrix.detach())
+    before = twin.cost(policy, *episodes)
+    CHANGES[change](twin.closure)
+    found = twin.cost(policy, *episodes)
+    fresh = DigitalTwin(twin.plant, copy.deepcopy(twin.closure)).cost(policy, *episodes)
+    assert torch.equal(found, fresh) and (change == "a frozen weight" or not torch.equal(found, before))
+
+
+def test_a_twin_is_planned_on_with_the_plant_it_has_now():
+    twin, policy, episodes = twin_and_policy()
+    before = twin.cost(policy, *episodes)
+    twin.plant = LinearQuadratic(dt=0.5 * twin.plant.dt)
+    found = twin.cost(policy, *episodes)
+    assert torch.equal(found, DigitalTwin(twin.plant, twin.closure).cost(policy, *episodes)) and found != before
+
+
+def test_a_policy_in_single_precision_is_refused_also_later():
+    twin, policy, episodes = twin_and_policy()
+    twin.cost(policy, *episodes)
+    with pytest.raises(ValueError, match="torch.float32"):
+        twin.cost(policy.float(), *episodes)
+
+
+def test_each_policy_has_its_own_cost():
+    twin, policy, episodes = twin_and_policy()
+    other = copy.deepcopy(policy)
+    with torch.no_grad():
+        next(other.parameters()).add_(0.3)
+    costs = [twin.cost(each, *episodes) for each in (policy, other, policy)]
+    assert torch.equal(costs[0], costs[2]) and not torch.equal(costs[0], costs[1])

@@ -7,6 +7,7 @@ from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines import native
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.engines.programs import Programs, point_of
+from rt_torchrl.trajectories.engines.weights import Weights
 
 
 class Snippet(nn.Module):
@@ -52,12 +53,12 @@ def marched(interval, state, t, exogenous, command):
 def compared(interval, initial_state, drive, *, lanes=None, seed=5):
     """States and gradients by all leaves: of machine code and of eager torch."""
     programs = traced(interval, initial_state, drive, lanes)
-    task = native._Task(programs, interval, native.MEMORY)
     leaves = [x.clone().requires_grad_() for x in (initial_state, *drive)]
-    found = native._EndStates.apply(task, *leaves, *task.learned)
+    task = native._Task(programs, Weights(interval), leaves[0], Drive(*leaves[1:]), native.MEMORY)
+    found = native._EndStates.apply(task, *leaves, *task.weights.learned)
     exact = marched(interval, *leaves)
     costate = torch.randn(exact.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    given = [*leaves, *task.learned]
+    given = [*leaves, *task.weights.learned]
     by_found = torch.autograd.grad(found, given, costate, allow_unused=True)
     by_exact = torch.autograd.grad(exact, given, costate, allow_unused=True) if exact.requires_grad else by_found
     zero = [torch.zeros_like(x) for x in given]

@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.programs.escapes import Escapes
 from rt_torchrl.programs.operators import new_tracer
 from rt_torchrl.programs.program import Program, UntraceableError
 from rt_torchrl.programs.tracer import Tracer
@@ -64,19 +65,18 @@ def traced(
     Raises:
         UntraceableError: if the function cannot become a program; the message names the reason and the line.
     """
-    tracer, first, entered = new_tracer(), 0, list[str]()
+    tracer, entered = new_tracer(), list[str]()
     given = {name: value.clone() for name, value in arguments.items()}
     try:
         for name, value in given.items():
             tracer.input(value, name)
         for weight in (weight for module in modules for weight in module.parameters()):
-            tracer.weight(weight, first)
-            first += weight.numel()
+            tracer.weight(weight)
         if prepare is not None:
             prepare(tracer)
-        with torch.no_grad(), tracer, _noted(modules, entered):
+        with torch.no_grad(), Escapes(tracer), tracer, _noted(modules, entered):
             found = function(**given)
-        outputs = {name: tracer.cells(value).flatten().tolist() for name, value in found.items()}
+        outputs = {name: tracer.outputs(value) for name, value in found.items()}
     except UntraceableError as error:
         layer = f"layer {entered[-1]} of " if entered else ""
         raise UntraceableError(f"{layer}{what} cannot be written in C: {error}. {REMEDY}") from error

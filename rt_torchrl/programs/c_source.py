@@ -44,10 +44,10 @@ class CSource:
             head: its declaration without the semicolon.
             program: the program.
             inputs: C expression of each input, by name and position.
-            outputs: places that are written, in C, with the values that they receive.
+            outputs: places that are written, in C, with the numbers that they receive.
             last: statements at its end.
         """
-        values = [program.as_number(value) for _, value in outputs]
+        values = [value for _, value in outputs]
         needed = [program.operations[i].attributes for i in program.needed(values) if _is_input(program, i)]
         writer = CWriter(self._tables)
         names = {key: f"{key[0]}_{key[1]}" for key in needed}

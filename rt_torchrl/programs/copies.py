@@ -96,19 +96,6 @@ def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
     return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
 
 
-def _slice_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    gradient, sizes, dim, start, end, step = args
-    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
-    index = torch.arange(sizes[dim])[slice(start, min(end, sizes[dim]), step)]
-    return zeros.index_copy(dim, index, tracer.cells(gradient))
-
-
-def _select_backward(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    gradient, sizes, dim, index = args
-    zeros = torch.full(tuple(sizes), tracer.program.constant(0.0))
-    return zeros.index_copy(dim, torch.tensor([index % sizes[dim]]), tracer.cells(gradient).unsqueeze(dim))
-
-
 PLAIN = (
     "cat stack flip roll repeat expand_copy diag_embed slice_scatter select_scatter unfold_copy view_copy permute_copy "
     "_unsafe_view alias_copy"
@@ -122,6 +109,4 @@ COPIES: dict[str, Rule] = {
     "scatter_add": _scatter_add,
     **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),
     "constant_pad_nd": _pad,
-    "slice_backward": _slice_backward,
-    "select_backward": _select_backward,
 }

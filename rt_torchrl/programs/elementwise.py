@@ -5,6 +5,7 @@ from collections.abc import Callable
 from rt_torchrl.programs.program import COMPARISONS, UNARY, Program
 
 Scalar = Callable[..., int]
+LOGIC = ("and", "or", "xor", "not")
 
 
 def _sigmoid(p: Program, a: int) -> int:
@@ -34,35 +35,24 @@ def _number_of(how: str) -> Scalar:
     return lambda p, a, b: p.select(p.logic("or", p.compare(how, a, b), p.compare("une", b, b)), a, b)
 
 
-def _unary(name: str) -> Scalar:
-    return lambda p, a: p.unary(name, a)
-
-
-def _binary(name: str) -> Scalar:
-    return lambda p, a, b: p.binary(name, a, b)
-
-
-def _comparison(how: str) -> Scalar:
-    return lambda p, a, b: p.compare(how, a, b)
-
-
-def _logic(how: str) -> Scalar:
-    return lambda p, *a: p.logic(how, *a)
+def _named(operation: Scalar, name: str) -> Scalar:
+    """One of the operations of a program that have a common method."""
+    return lambda p, *operands: operation(p, name, *operands)
 
 
 ELEMENTWISE: dict[str, Scalar] = {
-    **{name: _unary(name) for name in UNARY},
-    **{name: _comparison(how) for name, how in COMPARISONS.items()},
-    **{f"{family}_{how}": _logic(how) for family in ("logical", "bitwise") for how in ("and", "or", "xor", "not")},
+    **{name: _named(Program.unary, name) for name in UNARY},
+    **{name: _named(Program.compare, how) for name, how in COMPARISONS.items()},
+    **{f"logical_{how}": _named(Program.logic, how) for how in LOGIC},
+    **{f"bitwise_{how}": _named(Program.logic, how) for how in LOGIC},
     "add": Program.add,
     "sub": Program.sub,
     "mul": Program.mul,
     "div": Program.div,
     "pow": Program.pow,
     "where": Program.select,
-    "minimum": lambda p, a, b: p.extreme("minimum", a, b),
-    "maximum": lambda p, a, b: p.extreme("maximum", a, b),
-    **{name: _binary(name) for name in ("atan2", "hypot", "fmod")},
+    **{name: _named(Program.extreme, name) for name in ("minimum", "maximum")},
+    **{name: _named(Program.binary, name) for name in ("atan2", "hypot", "fmod")},
     "fmin": _number_of("olt"),
     "fmax": _number_of("ogt"),
     "reciprocal": lambda p, a: p.div(p.constant(1.0), a),

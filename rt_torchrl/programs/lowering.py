@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
-from rt_torchrl.programs.program import UNIFORM, Access, Program
+from rt_torchrl.programs.elementwise import ELEMENTWISE
+from rt_torchrl.programs.program import UNIFORM, VARYING, Access, Program
 
 BLOCKS = (8, 6, 5, 4, 3, 2, 1)
 """Numbers of columns of a product of matrices that are summed at once, so that a row is read once for all of them."""
@@ -127,24 +128,14 @@ class Lowering:
 
         self._loops(dims, inner)
 
-    def _elementwise(self, name: str, x: Sequence[str]) -> str:
-        """An elementwise operator on operands within a loop."""
-
-        def compute(name: str, *operands: str) -> str:
-            return self.writer.compute(name, operands, "", truth=False, lanes=True)
-
-        one = self.writer.constant(1.0, truth=False, lanes=True)
-        if name == "square":
-            return compute("mul", x[0], x[0])
-        if name == "reciprocal":
-            return compute("div", one, x[0])
-        if name == "sigmoid":
-            return compute("div", one, compute("add", one, compute("exp", compute("neg", x[0]))))
-        if name == "tanh_backward":
-            return compute("mul", x[0], compute("sub", one, compute("mul", x[1], x[1])))
-        if name == "sigmoid_backward":
-            return compute("mul", x[0], compute("mul", x[1], compute("sub", one, x[1])))
-        return compute(name, *x)
+    def _elementwise(self, name: str, operands: Sequence[str]) -> str:
+        """An elementwise operator on operands within a loop: a program of its own."""
+        body = Program()
+        inputs = [body.new("input", attributes=("x", k), level=VARYING) for k in range(len(operands))]
+        found = ELEMENTWISE[name](body, *inputs)
+        lowering = Lowering(body, self.writer, {("x", k): operand for k, operand in enumerate(operands)}, "")
+        lowering.write([found])
+        return lowering.operand(found)
 
     def _product(
         self, array: str, operands: Sequence[int], m: int, k: int, n: int, accesses: Sequence[Access | None]

@@ -8,8 +8,16 @@ from rt_torchrl.programs.lowering import Lowering
 from rt_torchrl.programs.program import Program
 from rt_torchrl.programs.vector_functions import FUNCTIONS, INTRINSICS, Lanes, symbol
 
-ARITHMETIC = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv contract"}
-"""Products and sums may be contracted into one rounding; nothing else of floating-point arithmetic is relaxed."""
+INSTRUCTIONS = {
+    **{name: f"f{name} contract {{number}} {{0}}, {{1}}" for name in ("add", "sub", "mul", "div")},
+    **{name: f"{name} {{truth}} {{0}}, {{1}}" for name in ("and", "or", "xor")},
+    "neg": "fneg {number} {0}",
+    "not": "xor {truth} {0}, {true}",
+    "compare": "fcmp {how} {number} {0}, {1}",
+    "select": "select {truth} {0}, {number} {1}, {number} {2}",
+}
+"""Operations that are instructions, of numbers and of truth values. Products and sums may be contracted into one
+rounding; nothing else of floating-point arithmetic is relaxed."""
 WIDTH = "align 8"  # torch aligns rows to doubles
 STACK = 2**17
 """Bytes of arrays that lie on the stack, which is 512 KiB in the threads of some systems; others are allocated."""
@@ -57,23 +65,12 @@ class LaneWriter:
         return "<" + ", ".join([f"{scalar} {text}"] * self.lanes.number) + ">" if lanes else text
 
     def compute(self, name: str, operands: Sequence[str], how: str, *, truth: bool, lanes: bool) -> str:
-        number, mask = (self.vector, self.mask) if lanes else ("double", "i1")
-        if name in ARITHMETIC:
-            return self.emit(f"{ARITHMETIC[name]} {number} {', '.join(operands)}", once=not lanes)
-        if name == "neg":
-            return self.emit(f"fneg {number} {operands[0]}", once=not lanes)
-        if name == "compare":
-            return self.emit(f"fcmp {how} {number} {', '.join(operands)}", once=not lanes)
-        if name == "select":
-            condition, a, b = operands
-            return self.emit(f"select {mask} {condition}, {number} {a}, {number} {b}", once=not lanes)
-        if name in ("and", "or", "xor"):
-            return self.emit(f"{name} {mask} {', '.join(operands)}", once=not lanes)
-        if name == "not":
-            every = self.constant(1.0, truth=True, lanes=lanes)
-            return self.emit(f"xor {mask} {operands[0]}, {every}", once=not lanes)
-        arguments = ", ".join(f"{number} {a}" for a in operands)
-        return self.emit(f"call {number} @{self._function(name, lanes)}({arguments})", once=not lanes)
+        types = {"number": self.vector, "truth": self.mask} if lanes else {"number": "double", "truth": "i1"}
+        if name in INSTRUCTIONS:
+            true = self.constant(1.0, truth=True, lanes=lanes)
+            return self.emit(INSTRUCTIONS[name].format(*operands, how=how, true=true, **types), once=not lanes)
+        arguments = ", ".join(f"{types['number']} {a}" for a in operands)
+        return self.emit(f"call {types['number']} @{self._function(name, lanes)}({arguments})", once=not lanes)
 
     def _function(self, name: str, lanes: bool) -> str:
         """The name of a mathematical function, which is declared; where there is none for lanes, one is defined."""

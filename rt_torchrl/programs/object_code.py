@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import llvmlite.binding as llvm
+import numpy as np
 from platformdirs import user_cache_path
 
 from rt_torchrl.atomic_file import write_atomically
@@ -31,7 +32,11 @@ class ObjectCode:
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         self._engine.add_object_file(code)
         self._engine.finalize_object()
-        self.call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(name))
+        self._function = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(name))
+
+    def __call__(self, *arguments: np.ndarray | int) -> None:
+        """Run the function; of an array it gets the address."""
+        self._function(*(x if isinstance(x, int) else x.ctypes.data for x in arguments))
 
 
 def _compiled(text: str) -> bytes:

@@ -44,25 +44,6 @@ def _clamp(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
     return cells
 
 
-def _clamp_max(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return _clamp(tracer, (args[0], None, args[1]), options, out)
-
-
-def _masked_fill(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    source, mask, value = (tracer.cells(a) for a in args)
-    return tracer.pointwise("where", [mask, value, source], out.shape)
-
-
-def _degrees_to_radians(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return tracer.pointwise("mul", [tracer.cells(args[0]), tracer.cells(math.pi / 180.0)], out.shape)
-
-
-def _reversed_sub(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    factor = tracer.cells((*args[2:], options.get("alpha", 1))[0])
-    scaled = tracer.pointwise("mul", [tracer.cells(args[0]), factor], args[0].shape)
-    return tracer.pointwise("sub", [tracer.cells(args[1]), scaled], out.shape)
-
-
 # Sums, products and folds
 
 
@@ -80,16 +61,6 @@ def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
 def _mean(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     count = tracer.cells(float(args[0].numel() // max(1, out.numel())))
     return tracer.pointwise("div", [_sum(tracer, args, options, out), count], out.shape)
-
-
-def _variance(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    p, correction = tracer.program, (*args[2:], options.get("correction", 1))[0]
-    found = []
-    for row in _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist():
-        mean = p.div(_folded(p.add, row[1:], row[0]), p.constant(float(len(row))))
-        squares = [p.mul(d, d) for d in (p.sub(x, mean) for x in row)]
-        found.append(p.div(_folded(p.add, squares[1:], squares[0]), p.constant(max(0.0, len(row) - correction))))
-    return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
 def _fold(step: Callable[[Program, int, int], int]) -> Rule:
@@ -180,11 +151,6 @@ def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
     return matrix_product(tracer, a, b, start)
 
 
-def _bmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    pairs = zip(tracer.cells(args[0]), tracer.cells(args[1]), strict=True)
-    return torch.stack([matrix_product(tracer, a, b) for a, b in pairs])
-
-
 # Tables
 
 
@@ -229,22 +195,10 @@ def _bucketize(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
-def _searchsorted(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    right = options.get("right", False) or options.get("side") == "right"
-    if args[0].ndim != 1:
-        raise tracer.refuse("searchsorted in more than one row of knots")
-    return _bucketize(tracer, (args[1], args[0]), {"right": right}, out)
-
-
 RULES: dict[str, Rule] = {
     **COPIES,
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
-    "var": _variance,
     "_to_copy": _convert,
-    "clamp_max": _clamp_max,
-    "masked_fill": _masked_fill,
-    "deg2rad": _degrees_to_radians,
-    "rsub": _reversed_sub,
     "sum": _sum,
     "mean": _mean,
     "amax": _fold(lambda p, a, b: p.extreme("maximum", a, b)),
@@ -256,10 +210,8 @@ RULES: dict[str, Rule] = {
     "cumprod": _cumulate(Program.mul),
     "mm": _mm,
     "addmm": _addmm,
-    "bmm": _bmm,
     "index": _index,
     "bucketize": _bucketize,
-    "searchsorted": _searchsorted,
 }
 
 

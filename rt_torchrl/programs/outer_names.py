@@ -3,12 +3,13 @@
 import inspect
 import types
 from collections.abc import Callable, Iterator
-from operator import is_
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from torch import Tensor
+
+from rt_torchrl.programs.watch import same
 
 DATA = (bool, int, float, complex, str, Tensor, np.ndarray, np.generic)
 FOREIGN = frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype builtins typing abc math".split())
@@ -23,33 +24,37 @@ class ReadByClass:
     ``version`` counts the changes. The attributes are kept, so that none of a new one has the address of an old one.
     """
 
-    def __init__(self, kind: type):
-        self.version = -1
-        self._refresh(kind)
+    def __init__(self) -> None:
+        self.version, self.names = -1, list[Name]()
+        self._attributes: list[object] = []
+        self._values: list[object] = []
 
-    def _refresh(self, kind: type) -> None:
-        self._attributes = tuple(vars(kind).values())
-        self.version += 1
-        self.names = _unique(name for f in self._attributes for name in read_by(_function(f)))
+    def refresh(self, kind: type) -> None:
+        """Bring it up to date; a global that is another function now reads other names."""
+        attributes = list(vars(kind).values())
+        changed = not same(attributes, self._attributes)
+        if changed or not same(self._present(), self._values):
+            self.version += changed
+            self.names = _unique(name for f in attributes for name in read_by(_function(f)))
+            self._attributes, self._values = attributes, self._present()
 
-    def now(self, kind: type) -> "ReadByClass":
-        """The same, up to date."""
-        attributes = vars(kind).values()
-        if len(attributes) != len(self._attributes) or not all(map(is_, attributes, self._attributes)):
-            self._refresh(kind)
-        return self
+    def _present(self) -> list[object]:
+        return [held.get(name) for held, name in self.names]
 
 
 _classes: "WeakKeyDictionary[type, ReadByClass]" = WeakKeyDictionary()
 
 
-def read_by_class(kind: type) -> Iterator[ReadByClass]:
-    """What a class and the classes that it extends read, without those of foreign packages."""
-    for each in kind.__mro__:
-        if each.__module__.partition(".")[0] not in FOREIGN:
-            if each not in _classes:
-                _classes[each] = ReadByClass(each)
-            yield _classes[each].now(each)
+def own_classes(kind: type) -> Iterator[type]:
+    """A class and those that it extends, without those of foreign packages."""
+    return (each for each in kind.__mro__ if not _foreign(each.__module__))
+
+
+def read_by_class(kind: type) -> ReadByClass:
+    """What the methods that a class itself defines read now."""
+    found = _classes.setdefault(kind, ReadByClass())
+    found.refresh(kind)
+    return found
 
 
 def read_by(function: Callable[..., Any] | None) -> list[Name]:

@@ -1,8 +1,8 @@
 """Tracing: one execution of torch code, for one realisation, becomes a program."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache
 from typing import Any
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from rt_torchrl.programs.decompositions import SIMPLER, known_to_torch
 from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
 from rt_torchrl.programs.places import Places
 from rt_torchrl.programs.program import CONSTANT, UNIFORM, VARYING, Access, Program, UntraceableError
@@ -33,7 +34,7 @@ class Tracer(TorchDispatchMode):
     therefore need no rules of their own, and copies are carried out on the cells.
 
     Args:
-        rules: operators that neither copy nor act elementwise, by name.
+        rules: operators that do not act elementwise, by name.
     """
 
     supports_higher_order_operators = True  # to refuse them with a message
@@ -44,6 +45,7 @@ class Tracer(TorchDispatchMode):
         self.places = Places()
         self._rules = rules
         self._cells: dict[int, Tensor] = {}
+        self._sizes = Counter[str]()  # of the inputs by their names, and of the weights
         self._alive: list[Tensor] = []  # a storage that is freed could give its address to another one
 
     # Cells
@@ -72,16 +74,23 @@ class Tracer(TorchDispatchMode):
         self._cells[_storage_of(x)] = cell
         self._alive.append(x)
 
-    def input(self, x: Tensor, name: str, first: int = 0) -> None:
-        """Let a tensor be a part of an input that varies over lanes and steps, from its element ``first`` on."""
-        places = range(first, first + x.numel())
+    def input(self, x: Tensor, name: str) -> None:
+        """Let a tensor be the next part of an input, which varies over lanes and steps."""
+        places = range(self._sizes[name], self._sizes[name] + x.numel())
         found = [self.program.new("input", attributes=(name, i), level=VARYING) for i in places]
+        self._sizes[name] = places.stop
         self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
 
-    def weight(self, x: Tensor, offset: int) -> None:
-        """Let a tensor be a part of the weights, which are the same for all lanes and steps."""
-        array = self.program.new("weights", attributes=(offset, x.numel()), kind="array", level=UNIFORM)
+    def weight(self, x: Tensor) -> None:
+        """Let a tensor be the next part of the weights, which are the same for all lanes and steps."""
+        attributes = self._sizes["weights"], x.numel()
+        array = self.program.new("weights", attributes=attributes, kind="array", level=UNIFORM)
+        self._sizes["weights"] += x.numel()
         self.assign(x, self.elements(array, x.numel()).view(x.shape))
+
+    def outputs(self, x: Tensor) -> list[int]:
+        """The values of a tensor as numbers."""
+        return [self.program.as_number(i) for i in self.cells(x).flatten().tolist()]
 
     def elements(self, array: int, count: int) -> Tensor:
         """The elements of an array as cells."""
@@ -111,7 +120,7 @@ class Tracer(TorchDispatchMode):
             name = packet if packet.startswith("_") else packet.rstrip("_")
             if packet in DECISIONS or torch.Tag.nondeterministic_seeded in func.tags:
                 return self._decided(func, packet, args, kwargs)
-            known = name in ELEMENTWISE or name in FILLS or name in self._rules
+            known = name in ELEMENTWISE or name in FILLS or name in self._rules or name in SIMPLER
             if not known and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
                     return func.decompose(*args, **kwargs)
@@ -124,7 +133,11 @@ class Tracer(TorchDispatchMode):
             if not func._schema.is_mutable and self._foldable(args):
                 return self._folded(func, args, kwargs)
             in_place = func._schema.is_mutable and packet.endswith("_")
-            if not known and not in_place and (decomposition := _decomposition(func)):
+            if name in SIMPLER and in_place >= func._schema.is_mutable:
+                with self:
+                    found = self._translated(func, SIMPLER[name], *args, **kwargs)
+                    return args[0].copy_(found) if in_place else found
+            if not known and not in_place and (decomposition := known_to_torch(func)):
                 with self:
                     return decomposition(*args, **kwargs)
             return self._executed(func, name, args, kwargs)
@@ -166,12 +179,8 @@ class Tracer(TorchDispatchMode):
         outs = list(tensors_in([out]))
         if any(o.is_complex() for o in outs):
             raise self.refuse("complex numbers")
-        try:
-            found = self._computed(func, name, args, kwargs, args[0] if func._schema.is_mutable else out)
-        except UntraceableError:
-            raise
-        except Exception as error:
-            raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
+        written = args[0] if func._schema.is_mutable else out
+        found = self._translated(func, self._computed, func, name, args, kwargs, written)
         if func._schema.is_mutable:
             if not func._schema.arguments[0].is_write or len(outs) != 1:
                 raise self.refuse(f"{func} writes into its argument out")
@@ -180,6 +189,15 @@ class Tracer(TorchDispatchMode):
         for o, cells in zip(outs, found if isinstance(found, (tuple, list)) else [found], strict=True):
             self.assign(o, cells)
         return out
+
+    def _translated(self, func: Any, translation: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """What a translation of an operator gives; arguments for which it fails are refused."""
+        try:
+            return translation(*args, **kwargs)
+        except UntraceableError:
+            raise
+        except Exception as error:
+            raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
 
     def _computed(self, func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> Any:
         """The cells of what an operator computes."""
@@ -274,17 +292,3 @@ def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
 
 def _storage_of(x: Tensor) -> int:
     return x.untyped_storage()._cdata
-
-
-@cache
-def _decomposition(func: Any) -> Callable[..., Any] | None:
-    """The way to compute an operator by simpler ones; None if torch knows none."""
-    return _decompositions().get(func)
-
-
-@cache
-def _decompositions() -> dict[Any, Callable[..., Any]]:
-    # These tables take a third of a second to import, and most code needs none of them.
-    from torch._decomp import core_aten_decompositions, decomposition_table
-
-    return {**decomposition_table, **core_aten_decompositions()}

@@ -11,6 +11,7 @@ engine                gradient                                            for
 ====================  ==================================================  ======================================
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Literal, get_args
 
@@ -115,7 +116,7 @@ class Rollout:
         """
         drive = self._drive(initial_state, exogenous, command, start)
         found = self._engine.costs(self.interval, initial_state, drive)
-        if found is not None and found.isfinite().all():
+        if found is not None and all_finite(found):
             return found / exogenous.shape[1]
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
 
@@ -149,7 +150,7 @@ class Rollout:
                     f"{argument} has shape {tuple(value.shape)} and dtype {value.dtype}; plant {plant.name!r} "
                     f"needs shape {shape} (batch, steps, signals) in torch.float64."
                 )
-            if not value.isfinite().all():
+            if not all_finite(value):
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
 
 
@@ -169,6 +170,11 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
 def _listed(names: Iterable[str]) -> str:
     *others, last = names
     return f"{', '.join(others)} or {last}"
+
+
+def all_finite(x: Tensor) -> bool:
+    """Whether all numbers are finite. Their sum tells it in one pass, unless it overflows."""
+    return math.isfinite(x.detach().sum().item()) or bool(x.isfinite().all())
 
 
 def require_finite(
@@ -193,7 +199,7 @@ def require_finite(
     Raises:
         DivergenceError: if a state is not finite; the message names plant, realisation, time and the last finite state.
     """
-    if ends.isfinite().all():
+    if all_finite(ends):
         return
     k, realisation, component = (~ends.isfinite()).nonzero()[0].tolist()
     began = float(start[realisation]) if isinstance(start, Tensor) else start

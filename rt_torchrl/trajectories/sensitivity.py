@@ -35,14 +35,13 @@ class TangentInterval(nn.Module):
     def __init__(self, interval: Interval):
         super().__init__()
         self.interval = interval
-        self.names = [name for name, w in interval.closure.named_parameters() if w.requires_grad]
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """States and sensitivities, (s, S), at the end of the interval."""
         n_s = len(self.interval.plant.states)
         s, S = state[..., :n_s], state[..., n_s:].unflatten(-1, (n_s, -1))
-        held = dict(self.interval.closure.named_parameters())
-        weights = {f"closure.{name}": held[name] for name in self.names}
+        named = self.interval.closure.named_parameters()
+        weights = {f"closure.{name}": w for name, w in named if w.requires_grad}
         t = drive.t.expand(s.shape[:1])
 
         def end(values: dict[str, Tensor], s: Tensor, *drive: Tensor) -> Tensor:
@@ -67,6 +66,7 @@ class Sensitivities:
 
     def __init__(self, plant: Plant, closure: nn.Module):
         self.interval = Interval(plant, closure, None)
+        self._tangent = TangentInterval(self.interval)
         self._engine = Native(compiled=False)
 
     @torch.no_grad()
@@ -94,9 +94,11 @@ class Sensitivities:
         S = initial_state.new_zeros(batch, n_s, count)
         if initial:
             S = torch.cat([S, torch.eye(n_s, dtype=S.dtype, device=S.device).expand(batch, -1, -1)], -1)
-        tangent, state = TangentInterval(self.interval), torch.cat([initial_state, S.flatten(1)], -1)
-        if S.shape[-1] <= WIDE and self._engine.takes(tangent, state, drive):
-            ends, S_ends = self._engine.end_states(tangent, state, drive).split([n_s, n_s * S.shape[-1]], -1)
+        state, found = torch.cat([initial_state, S.flatten(1)], -1), None
+        if S.shape[-1] <= WIDE:
+            found = self._engine.own_end_states(self._tangent, state, drive)
+        if found is not None:
+            ends, S_ends = found.split([n_s, n_s * S.shape[-1]], -1)
             S_ends = S_ends.unflatten(-1, S.shape[1:])
         else:
             ends = self._engine.end_states(self.interval, initial_state, drive)

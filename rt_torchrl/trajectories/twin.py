@@ -1,14 +1,19 @@
 """The digital twin: a plant's vector field and step under a learned closure."""
 
 import copy
+from operator import is_
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.programs.fingerprint import fingerprint
 from rt_torchrl.trajectories.rollout import Engine, Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import Trajectory
+
+KEPT = 4
+"""Number of policies whose rollouts a twin keeps, such as those that are judged in turn."""
 
 
 class DigitalTwin:
@@ -28,6 +33,7 @@ class DigitalTwin:
         self._engine, self._compiled = engine, compiled
         self._replay = self._rollout(closure, None)
         self.sensitivities = Sensitivities(plant, closure)
+        self._planned: list[_Planned] = []
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
@@ -55,13 +61,39 @@ class DigitalTwin:
 
         The trajectory is differentiable by the policy's weights and the initial state; the closure is held constant.
         """
-        return self._rollout(constant(self.closure), policy)(initial_state, exogenous, start=start)
+        return self._planning(policy)(initial_state, exogenous, start=start)
 
     def cost(
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
-        return self._rollout(constant(self.closure), policy).costs(initial_state, exogenous).mean()
+        return self._planning(policy).costs(initial_state, exogenous).mean()
+
+    def _planning(self, policy: nn.Module) -> Rollout:
+        """The rollout of a policy under the closure held constant, kept as long as both are the same."""
+        for planned in self._planned:
+            if planned.rollout.plant is self.plant and planned.serves(self.closure, policy):
+                return planned.rollout
+        modules = nn.ModuleList([self.closure, policy])
+        new = _Planned(modules, self._rollout(constant(self.closure), policy))
+        self._planned = [new, *self._planned[: KEPT - 1]]
+        return new.rollout
+
+
+class _Planned:
+    """A rollout with a constant copy of a closure, which shares its weights and buffers.
+
+    Args:
+        modules: the closure and the policy.
+        rollout: the rollout.
+    """
+
+    def __init__(self, modules: nn.ModuleList, rollout: Rollout):
+        self.rollout, self._pair, self._watch = rollout, modules, fingerprint(modules).watch
+
+    def serves(self, *modules: nn.Module) -> bool:
+        """Whether closure and policy are those of the rollout, and nothing but their weights' values has changed."""
+        return all(map(is_, self._pair, modules)) and self._watch.holds(self._pair)
 
 
 def constant(module: nn.Module) -> nn.Module:

@@ -20,11 +20,11 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
-from rt_torchrl.trajectories.engines.groups import Group, Signals, for_each_group, pieces
+from rt_torchrl.trajectories.engines.groups import Group, for_each_group
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.engines.programs import Programs, programs_of
-from rt_torchrl.trajectories.engines.traced_interval import weights_of
+from rt_torchrl.trajectories.engines.weights import Weights
 
 MEMORY = 2.0**30
 """Bytes of states and drive that a sweep holds at once; of longer trajectories it holds checkpoints in time."""
@@ -52,202 +52,192 @@ class Native(GradientEngine):
         if not memory >= LEAST_MEMORY:
             raise ValueError(f"memory={memory} bytes of engine 'native' must be at least {LEAST_MEMORY:.0f}.")
         self.memory, self._compiled = memory, compiled
+        self._costed: CostInterval | None = None
 
     @cached_property
     def _substitute(self) -> Parallel:
         return Parallel(compiled=self._compiled)
 
-    def takes(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> bool:
-        """Whether the interval can become a program; a warning says why not."""
-        return programs_of(interval, initial_state, drive) is not None
-
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
-        programs = programs_of(interval, initial_state, drive)
-        if programs is None:
-            return self._substitute.end_states(interval, initial_state, drive)
-        task = _Task(programs, interval, self.memory)
-        found: Tensor = _EndStates.apply(task, initial_state, *drive, *task.learned)
-        return found
+        found = self.own_end_states(interval, initial_state, drive)
+        return self._substitute.end_states(interval, initial_state, drive) if found is None else found
+
+    def own_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
+        """The same by machine code; None, with a warning that says why, if the interval cannot become a program."""
+        found = programs_of(interval, initial_state, drive)
+        if found is None:
+            return None
+        task = _Task(*found, initial_state, drive, self.memory)
+        ends: Tensor = _EndStates.apply(task, initial_state, *drive, *task.weights.learned)
+        return ends
 
     def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """Sums of the running cost over all intervals, ``batch``; None if the interval cannot become a program.
 
         Where a gradient is wanted, it is computed in the same sweep.
         """
-        costed = CostInterval(interval)
-        state = torch.cat([initial_state, initial_state.new_zeros(len(initial_state), 1)], -1)
-        programs = programs_of(costed, state, drive)
-        if programs is None:
+        if self._costed is None or self._costed.interval is not interval:
+            self._costed = CostInterval(interval)
+        state = nn.functional.pad(initial_state, (0, 1))
+        found = programs_of(self._costed, state, drive)
+        if found is None:
             return None
-        task = _Task(programs, costed, self.memory)
-        leaves = (state, *drive, *task.learned)
+        task = _Task(*found, state, drive, self.memory)
+        leaves = (state, *drive, *task.weights.learned)
         wanted = torch.is_grad_enabled() and any(x.requires_grad for x in leaves)
-        found: Tensor = _Costs.apply(task, wanted, *leaves)
-        return found
+        costs: Tensor = _Costs.apply(task, wanted, *leaves)
+        return costs
 
 
 class _Task:
-    """Programs with the weights that they run with, and the pieces of time that they run over.
+    """Trajectories that are to be computed, in pieces of time.
 
     Args:
         programs: machine code of the interval.
-        interval: the interval with its weights.
+        weights: weights of the interval.
+        initial_state: initial states.
+        drive: drive of all intervals.
         memory: bytes that a sweep may hold.
     """
 
-    def __init__(self, programs: Programs, interval: nn.Module, memory: float):
-        self.programs, self.weights, self.lanes = programs, weights_of(interval), programs.lanes.number
-        self.learned = [w for w in interval.parameters() if w.requires_grad]
-        self.n_s, self.n_x = programs.point.state.shape[-1], programs.width
-        self.n_w = sum(w.numel() for w in self.learned)
-        self.length = max(1, int(memory / torch.get_num_threads() / (16 * self.lanes * (self.n_s + self.n_x))))
+    def __init__(self, programs: Programs, weights: Weights, initial_state: Tensor, drive: Drive, memory: float):
+        self.programs, self.weights, self.lanes = programs, weights, programs.lanes.number
+        self.row, self.n_w = weights.row(), sum(weights.sizes)
+        self.initial_state, self.n = initial_state.detach().numpy(), len(drive.t)
+        t = drive.t.unsqueeze(-1).expand(-1, len(initial_state), 1)
+        self.drive = [x.detach().numpy() for x in (t, *drive[1:])]
+        self.n_s, self.n_x = (programs.march.sizes[name] for name in "sx")
+        length = max(1, int(memory / torch.get_num_threads() / (16 * self.lanes * (self.n_s + self.n_x))))
+        self.pieces = [slice(first, min(first + length, self.n)) for first in range(0, self.n, length)]
 
-    def march(self, group: Group, drive: Signals, state: np.ndarray, first: int, last: int) -> np.ndarray:
-        """States ``first`` ... ``last`` of a group, ``n+1 n_s lanes``, from its state at ``first`` on."""
-        states = np.empty((last - first + 1, *state.shape))
+    def start(self, group: Group) -> np.ndarray:
+        """The initial states of a group, ``n_s lanes``."""
+        return group.gather(self.initial_state[None])[0]
+
+    def march(self, group: Group, piece: slice, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Drive ``n n_x lanes`` and states ``n+1 n_s lanes`` of a piece, from the state at its start on."""
+        x = self.driving(group, piece)
+        states = np.empty((len(x) + 1, *state.shape))
         states[0] = state
-        self.programs.march()(group.packed(drive, first, last), states, self.weights, last - first)
-        return states
+        self.programs.march(x, states, self.row, len(x))
+        return x, states
 
-    def sweep(
-        self,
-        group: Group,
-        drive: Signals,
-        first: int,
-        last: int,
-        states: np.ndarray,
-        source: np.ndarray,
-        out: "_Gradients",
-    ) -> None:
-        """Go back from interval ``last`` − 1 to ``first``, whose states at the starts are given."""
-        x = group.packed(drive, first, last)
-        driven = out.by_drive.shape[-1] > 0
-        by_drive = np.empty((last - first, out.by_drive.shape[-1], self.lanes))
-        sweep = self.programs.sweep(driven)
-        sweep(x, states, source, out.costate, self.weights, by_drive, out.by_weights, last - first)
-        group.scatter(by_drive, out.by_drive[first:last])
+    def driving(self, group: Group, piece: slice) -> np.ndarray:
+        """The drive of a group in a piece, ``n n_x lanes``."""
+        return group.gather(*(signal[piece] for signal in self.drive))
 
-    def split(self, by_weights: np.ndarray) -> list[Tensor]:
-        """Gradients of the learned weights in their own shapes."""
-        parts = torch.from_numpy(by_weights).split([w.numel() for w in self.learned]) if self.learned else []
-        return [part.view(w.shape) for part, w in zip(parts, self.learned, strict=True)]
+    def of_drive(self, by_drive: Tensor, t: Tensor) -> list[Tensor]:
+        """Gradients by t, z and a, in their own shapes, of those by the drive, ``n batch n_x``."""
+        by_t, *rest = by_drive.split([signal.shape[-1] for signal in self.drive], -1)
+        return [by_t.squeeze(-1).sum_to_size(t.shape), *rest]
 
 
-class _Gradients:
-    """Gradients of a group on its way back: the co-state, the sums by the weights, and those by the drive of all."""
+class _Adjoint:
+    """The way back of a group.
 
-    def __init__(self, task: _Task, by_drive: np.ndarray):
+    Args:
+        task: the trajectories.
+        group: the group.
+        by_drive: gradients by the drive of all groups, ``n batch n_x``, of which it writes its own; None to leave them.
+    """
+
+    def __init__(self, task: _Task, group: Group, by_drive: np.ndarray | None):
+        self._task, self._group, self._by_drive = task, group, by_drive
+        self._sweep = task.programs.sweep(by_drive is not None)
         self.costate, self.by_weights = np.zeros((task.n_s, task.lanes)), np.zeros((task.n_w, task.lanes))
-        self.by_drive = by_drive
+
+    def sweep(self, piece: slice, x: np.ndarray, states: np.ndarray, source: np.ndarray) -> None:
+        """Go back over a piece, with its drive and its states as :meth:`_Task.march` gives them."""
+        by_drive = np.empty(x.shape if self._by_drive is not None else 0)
+        self._sweep(x, states, source, self.costate, self._task.row, by_drive, self.by_weights, len(x))
+        if self._by_drive is not None:
+            self._group.scatter(by_drive, self._by_drive[piece])
 
 
 class _EndStates(torch.autograd.Function):
     """Maps (s_0, t, z, a, w) to s_1 ... s_n."""
 
     @staticmethod
-    def forward(
-        ctx: Any, task: _Task, initial_state: Tensor, t: Tensor, exogenous: Tensor, command: Tensor, *weights: Tensor
-    ) -> Tensor:
-        drive, n, first_states = Signals.of(Drive(t, exogenous, command)), len(t), initial_state.detach().numpy()
-        ends = np.empty((n, *first_states.shape))
+    def forward(ctx: Any, task: _Task, *leaves: Tensor) -> Tensor:
+        ends = np.empty((task.n, *task.initial_state.shape))
 
         def work(group: Group) -> None:
-            state = group.gather(first_states[None])[0]
-            for first, last in pieces(n, task.length):
-                states = task.march(group, drive, state, first, last)
-                group.scatter(states[1:], ends[first:last])
+            state = task.start(group)
+            for piece in task.pieces:
+                _, states = task.march(group, piece, state)
+                group.scatter(states[1:], ends[piece])
                 state = states[-1]
 
-        for_each_group(len(first_states), task.lanes, work)
+        for_each_group(ends.shape[1], task.lanes, work)
         found = torch.from_numpy(ends)
         ctx.task = task
-        # Saving the weights lets autograd notice when one is changed between forward and backward.
-        ctx.save_for_backward(initial_state, t, exogenous, command, found, *weights)
+        # What is saved tells autograd when it is changed between forward and backward, the weights too.
+        ctx.save_for_backward(found, *leaves)
         return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
-        task: _Task = ctx.task
-        initial_state, t, exogenous, command, ends = ctx.saved_tensors[:5]
-        drive, sources = Signals.of(Drive(t, exogenous, command)), cost_gradient.numpy()
-        starts, n = np.concatenate([initial_state.numpy()[None], ends[:-1].numpy()]), len(ends)
-        driven = any(ctx.needs_input_grad[2:5])
+        task, (ends, _, t, *_) = ctx.task, ctx.saved_tensors
+        starts, sources = np.concatenate([task.initial_state[None], ends[:-1].numpy()]), cost_gradient.numpy()
         by_state, by_weights = np.empty((1, *starts.shape[1:])), np.zeros((starts.shape[1], task.n_w))
-        by_drive = np.empty((n, starts.shape[1], task.n_x if driven else 0))
+        by_drive = np.empty((*starts.shape[:2], task.n_x)) if any(ctx.needs_input_grad[2:5]) else None
 
         def work(group: Group) -> None:
-            out = _Gradients(task, by_drive)
-            for first, last in reversed(pieces(n, task.length)):
-                source = group.gather(sources[first:last]).copy()
+            adjoint = _Adjoint(task, group, by_drive)
+            for piece in reversed(task.pieces):
+                source = group.gather(sources[piece])
                 source[:, :, group.live :] = 0.0
-                states = np.ascontiguousarray(group.gather(starts[first:last]))
-                task.sweep(group, drive, first, last, states, source, out)
-            group.scatter(out.costate[None], by_state)
-            by_weights[group.first] = out.by_weights.sum(-1)
+                adjoint.sweep(piece, task.driving(group, piece), group.gather(starts[piece]), source)
+            group.scatter(adjoint.costate[None], by_state)
+            by_weights[group.first] = adjoint.by_weights.sum(-1)
 
         for_each_group(starts.shape[1], task.lanes, work)
-        along = _of_drive(torch.from_numpy(by_drive), (t, exogenous, command), driven)
-        return None, torch.from_numpy(by_state[0]), *along, *task.split(by_weights.sum(0))
+        along = [None] * 3 if by_drive is None else task.of_drive(torch.from_numpy(by_drive), t)
+        return None, torch.from_numpy(by_state[0]), *along, *task.weights.split(by_weights.sum(0))
 
 
 class _Costs(torch.autograd.Function):
     """Maps (s_0, t, z, a, w) to the last signal of s_n of each realisation, and computes its gradients at once."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        task: _Task,
-        wanted: bool,
-        state: Tensor,
-        t: Tensor,
-        exogenous: Tensor,
-        command: Tensor,
-        *weights: Tensor,
-    ) -> Tensor:
-        drive, states_0 = Signals.of(Drive(t, exogenous, command)), state.detach().numpy()
-        n, batch, driven = len(t), len(states_0), wanted and any(ctx.needs_input_grad[3:6])
-        costs, by_state = np.empty(batch), np.empty((1, *states_0.shape))
-        by_drive, by_weights = np.empty((n, batch, task.n_x if driven else 0)), np.empty((1, batch, task.n_w))
+    def forward(ctx: Any, task: _Task, wanted: bool, *leaves: Tensor) -> Tensor:
+        batch, driven = len(task.initial_state), wanted and any(ctx.needs_input_grad[3:6])
+        costs, by_state = np.empty(batch), np.empty((1, *task.initial_state.shape))
+        by_weights = np.empty((1, batch, task.n_w))
+        by_drive = np.empty((task.n, batch, task.n_x)) if driven else None
         nothing = np.zeros((1, task.n_s, task.lanes))
 
         def work(group: Group) -> None:
-            cuts, states = pieces(n, task.length), np.empty(0)
-            starts = [group.gather(states_0[None])[0]]
-            for first, last in cuts:
-                states = task.march(group, drive, starts[-1], first, last)
+            starts = [task.start(group)]
+            for piece in task.pieces:
+                x, states = task.march(group, piece, starts[-1])
                 starts.append(states[-1].copy())
             costs[group.first : group.last] = starts.pop()[-1, : group.live]
             if not wanted:
                 return
-            out = _Gradients(task, by_drive)
-            out.costate[-1] = 1.0
-            for first, last in reversed(cuts):
+            adjoint = _Adjoint(task, group, by_drive)
+            adjoint.costate[-1] = 1.0
+            for piece in reversed(task.pieces):
                 start = starts.pop()
-                if last < n:  # the states of the last piece are still there
-                    states = task.march(group, drive, start, first, last)
-                task.sweep(group, drive, first, last, states, nothing, out)
-            group.scatter(out.costate[None], by_state)
-            group.scatter(out.by_weights[None], by_weights)
+                if piece.stop < task.n:  # those of the last piece are still there
+                    x, states = task.march(group, piece, start)
+                adjoint.sweep(piece, x, states, nothing)
+            group.scatter(adjoint.costate[None], by_state)
+            group.scatter(adjoint.by_weights[None], by_weights)
 
         for_each_group(batch, task.lanes, work)
-        ctx.task, ctx.driven = task, driven
-        ctx.save_for_backward(t, exogenous, command, *(torch.from_numpy(x) for x in (by_state, by_drive, by_weights)))
+        ctx.task, ctx.t, ctx.found = task, leaves[1], [by_state[0], by_weights[0], by_drive]
         return torch.from_numpy(costs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        t, exogenous, command, by_state, by_drive, by_weights = ctx.saved_tensors
-        along = _of_drive(by_drive * gradient.unsqueeze(-1), (t, exogenous, command), ctx.driven)
-        weights = ctx.task.split((gradient @ by_weights[0]).numpy())
-        return None, None, by_state[0] * gradient.unsqueeze(-1), *along, *weights
-
-
-def _of_drive(by_drive: Tensor, drive: tuple[Tensor, Tensor, Tensor], driven: bool) -> list[Tensor | None]:
-    """Gradients by t, z and a, in their own shapes."""
-    if not driven:
-        return [None] * len(drive)
-    by_t, *rest = by_drive.split([1, drive[1].shape[-1], drive[2].shape[-1]], -1)
-    return [by_t.squeeze(-1).sum_to_size(drive[0].shape), *rest]
+        task, factor = ctx.task, gradient.numpy()
+        by_state, by_weights, by_drive = ctx.found
+        along = [None] * 3
+        if by_drive is not None:
+            along = task.of_drive(torch.from_numpy(by_drive * factor[:, None]), ctx.t)
+        state = torch.from_numpy(by_state * factor[:, None]) if ctx.needs_input_grad[2] else None
+        return None, None, state, *along, *task.weights.split(factor @ by_weights)

@@ -4,15 +4,17 @@ import threading
 import warnings
 from collections import OrderedDict
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.programs.fingerprint import fingerprint
+from rt_torchrl.programs.fingerprint import Fingerprint, fingerprint
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.engines.traced_interval import March, Point, Sweep
+from rt_torchrl.trajectories.engines.weights import Weights
 
 KEPT = 256
 """Number of kinds of intervals whose programs are kept."""
@@ -31,17 +33,8 @@ class Programs:
 
     def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
         self.point, self.lanes = point, lanes
-        self._march = March(interval, point, lanes)
+        self.march = March(interval, point, lanes)
         self._sweeps: dict[bool, Sweep] = {}
-
-    @property
-    def width(self) -> int:
-        """Number of signals of the drive."""
-        return self._march.sizes["x"]
-
-    def march(self) -> March:
-        """The recurrence."""
-        return self._march
 
     def prepare_sweep(self, interval: nn.Module, driven: bool) -> None:
         """Make the reverse sweep of an interval of this kind, unless it is there.
@@ -57,6 +50,13 @@ class Programs:
         return self._sweeps[driven]
 
 
+class _Known(NamedTuple):
+    """An interval as it is as long as its fingerprint holds."""
+
+    fingerprint: Fingerprint
+    weights: Weights
+
+
 class _Entry(NamedTuple):
     """What is kept of one kind of interval: its programs or why there are none, for any of its sweeps.
 
@@ -67,36 +67,45 @@ class _Entry(NamedTuple):
     alive: tuple[object, ...]
 
 
+_known: "WeakKeyDictionary[nn.Module, _Known]" = WeakKeyDictionary()
 _kept: "OrderedDict[tuple[object, ...], _Entry]" = OrderedDict()
 _lock = threading.RLock()
 
 
-def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Programs | None:
-    """The programs of an interval; None where it is not on the CPU or, with one warning, cannot become a program.
+def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[Programs, Weights] | None:
+    """The programs of an interval with its weights; None where there are none.
 
-    Where a gradient is wanted, the sweep is prepared too: later the interval may be another one.
+    There are none for an interval that is not on the CPU or, with one warning, cannot become a program. Where a
+    gradient is wanted, the sweep is prepared too: later the interval may be another one.
     """
     if initial_state.device.type != "cpu":
         return None
     with _lock:
-        lanes = lanes_of_this_machine()
-        digest, alive = fingerprint(interval)
-        key = (digest, lanes, initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1])
+        known, lanes = _known_as(interval), lanes_of_this_machine()
+        widths = initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1]
+        key = (known.fingerprint.digest, lanes, *widths)
         found = _kept[key].programs if key in _kept else None
         if not isinstance(found, UntraceableError):
             try:
                 found = found or Programs(interval, point_of(initial_state, drive, lanes.number), lanes)
-                leaves = (initial_state, *drive, *interval.parameters())
-                if torch.is_grad_enabled() and any(x.requires_grad for x in leaves):
-                    found.prepare_sweep(interval, any(x.requires_grad for x in drive))
+                driven = any(x.requires_grad for x in drive)
+                if torch.is_grad_enabled() and (driven or initial_state.requires_grad or known.weights.learned):
+                    found.prepare_sweep(interval, driven)
             except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
                 found = _reason(error)
                 warnings.warn(f"engine 'parallel' takes the place of 'native': {found}.", stacklevel=2)
-            _kept[key] = _Entry(found, _kept[key].alive if key in _kept else alive)
+            _kept[key] = _Entry(found, _kept[key].alive if key in _kept else known.fingerprint.alive)
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
-        return found if isinstance(found, Programs) else None
+        return (found, known.weights) if isinstance(found, Programs) else None
+
+
+def _known_as(interval: nn.Module) -> _Known:
+    found = _known.get(interval)
+    if found is None or not found.fingerprint.watch.holds(interval):
+        found = _known[interval] = _Known(fingerprint(interval), Weights(interval))
+    return found
 
 
 def _reason(error: Exception) -> UntraceableError:

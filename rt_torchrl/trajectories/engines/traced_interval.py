@@ -1,7 +1,6 @@
 """Machine code of the recurrence of an interval and of its reverse sweep, traced and compared with torch."""
 
 import ctypes
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -13,10 +12,12 @@ from rt_torchrl.programs.escapes import Escapes
 from rt_torchrl.programs.machine_code import march_text, sweep_text
 from rt_torchrl.programs.object_code import ObjectCode
 from rt_torchrl.programs.operators import new_tracer
-from rt_torchrl.programs.program import Program, UntraceableError
+from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.tracer import Tracer
 from rt_torchrl.programs.vector_functions import Lanes
+from rt_torchrl.trajectories.engines.groups import Group
 from rt_torchrl.trajectories.engines.interval import Drive, with_weights
+from rt_torchrl.trajectories.engines.weights import Weights
 
 POINTER = ctypes.c_void_p
 MARCH = (POINTER, POINTER, POINTER, ctypes.c_int64)
@@ -30,6 +31,12 @@ class Point(NamedTuple):
 
     state: Tensor
     drive: Drive
+
+    def in_lanes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Drive ``1 n_x lanes`` and states ``1 n_s lanes``, one realisation in each lane."""
+        n, (t, *rest) = len(self.state), (x.unsqueeze(0).numpy() for x in self.drive)
+        lanes = Group(0, n, n)
+        return lanes.gather(t[:, :, None], *rest), lanes.gather(self.state.unsqueeze(0).numpy())
 
 
 class March:
@@ -49,25 +56,21 @@ class March:
         state, drive, weights = _traced_inputs(tracer, interval, point)
         with torch.no_grad(), Escapes(tracer), tracer:
             end = with_weights(interval, weights, state, drive)
-        ends = tracer.cells(end).flatten().tolist()
-        sizes = {"x": _width(point.drive), "s": state.shape[-1]}
         if end.shape != state.shape:
             raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
-        self.lanes, self.sizes = lanes, sizes
-        self._code = ObjectCode(
-            march_text(tracer.program, _numbers(tracer.program, ends), sizes, lanes), "march", MARCH
-        )
+        self.lanes, self.sizes = lanes, {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
+        self._code = ObjectCode(march_text(tracer.program, tracer.outputs(end), self.sizes, lanes), "march", MARCH)
         self._compare(interval, point)
 
     def __call__(self, x: np.ndarray, states: np.ndarray, weights: np.ndarray, n: int) -> None:
         """Write the states 1 ... n of ``states`` (``n+1 n_s lanes``), under the drive ``x`` (``n n_x lanes``)."""
-        self._code.call(x.ctypes.data, states.ctypes.data, weights.ctypes.data, n)
+        self._code(x, states, weights, n)
 
     @torch.no_grad()
     def _compare(self, interval: nn.Module, point: Point) -> None:
-        states = np.empty((2, self.sizes["s"], self.lanes.number))
-        states[0] = point.state.numpy().T
-        self(packed(point.drive), states, weights_of(interval), 1)
+        x, start = point.in_lanes()
+        states = np.concatenate([start, start])
+        self(x, states, Weights(interval).row(), 1)
         require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
 
 
@@ -97,10 +100,13 @@ class Sweep:
             with Escapes(tracer), tracer:
                 end = with_weights(interval, weights, state, drive)
                 found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
-        cells = [_gradient(tracer, g, leaf) for g, leaf in zip(found or [None] * len(leaves), leaves, strict=True)]
+        zero = tracer.program.constant(0.0)
+        pairs = zip(found or [None] * len(leaves), leaves, strict=True)
+        cells = [[zero] * leaf.numel() if g is None else tracer.outputs(g) for g, leaf in pairs]
         by_state, by_drive, by_weights = cells[0], sum(cells[1:4], []) if driven else [], cells[4 if driven else 1 :]
         self.lanes, self.driven, self.names = lanes, driven, list(learned)
-        self.sizes = {"x": _width(point.drive), "s": state.shape[-1], "w": sum(w.numel() for w in learned.values())}
+        self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
+        self.sizes["w"] = sum(w.numel() for w in learned.values())
         write = partial(sweep_text, tracer.program, sizes=self.sizes, lanes=lanes)
         self._code = ObjectCode(write(by_state, sum(by_weights, []), by_drive), "sweep", SWEEP)
         self._compare(interval, point)
@@ -129,17 +135,14 @@ class Sweep:
             n: number of intervals.
         """
         stride = int(len(source) > 1)
-        arrays = (costate, weights, by_drive, by_weights)
-        self._code.call(
-            x.ctypes.data, states.ctypes.data, source.ctypes.data, stride, *(a.ctypes.data for a in arrays), n
-        )
+        self._code(x, states, source, stride, costate, weights, by_drive, by_weights, n)
 
     def _compare(self, interval: nn.Module, point: Point) -> None:
         n_lanes, names = self.lanes.number, self.names
         costate = 1.0 + 0.1 * np.arange(self.sizes["s"] * n_lanes, dtype=float).reshape(-1, n_lanes)
-        source, x = np.zeros((1, self.sizes["s"], n_lanes)), packed(point.drive)
+        source, (x, states) = np.zeros((1, self.sizes["s"], n_lanes)), point.in_lanes()
         found = costate.copy(), np.zeros((1, self.sizes["x"], n_lanes)), np.zeros((self.sizes["w"], n_lanes))
-        self(x, point.state.numpy().T[None].copy(), source, found[0], weights_of(interval), *found[1:], 1)
+        self(x, states, source, found[0], Weights(interval).row(), *found[1:], 1)
         weights = {name: w.detach().clone().requires_grad_(name in names) for name, w in interval.named_parameters()}
         leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
         with torch.enable_grad():
@@ -154,18 +157,6 @@ class Sweep:
         parts = np.split(found[2].sum(-1), np.cumsum([w.numel() for w in wanted[4:]])[:-1]) if names else []
         for name, part, exactly in zip(names, parts, wanted[4:], strict=True):
             require_equal(f"the gradient by {name}", part, exactly.flatten().numpy(), exactly.flatten().numpy())
-
-
-def packed(drive: Drive) -> np.ndarray:
-    """The drive of one interval as one row, ``1 n_x lanes``."""
-    rows = np.concatenate([drive.t[None].numpy(), drive.exogenous.numpy().T, drive.command.numpy().T])
-    return np.ascontiguousarray(rows[None])  # of transposed arrays NumPy makes a transposed one
-
-
-def weights_of(interval: nn.Module) -> np.ndarray:
-    """All weights of an interval as one row of numbers."""
-    found = [w.detach().numpy().ravel() for w in interval.parameters()]
-    return np.concatenate(found) if found else np.zeros(1)
 
 
 def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
@@ -190,32 +181,12 @@ def _traced_inputs(tracer: Tracer, interval: nn.Module, point: Point) -> tuple[T
     """
     state, drive = point.state[-1:].clone(), Drive(*(x[-1:].clone() for x in point.drive))
     tracer.input(state, "s")
-    offset = 0
     for x in drive:
-        tracer.input(x, "x", offset)
-        offset += x.numel()
-    weights, first = {}, 0
+        tracer.input(x, "x")
+    weights = {}
     for name, w in interval.named_parameters():
         if w.dtype != torch.float64:
             raise UntraceableError(f"{name} is in {w.dtype}; trajectories need torch.float64")
         weights[name] = w.detach().clone()
-        tracer.weight(weights[name], first)
-        first += w.numel()
+        tracer.weight(weights[name])
     return state, drive, weights
-
-
-def _width(drive: Drive) -> int:
-    return 1 + drive.exogenous.shape[-1] + drive.command.shape[-1]
-
-
-def _gradient(tracer: Tracer, gradient: Tensor | None, leaf: Tensor) -> list[int]:
-    zero = tracer.program.constant(0.0)
-    return (
-        [zero] * leaf.numel()
-        if gradient is None
-        else _numbers(tracer.program, tracer.cells(gradient).flatten().tolist())
-    )
-
-
-def _numbers(program: Program, values: Sequence[int]) -> list[int]:
-    return [program.as_number(value) for value in values]
