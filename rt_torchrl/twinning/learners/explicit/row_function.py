@@ -66,7 +66,7 @@ class RowFunction:
             found = self._formula(self._rows.t(), weights)
             torch.cat([part.t() for part in found], out=self._results)
         else:
-            self._code.call(self._rows.data_ptr(), self._results.data_ptr(), weights.data_ptr(), self._groups)
+            self._code(self._rows.data_ptr(), self._results.data_ptr(), weights.data_ptr(), self._groups)
 
 
 @cache
@@ -88,7 +88,7 @@ def text_of(formula: Formula, n_w: int, lanes: Lanes) -> str:
     """
     tracer, row, weights = new_tracer(), torch.zeros(1, formula.n_in).double(), torch.zeros(n_w).double()
     tracer.input(row, "x")
-    tracer.weight(weights, 0)
+    tracer.weight(weights)
     with torch.no_grad(), tracer:
         found = formula(row, weights)
     outputs = [i for part in found for i in tracer.cells(part).flatten().tolist()]
