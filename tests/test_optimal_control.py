@@ -13,7 +13,7 @@ from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import clairvoyant, constant_starts, random_starts
 from rt_torchrl.optimal_control.forecasts import Preview
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
-from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 
 
@@ -159,6 +159,24 @@ def test_late_solves_leave_the_last_plan():
     late.begin()
     late.plan(0.0, state, exogenous[:, 0])
     assert not late.solves[-1].late  # there is no plan to go on with
+
+
+def test_a_solve_starts_from_a_guess_that_costs_less():
+    plant = LinearQuadratic(horizon=2.0, noise=0.0)
+    state, exogenous = episodes(plant, 1)
+    best = quadratic_program(plant, state[0].numpy(), exogenous[0, :, 0].numpy())[0]
+    given = {
+        "the optimum": torch.from_numpy(best)[None, :, None],
+        "the least force": torch.full((1, 20, 1), -2.0).double(),
+    }
+    costs = {}
+    for name, commands in {"nothing": None, **given}.items():
+        guess = None if commands is None else lambda s, z, commands=commands: commands
+        config = RecedingHorizonConfig(horizon=2.0, iterations=1)
+        controller = RecedingHorizon(plant, plant.closure, config, guess=guess)
+        planned = controller.plan(0.0, state, exogenous[:, 0])
+        costs[name] = Rollout(plant, plant.closure).costs(state, exogenous, planned).item()
+    assert costs["the optimum"] < 0.99 * costs["nothing"] == pytest.approx(0.99 * costs["the least force"])
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize
 
 from rt_torchrl.options import check_options
 
@@ -97,6 +96,8 @@ def descend(
 
     Source: Zhu, Byrd, Lu and Nocedal, ACM Trans. Math. Softw. 23 (1997) 550, in SciPy.
     """
+    from scipy.optimize import minimize  # here, because it takes a second to load and --help need not wait for it
+
     seen = _Seen(evaluate, start)
     options = {
         "maxiter": config.iterations,

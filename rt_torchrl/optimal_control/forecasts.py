@@ -5,7 +5,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 
@@ -110,6 +109,8 @@ class Preview:
 
 def _decay_time(covariance: Float[np.ndarray, " lags"], dt: float, longest: float) -> float:
     """The decay time [s] of the least forecast error, between a tenth of an interval and the length of a record."""
+    from scipy.optimize import minimize_scalar  # here, because it takes a second to load and --help need not wait
+
     steps = np.arange(len(covariance))
 
     def error(log_time: float) -> float:

@@ -3,6 +3,7 @@
 import itertools
 import math
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,6 +21,9 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import constant
+
+Guess = Callable[[Tensor, Tensor], Tensor]
+"""Function from states ``batch n_s`` and forecast inputs ``batch n n_z`` to commands ``batch n n_a``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +99,8 @@ class RecedingHorizon:
         forecast: forecast of the exogenous inputs; None holds what is measured.
         terminal: cost V after the horizon, of the end states ``batch n_s``, in units of L_a·s; None for none. A window
             that ends with the episode has none.
+        guess: commands that a solve starts from where they cost less than the rest of the last plan, such as those of a
+            classical controller on the model; None for none.
 
     Raises:
         ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
@@ -108,8 +114,9 @@ class RecedingHorizon:
         *,
         forecast: Forecast | None = None,
         terminal: TerminalCost | None = None,
+        guess: Guess | None = None,
     ):
-        self.plant, self.config = plant, config
+        self.plant, self.config, self.guess = plant, config, guess
         self.forecast: Forecast = forecast or Held()
         hold = self._whole("hold", plant.dt if config.hold is None else config.hold, 1)
         self.horizon = self._whole("horizon", config.horizon, hold)
@@ -160,6 +167,9 @@ class RecedingHorizon:
             began = time.perf_counter()
             self.cost.begin(state[one], inputs[one], start=t)
             start = self._best_constant() if first else self._shifted(self._plans[episode])
+            if self.guess is not None:
+                guessed = self.cost.units(self.guess(state[one], inputs[one]))[0]
+                start = self._cheapest([start, guessed])
             found.append(self._solved(start, began, math.inf if first else self.config.deadline))
         self._plans = found
         return self.cost.commands(np.stack(found), n)
@@ -196,8 +206,12 @@ class RecedingHorizon:
         """The constant commands of the least cost, of both ends and the middle of every range."""
         blocks, n_a = self.cost.blocks(self.cost.n), len(self.plant.actions)
         tried = [np.full((blocks, n_a), levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=n_a)]
-        costs = [float(self.cost(point[None])[0][0]) for point in tried]
-        return tried[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
+        return self._cheapest(tried)
+
+    def _cheapest(self, plans: Sequence[np.ndarray]) -> np.ndarray:
+        """The plan of the least cost; one that diverges costs more than any other."""
+        costs = [float(self.cost(plan[None])[0][0]) for plan in plans]
+        return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
     def act(
         self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
