@@ -13,6 +13,8 @@ from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import clairvoyant, constant_starts, random_starts
 from rt_torchrl.optimal_control.forecasts import Preview
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 
@@ -159,6 +161,25 @@ def test_late_solves_leave_the_last_plan():
     late.begin()
     late.plan(0.0, state, exogenous[:, 0])
     assert not late.solves[-1].late  # there is no plan to go on with
+
+
+def test_it_acts_on_a_real_system_behind_a_safety_layer_in_time():
+    plant = LinearQuadratic(horizon=3.0, noise=0.5)
+    config = SafetyConfig(interval=plant.dt, deadline=5.0, rates=(100.0,))
+    system = SafetyLayer(PlantEnv(plant, seed=4), config, fallback=(0.0,))
+    controller = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=1.0, deadline=5.0))
+    entries = system.reset()
+    start, states, inputs, applied = entries["state"], [], [], []
+    for k in range(plant.n_steps):
+        inputs.append(entries["exogenous"])
+        entries["action"] = controller.act(k * plant.dt, entries["state"], entries["exogenous"])
+        entries = system.step(entries)["next"]
+        states.append(entries["state"])
+        applied.append(entries["applied"])
+    assert not system.reports[-1].events and not any(solve.late for solve in controller.solves)
+    flown = controller.fly(start, torch.stack(inputs, 1))
+    torch.testing.assert_close(flown.states[:, 1:], torch.stack(states, 1), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(flown.actions, torch.stack(applied, 1), rtol=1e-9, atol=1e-9)
 
 
 def test_a_solve_starts_from_a_guess_that_costs_less():
