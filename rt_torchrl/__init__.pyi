@@ -24,6 +24,9 @@ from .evaluation.baseline import RealController
 from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
+from .optimal_control.clairvoyant import Clairvoyant, clairvoyant
+from .optimal_control.forecasts import Decaying, Forecast, Held, Preview
+from .optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from .identification.identification import Identification, IdentificationConfig
 from .identification.sensor_log import read_log
 
@@ -59,8 +62,10 @@ __all__ = [
     "AssimilationConfig",
     "BoundedPerceptron",
     "CallingSimulator",
+    "Clairvoyant",
     "ClassicalController",
     "ContractReport",
+    "Decaying",
     "DecisionTree",
     "Descended",
     "DescentConfig",
@@ -72,6 +77,8 @@ __all__ = [
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "Forecast",
+    "Held",
     "Identification",
     "IdentificationConfig",
     "Learner",
@@ -84,9 +91,12 @@ __all__ = [
     "PlantContractError",
     "PlantEnv",
     "PositiveCoefficients",
+    "Preview",
     "Reading",
     "RealController",
     "RealSystem",
+    "RecedingHorizon",
+    "RecedingHorizonConfig",
     "Referee",
     "RefereeConfig",
     "ReinforcementTwinning",
@@ -113,6 +123,7 @@ __all__ = [
     "WholeEpisodes",
     "check_options",
     "check_plant",
+    "clairvoyant",
     "control_cost",
     "export_c",
     "export_controller",

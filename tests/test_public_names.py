@@ -24,6 +24,7 @@ ROOMS_OF = {
     "benchmark.py": {"trajectories"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
+    "limit.py": {"evaluation", "optimal_control", "runs", "study"},
     "record_log.py": {"identification", "runs"},
     "study.py": {"study", "runs"},
 }

@@ -1,0 +1,226 @@
+r"""The cost of held commands and its exact gradient, for optimisers of commands.
+
+.. math::
+    J(u) = \frac1N\sum_{k<N}\Big(L_a(t_k, s_k, a_k, z_k)
+        + w\sum_i\Big(\frac{c_{k,i} - a_{k,i}}{h_i - l_i}\Big)^2\Big) + \frac{V(s_N)}{N\Delta t}, \qquad
+    c_k = l + (h - l)\,u_{\lfloor k/m\rfloor}
+
+The commands c lie between the ends l and h of their ranges, and each is held for m control intervals. A command beyond
+a rate limit changes nothing, so that its gradient is zero and a descent ends there. The penalty w leads it back. An
+action a that the actuators apply is itself a command that they apply at once, c = a. With a command for every interval
+the penalty is therefore zero at an optimum and does not move it.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.engines import Native
+from rt_torchrl.trajectories.engines.groups import Group
+from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.programs import Programs, programs_of
+from rt_torchrl.trajectories.engines.weights import Weights
+from rt_torchrl.trajectories.rollout import require_double
+
+TerminalCost = Callable[[Tensor], Tensor]
+"""Function from the end states, ``batch n_s``, to the cost V after the window, ``batch``, in units of L_a·s."""
+PENALTY = 1.0
+"""Weight w of the penalty, in units of L_a."""
+
+
+class PenalisedInterval(nn.Module):
+    """A control interval whose state (s, J) also sums L_a and the penalty; its drive holds commands in [0, 1].
+
+    Args:
+        plant: the physics, whose actions have finite ranges.
+        closure: closure of the system, which asks for no gradients.
+        penalty: weight w of the penalty.
+    """
+
+    low: Tensor
+    span: Tensor
+
+    def __init__(self, plant: Plant, closure: nn.Module, penalty: float):
+        super().__init__()
+        self.plant, self.closure = plant, closure
+        low, high = bounds(plant.actions)
+        self.register_buffer("low", low)
+        self.register_buffer("span", high - low)
+        # A weight is an input of the traced program, so that another penalty needs no other program.
+        self.penalty = nn.Parameter(torch.tensor(penalty, dtype=torch.float64), requires_grad=False)
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """State and cost, (s, J), at the end of the interval."""
+        s, command = state[..., :-1], self.low + self.span * drive.command
+        applied = self.plant.actuate(s, command)
+        excess = ((command - applied) / self.span).square().sum(-1)
+        cost = self.plant.running_cost(drive.t, s, applied, drive.exogenous) + self.penalty * excess
+        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
+        return torch.cat([end, (state[..., -1] + cost).unsqueeze(-1)], -1)
+
+
+class CommandCost:
+    """J of commands over a window, with its gradient in one call; :meth:`begin` says where the window begins.
+
+    The machine code of the engine ``native`` works on arrays that are kept between calls, because a window of some
+    tens of intervals takes less time than a few operations on tensors.
+
+    Args:
+        plant: the physics.
+        closure: closure of the system.
+        hold: number m of control intervals for which a command is held.
+        penalty: weight w of the penalty.
+        terminal: cost V after the window; None for none.
+
+    Raises:
+        ValueError: if an action has no finite range, the penalty is negative, ``hold`` is below 1 or a weight is not in
+            double precision.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        closure: nn.Module,
+        *,
+        hold: int = 1,
+        penalty: float = PENALTY,
+        terminal: TerminalCost | None = None,
+    ):
+        require_double("closure", closure)
+        low, high = bounds(plant.actions)
+        unbounded = [a.name for a, span in zip(plant.actions, (high - low).tolist(), strict=True) if span == torch.inf]
+        if unbounded:
+            raise ValueError(
+                f"actions {', '.join(unbounded)} of plant {plant.name!r} have no finite range; give them low and high."
+            )
+        if hold < 1:
+            raise ValueError(f"hold={hold} must be at least 1 control interval.")
+        if not 0.0 <= penalty < torch.inf:
+            raise ValueError(f"penalty={penalty} must be finite and not negative.")
+        self.plant, self.hold, self.terminal = plant, hold, terminal
+        self.interval = PenalisedInterval(plant, closure, penalty)
+        self._low, self._span = low.numpy(), (high - low).numpy()
+        self._programs: Programs | None = None
+
+    def blocks(self, n: int) -> int:
+        """Number of commands of a window of n control intervals; the last may be held for less time."""
+        return -(-n // self.hold)
+
+    def commands(self, unit: Float[np.ndarray, "batch m n_a"], n: int) -> Float[Tensor, "batch n n_a"]:
+        """The commands of all n intervals."""
+        return torch.from_numpy(np.repeat(self._low + self._span * unit, self.hold, 1)[:, :n].copy())
+
+    def units(self, commands: Float[Tensor, "batch n n_a"]) -> Float[np.ndarray, "batch m n_a"]:
+        """The held commands in [0, 1] that are nearest to commands of all intervals: the means over the blocks."""
+        first = np.arange(0, commands.shape[1], self.hold)
+        counts = np.diff(np.append(first, commands.shape[1]))[:, None]
+        held = np.add.reduceat(commands.detach().numpy(), first, 1) / counts
+        return np.clip((held - self._low) / self._span, 0.0, 1.0)
+
+    def begin(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        *,
+        start: float = 0.0,
+    ) -> None:
+        """Set the window: its initial states, exogenous inputs and the time of its start [s]."""
+        n = exogenous.shape[1]
+        t = start + self.plant.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1)
+        state = torch.nn.functional.pad(initial_state, (0, 1))
+        command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
+        self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
+        if self._programs is None:
+            self._programs = self._traced()
+        if self._programs is not None:
+            self._weights = Weights(self.interval).row()
+            self._place(self._programs)
+
+    def _traced(self) -> Programs | None:
+        with torch.enable_grad():
+            drive = self._drive._replace(command=self._drive.command.clone().requires_grad_())
+            found = programs_of(self.interval, self._state, drive)
+        return None if found is None else found[0]
+
+    def _place(self, programs: Programs) -> None:
+        """Lay out the arrays of the window, one set for each group of lanes."""
+        lanes, batch = programs.lanes.number, len(self._state)
+        n, n_s, n_x = self.n, self._state.shape[1], programs.march.sizes["x"]
+        groups = [Group(first, min(first + lanes, batch), lanes) for first in range(0, batch, lanes)]
+        if getattr(self, "_shape", None) != (n, batch):
+            self._shape = n, batch
+            self._x = np.empty((len(groups), n, n_x, lanes))
+            self._states = np.empty((len(groups), n + 1, n_s, lanes))
+            self._by_drive = np.empty((n, n_x, lanes))
+            self._costate, self._nothing = np.empty((n_s, lanes)), np.zeros((1, n_s, lanes))
+            self._first_block = np.arange(0, n, self.hold)
+        self._groups, first = groups, 1 + self._drive.exogenous.shape[-1]
+        exogenous, state = self._drive.exogenous.numpy(), self._state.numpy()[None]
+        for k, group in enumerate(groups):
+            self._x[k, :, :1] = self._drive.t.numpy()[:, None]
+            self._x[k, :, 1:first] = group.gather(exogenous)
+            self._states[k, 0] = group.gather(state)[0]
+
+    def __call__(
+        self, unit: Float[np.ndarray, "batch m n_a"]
+    ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, "batch m n_a"]]:
+        """J and its gradient by the commands u in [0, 1] of each realisation of the window."""
+        if self._programs is None:
+            return self._by_torch(unit)
+        costs, gradient = np.empty(len(unit)), np.empty_like(unit)
+        for k, group in enumerate(self._groups):
+            self._sweep(self._programs, k, group, unit, costs, gradient)
+        costs /= self.n
+        gradient /= self.n
+        return costs, gradient
+
+    def _sweep(
+        self,
+        programs: Programs,
+        k: int,
+        group: Group,
+        unit: np.ndarray,
+        costs: np.ndarray,
+        gradient: np.ndarray,
+    ) -> None:
+        x, states, n, n_a = self._x[k], self._states[k], self.n, unit.shape[-1]
+        lanes = np.repeat(group.gather(unit.transpose(1, 0, 2)), self.hold, 0)[:n]
+        x[:, -n_a:] = lanes
+        programs.march(x, states, self._weights, n)
+        self._costate[:] = 0.0
+        self._costate[-1] = 1.0
+        costs[group.first : group.last] = states[-1, -1, : group.live]
+        if self.terminal is not None:
+            costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
+        by_weights = np.zeros((0, group.lanes))
+        arrays = (self._costate, self._weights, self._by_drive, by_weights)
+        programs.sweep(True)(x, states, self._nothing, *arrays, n)
+        by_blocks = np.add.reduceat(self._by_drive[:, -n_a:], self._first_block, 0)
+        gradient[group.first : group.last] = by_blocks[:, :, : group.live].transpose(2, 0, 1)
+
+    def _end(self, ends: np.ndarray, live: int) -> np.ndarray:
+        """V/Δt of the end states, whose gradient goes into the co-state."""
+        assert self.terminal is not None
+        with torch.enable_grad():
+            end = torch.from_numpy(ends[:, :live].T.copy()).requires_grad_()
+            value = self.terminal(end) / self.plant.dt
+            (slope,) = torch.autograd.grad(value.sum(), end)
+        self._costate[:-1, :live] = slope.numpy().T
+        return value.detach().numpy()
+
+    def _by_torch(self, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for a plant that cannot become machine code."""
+        with torch.enable_grad():
+            u = torch.from_numpy(unit).clone().requires_grad_()
+            command = u.repeat_interleave(self.hold, 1)[:, : self.n].transpose(0, 1)
+            ends = Native(compiled=False).end_states(self.interval, self._state, self._drive._replace(command=command))
+            cost = ends[-1, :, -1]
+            if self.terminal is not None:
+                cost = cost + self.terminal(ends[-1, :, :-1]) / self.plant.dt
+            (slope,) = torch.autograd.grad(cost.sum(), u)
+        return cost.detach().numpy() / self.n, slope.numpy() / self.n

@@ -1,0 +1,124 @@
+"""Forecasts of the exogenous inputs over a planning horizon."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class Forecast(Protocol):
+    """Anything that forecasts the exogenous inputs."""
+
+    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+        """The inputs of the n control intervals from t [s] on, of which the first is measured."""
+
+
+class Held:
+    """The measured input, held."""
+
+    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+        return exogenous.unsqueeze(1).expand(-1, n, -1)
+
+
+class Decaying:
+    r"""The measured input decays to its mean, :math:`\hat z_{k+j} = \bar z + (z_k - \bar z)e^{-j\Delta t/\tau}`.
+
+    Args:
+        mean: mean of each input.
+        time: decay time τ of each input [s].
+        dt: control interval [s].
+
+    Raises:
+        ValueError: if a decay time is not positive.
+    """
+
+    def __init__(self, mean: Float[Tensor, " n_z"], time: Float[Tensor, " n_z"], *, dt: float):
+        if not (time > 0.0).all():
+            raise ValueError(f"time={time.tolist()} s of the decay must be positive.")
+        self.mean, self.time, self.dt = mean, time, dt
+
+    @classmethod
+    def fitted(cls, records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float) -> "Decaying":
+        r"""The decay times of the least mean squared error of the forecast over the horizon.
+
+        .. math::
+            \sum_{j\le N}\mathrm E(z_{k+j} - \hat z_{k+j})^2 = \sum_{j\le N}\Gamma_0 - 2q^j\Gamma_j + q^{2j}\Gamma_0
+
+        with the sample covariances Γ_j of the records and q = e^{−Δt/τ}.
+
+        Args:
+            records: recorded inputs of episodes.
+            dt: control interval [s].
+            horizon: time over which the error is summed [s].
+
+        Raises:
+            ValueError: if the records are not longer than the horizon.
+        """
+        lags = round(horizon / dt)
+        if not 1 <= lags < records.shape[1]:
+            raise ValueError(
+                f"horizon={horizon} s is {lags} control intervals; it must be at least one and below the "
+                f"{records.shape[1]} of the records."
+            )
+        mean = records.mean((0, 1))
+        spectrum = np.abs(np.fft.rfft((records - mean).numpy(), 2 * records.shape[1], axis=1)) ** 2
+        number = records.shape[1] - np.arange(lags + 1)
+        covariance = np.fft.irfft(spectrum.mean(0), axis=0)[: lags + 1] / number[:, None]
+        times = [_decay_time(column, dt, records.shape[1] * dt) for column in covariance.T]
+        return cls(mean, torch.tensor(times, dtype=torch.float64), dt=dt)
+
+    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+        share = torch.exp(-self.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1) / self.time)
+        return self.mean + (exogenous - self.mean).unsqueeze(1) * share
+
+
+class Preview:
+    """The inputs themselves for a time ahead, as a lidar measures them, and another forecast from there on.
+
+    Args:
+        record: inputs of whole episodes.
+        dt: control interval [s].
+        reach: time for which the inputs are known [s]; infinity for all of them.
+        beyond: forecast beyond the reach, from the last input that is known.
+    """
+
+    def __init__(
+        self,
+        record: Float[Tensor, "batch n n_z"],
+        *,
+        dt: float,
+        reach: float = float("inf"),
+        beyond: Forecast | None = None,
+    ):
+        if not reach >= 0.0:
+            raise ValueError(f"reach={reach} s of the preview must not be negative.")
+        self.record, self.dt, self.reach, self.beyond = record, dt, reach, beyond or Held()
+
+    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+        k = round(t / self.dt)
+        ahead = n if self.reach == float("inf") else min(n, 1 + int(self.reach / self.dt + 1e-9))
+        known = self.record[:, k : k + ahead]
+        if known.shape[1] == n:
+            return known
+        last = t + self.dt * (known.shape[1] - 1)
+        return torch.cat([known, self.beyond(last, known[:, -1], n - known.shape[1] + 1)[:, 1:]], 1)
+
+
+def _decay_time(covariance: Float[np.ndarray, " lags"], dt: float, longest: float) -> float:
+    """The decay time [s] of the least forecast error, between a tenth of an interval and the length of a record."""
+    from scipy.optimize import minimize_scalar  # here, because it takes a second to load and --help need not wait
+
+    steps = np.arange(len(covariance))
+
+    def error(log_time: float) -> float:
+        share = np.exp(-dt * steps / np.exp(log_time))
+        return float((covariance[0] * (1.0 + share**2) - 2.0 * share * covariance).sum())
+
+    ends = np.log(0.1 * dt), np.log(longest)
+    grid = np.linspace(*ends, 60)
+    k = int(np.argmin([error(x) for x in grid]))
+    around = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
+    return float(np.exp(minimize_scalar(error, bounds=around, method="bounded").x))

@@ -1,0 +1,148 @@
+"""The limit of a plant's cost, and how far classical controllers and model predictive control are from it."""
+
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held, Preview
+from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+RECORDS = 20
+"""Number of episodes, with other draws, whose inputs a forecast is fitted to."""
+RECORDS_SEED = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contender:
+    """What one controller costs, and what it makes of the episodes.
+
+    Args:
+        costs: J_a of each episode.
+        merit: mean of each of the plant's own quantities.
+        milliseconds: wall-clock time of an action [ms], as ``median`` and ``max``; None for the clairvoyant optimum.
+        details: further results.
+    """
+
+    costs: list[float]
+    merit: dict[str, float]
+    milliseconds: dict[str, float] | None
+    details: dict[str, Any]
+
+    @property
+    def mean(self) -> float:
+        """Mean J_a of all episodes."""
+        return statistics.fmean(self.costs)
+
+
+def judged(
+    episodes: UnseenEpisodes, flown: Trajectory, milliseconds: dict[str, float] | None, **details: Any
+) -> Contender:
+    """The contender that has flown the episodes."""
+    costs, merit = episodes.judge(flown)
+    means = {name: values.mean().item() for name, values in merit.items()}
+    return Contender(costs=costs.tolist(), merit=means, milliseconds=milliseconds, details=details)
+
+
+def limit(
+    episodes: UnseenEpisodes,
+    starts: Mapping[str, Float[Tensor, "batch n n_a"]],
+    *,
+    hold: int,
+    config: BoundedDescentConfig,
+) -> Contender:
+    """The clairvoyant optimum from commands by name; see :func:`clairvoyant`."""
+    plant, state, exogenous = episodes.plant, episodes.initial_state, episodes.exogenous
+    found = clairvoyant(plant, state, exogenous, starts, closure=episodes.known_closure(), hold=hold, config=config)
+    return judged(episodes, found.flown, None, **evidence(found))
+
+
+def general_starts(episodes: UnseenEpisodes, *, seed: int) -> dict[str, Float[Tensor, "batch n n_a"]]:
+    """Constant commands, and random ones of a seed."""
+    plant, batch = episodes.plant, len(episodes.initial_state)
+    generator = torch.Generator().manual_seed(seed)
+    starts = constant_starts(plant, batch, plant.n_steps)
+    return starts | random_starts(plant, batch, plant.n_steps, generator=generator)
+
+
+def resting_at_the_end(
+    episodes: UnseenEpisodes, commands: Float[Tensor, "batch n n_a"], *, most: float = 0.2, count: int = 25
+) -> Float[Tensor, "batch n n_a"]:
+    """The commands, but the least ones for the last part of each episode, which is as long as costs least.
+
+    Nobody pays for the state at the end of an episode, so that an optimum may rest there; a descent from commands that
+    act until the end hardly finds it.
+
+    Args:
+        episodes: the episodes.
+        commands: commands of whole episodes.
+        most: longest part, as a share of the episode.
+        count: number of lengths that are tried.
+    """
+    rollout = Rollout(episodes.plant, episodes.known_closure())
+    low, n = bounds(episodes.plant.actions)[0], commands.shape[1]
+    ends = [round(n * (1.0 - most * k / count)) for k in range(count + 1)]
+    tried = [torch.cat([commands[:, :end], low.expand(len(commands), n - end, -1)], 1) for end in ends]
+    costs = torch.stack([rollout.costs(episodes.initial_state, episodes.exogenous, each) for each in tried])
+    return torch.stack([tried[k][episode] for episode, k in enumerate(costs.argmin(0).tolist())])
+
+
+def evidence(found: Clairvoyant) -> dict[str, Any]:
+    """What says that commands are an optimum."""
+    return {
+        "projected_gradient": found.gradient.max().item(),
+        "excess": found.excess,
+        "above_the_best": found.spread(),
+        "gradients": found.gradients,
+    }
+
+
+def classical(episodes: UnseenEpisodes, kind: type[ClassicalController], *, calls: int = 50) -> Contender:
+    """A classical controller with its default gains; ``calls`` is the number of actions that are timed."""
+    controller = kind(episodes.plant)
+    flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1]
+    memory, seconds = controller.first_memory(state), []
+    for _ in range(calls):
+        began = time.perf_counter()
+        controller.act(state, memory)
+        seconds.append(time.perf_counter() - began)
+    return judged(episodes, flown, in_milliseconds(seconds))
+
+
+def receding(
+    episodes: UnseenEpisodes, config: RecedingHorizonConfig, forecast: Forecast, closure: nn.Module | None = None
+) -> Contender:
+    """Model predictive control, on the exact model or on one with the closure that is given."""
+    exact = episodes.known_closure()
+    controller = RecedingHorizon(episodes.plant, closure or exact, config, forecast=forecast)
+    flown = controller.fly(episodes.initial_state, episodes.exogenous, exact)
+    batch, solves = len(episodes.initial_state), controller.solves
+    milliseconds = in_milliseconds([solve.seconds for solve in solves[batch:]])  # the first solves trace the programs
+    gradients = statistics.median(solve.gradients for solve in solves)
+    return judged(episodes, flown, milliseconds, gradients=gradients, late=sum(solve.late for solve in solves))
+
+
+def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: float) -> dict[str, Forecast]:
+    """The forecasts that are compared: held, decaying to the mean as other episodes do, and known."""
+    records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
+    longest = min(horizon, 0.5 * plant.horizon)
+    decaying = Decaying.fitted(records, dt=plant.dt, horizon=longest)
+    return {"held": Held(), "decaying": decaying, "preview": Preview(exogenous, dt=plant.dt)}
+
+
+def in_milliseconds(seconds: list[float]) -> dict[str, float]:
+    """Median and greatest of some times [ms]."""
+    return {"median": 1e3 * statistics.median(seconds), "max": 1e3 * max(seconds)}

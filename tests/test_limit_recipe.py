@@ -1,0 +1,72 @@
+"""The recipe of the limits, on short episodes, and the start that rests at the end."""
+
+import ast
+import json
+import re
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from printed_commands import blocks
+from test_export_recipe import leave_run, recipe
+
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.study.limits import resting_at_the_end
+from rt_torchrl.trajectories.rollout import Rollout
+
+
+def run(tmp_path, **options):
+    module = recipe("limit")
+    descent = module.BoundedDescentConfig(iterations=300)
+    module.main(module.Config(episodes=2, folder=tmp_path, descent=descent, **options))
+    (path,) = tmp_path.glob("*.json")
+    return json.loads(path.read_text())["contenders"]
+
+
+def mean(contender):
+    return sum(contender["costs"]) / len(contender["costs"])
+
+
+def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
+    _, parts = leave_run(tmp_path / "run", "wind_turbine", policy="paper")
+    found = run(tmp_path, plant="wind_turbine", horizon=15.0, mpc=("held", "preview"), run=tmp_path / "run")
+    controllers = ["MPC, exact, held", "MPC, exact, preview", "MPC, fitted, held", "MPC, fitted, preview"]
+    assert list(found) == ["clairvoyant", "Jonkman", *controllers]
+    best, details = mean(found["clairvoyant"]), found["clairvoyant"]["details"]
+    assert all(best < mean(contender) for name, contender in found.items() if name != "clairvoyant")
+    assert mean(found["MPC, exact, preview"]) < mean(found["MPC, exact, held"])
+    assert mean(found["MPC, exact, preview"]) < mean(found["MPC, fitted, preview"])
+    assert set(details["above_the_best"]) == {"Jonkman", "constant 0.25", "constant 0.5", "constant 0.75", "random 0"}
+    assert found["Jonkman"]["milliseconds"]["median"] > 0.0 and found["clairvoyant"]["milliseconds"] is None
+    printed = capsys.readouterr().out
+    assert f"{mean(found['Jonkman']) / best:.4f}" in printed and "mean power [MW]" in printed
+
+
+def test_the_least_commands_last_as_long_as_costs_least():
+    plant = LinearQuadratic(horizon=2.0, noise=0.0)
+    plant.actions = (plant.actions[0].__class__(symbol="a", name="force", unit="N", low=0.0, high=2.0),)
+    episodes = UnseenEpisodes(plant, 3)
+    commands = torch.full((3, plant.n_steps, 1), 1.0, dtype=torch.float64)
+    rested = resting_at_the_end(episodes, commands, most=1.0, count=20)
+    rollout = Rollout(plant, plant.closure)
+    costs = []
+    for k in range(plant.n_steps + 1):
+        tried = commands.clone()
+        tried[:, k:] = 0.0
+        costs.append(rollout.costs(episodes.initial_state, episodes.exogenous, tried))
+    wanted = torch.stack(costs).amin(0)
+    torch.testing.assert_close(rollout.costs(episodes.initial_state, episodes.exogenous, rested), wanted)
+
+
+def test_the_printed_example_runs(capsys):
+    (code,) = blocks("optimal_control.md", "python")
+    exec(compile(code, "docs/optimal_control.md", "exec"), {})
+    first, second = ast.literal_eval(re.search(r"tensor\((\[.*?\])", capsys.readouterr().out).group(1))
+    assert 0.0 < first < 0.1 and 0.0 < second < 0.1
+
+
+@pytest.mark.parametrize("option", [{"episodes": 1}, {"seed": -1}, {"hold": 0}])
+def test_impossible_options_are_refused(option):
+    ((name, value),) = option.items()
+    with pytest.raises(ValueError, match=f"{name}={value}"):
+        recipe("limit").Config(**option)

@@ -1,0 +1,218 @@
+"""Optimal commands of linear-quadratic problems against quadratic programming and Riccati's equation."""
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import lsq_linear
+
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.optimal_control.clairvoyant import clairvoyant, constant_starts, random_starts
+from rt_torchrl.optimal_control.forecasts import Preview
+from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.trajectory import control_cost
+
+
+def matrices(plant):
+    """The interval as s⁺ = A s + B a + D z, by the four terms of Runge and Kutta's scheme, and the weights of L_a."""
+    continuous = np.array(plant.A) + np.array(plant.true_closure)
+    power, total = np.eye(2), np.zeros((2, 2))
+    for order in range(1, 5):
+        total = total + power * plant.dt / order
+        power = power @ continuous * plant.dt / order
+    # total is now dt·(I + A dt/2 + (A dt)²/6 + (A dt)³/24).
+    A = np.eye(2) + continuous @ total
+    return A, total @ np.array(plant.B), total @ np.array(plant.D), np.array(plant.Q), np.array(plant.R)
+
+
+def quadratic_program(plant, s_0, z):
+    """The optimal actions of an episode as a bounded least-squares problem, and their J_a."""
+    A, B, D, Q, R = matrices(plant)
+    n, root = len(z), np.linalg.cholesky(Q).T
+    gain, free = np.zeros((2, n)), s_0.copy()
+    rows, rest = [], []
+    for k in range(n):
+        rows += [root @ gain, np.sqrt(R[0, 0]) * np.eye(n)[k : k + 1]]
+        rest += [root @ free, np.zeros(1)]
+        gain, free = A @ gain, A @ free + D[:, 0] * z[k]
+        gain[:, k] += B[:, 0]
+    found = lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=(-2.0, 2.0), tol=1e-14)
+    return found.x, 2.0 * found.cost / n
+
+
+def episodes(plant, batch, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return 2.0 * plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator)
+
+
+def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program():
+    plant = LinearQuadratic(horizon=4.0, noise=0.5)
+    state, exogenous = episodes(plant, 3)
+    starts = constant_starts(plant, 3, plant.n_steps)
+    starts |= random_starts(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1), count=2)
+    found = clairvoyant(plant, state, exogenous, starts, config=BoundedDescentConfig(tolerance=0.0))
+    saturated = 0
+    for episode in range(3):
+        actions, cost = quadratic_program(plant, state[episode].numpy(), exogenous[episode, :, 0].numpy())
+        np.testing.assert_allclose(found.flown.actions[episode, :, 0].numpy(), actions, atol=2e-4)
+        assert found.costs[episode].item() == pytest.approx(cost, rel=1e-7)
+        saturated += (np.abs(actions) > 2.0 - 1e-9).sum()
+    assert saturated > 0
+    assert max(found.spread().values()) < 1e-6 and min(found.spread().values()) > -1e-12
+    assert set(found.start_costs) == set(starts) and found.excess == 0.0
+    assert found.gradient.max() < 1e-5
+    torch.testing.assert_close(found.costs, control_cost(plant, found.flown))
+
+
+def test_held_commands_cost_more_than_free_ones_and_change_only_between_blocks():
+    plant = LinearQuadratic(horizon=4.0, noise=0.5)
+    state, exogenous = episodes(plant, 2)
+    starts = constant_starts(plant, 2, plant.n_steps)
+    free, held = (clairvoyant(plant, state, exogenous, starts, hold=hold) for hold in (1, 7))
+    assert (held.costs > free.costs).all()
+    blocks = held.flown.actions[:, :35].reshape(2, 5, 7)
+    assert (blocks == blocks[:, :, :1]).all() and blocks[0, 0, 0] != blocks[0, 1, 0]
+
+
+def test_an_optimum_without_a_start_is_refused():
+    plant = LinearQuadratic(horizon=1.0)
+    with pytest.raises(ValueError, match="starts is empty"):
+        clairvoyant(plant, *episodes(plant, 1), {})
+
+
+def test_starts_that_diverge_are_reported():
+    plant = LinearQuadratic(horizon=1.0)
+    state, exogenous = episodes(plant, 2)
+    nowhere = torch.full((2, plant.n_steps, 1), torch.nan, dtype=torch.float64)
+    middle = constant_starts(plant, 2, plant.n_steps)["constant 0.5"]
+    found = clairvoyant(plant, state, exogenous, {"nowhere": nowhere, "middle": middle})
+    assert found.start_costs["nowhere"].isinf().all() and found.start_costs["middle"].isfinite().all()
+    with pytest.raises(DivergenceError, match="diverges from every start: nowhere"):
+        clairvoyant(plant, state, exogenous, {"nowhere": nowhere})
+
+
+def test_rate_limits_leave_starts_that_agree():
+    plant = WindTurbine(horizon=60.0)
+    state, exogenous = episodes(plant, 2)
+    state = plant.draw_initial_state(2, torch.Generator().manual_seed(0))
+    starts = {"Jonkman": JonkmanController(plant).fly(state, exogenous).actions}
+    starts |= constant_starts(plant, 2, plant.n_steps)
+    found = clairvoyant(plant, state, exogenous, starts)
+    assert max(found.spread().values()) < 1e-3 and found.excess < 1e-3
+    assert found.costs.mean() < 0.5 * control_cost(plant, JonkmanController(plant).fly(state, exogenous)).mean()
+
+
+def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
+    plant = LinearQuadratic(horizon=3.0, noise=0.0)
+    A, B, _, Q, R = matrices(plant)
+    P = solve_discrete_are(A, B, Q, R)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    value = torch.from_numpy(P * plant.dt)
+    config = RecedingHorizonConfig(horizon=0.3, tolerance=0.0, iterations=200)
+    terminal = lambda end: ((end @ value) * end).sum(-1)  # noqa: E731
+    controller = RecedingHorizon(plant, plant.closure, config, terminal=terminal)
+    state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
+    flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
+    s = state.numpy().T
+    for k in range(plant.n_steps):
+        np.testing.assert_allclose(flown.actions[:, k].numpy().T, -K @ s, atol=1e-5)
+        s = A @ s - B @ K @ s
+    assert len(controller.solves) == 2 * plant.n_steps and not any(solve.late for solve in controller.solves)
+
+
+def test_a_preview_until_the_end_is_the_clairvoyant_optimum():
+    plant = LinearQuadratic(horizon=3.0, noise=0.5)
+    state, exogenous = episodes(plant, 2)
+    config = RecedingHorizonConfig(horizon=3.0, period=0.5, ends=True, tolerance=0.0, iterations=300)
+    controller = RecedingHorizon(plant, plant.closure, config, forecast=Preview(exogenous, dt=plant.dt))
+    costs = control_cost(plant, controller.fly(state, exogenous))
+    for episode, cost in enumerate(costs.tolist()):
+        wanted = quadratic_program(plant, state[episode].numpy(), exogenous[episode, :, 0].numpy())[1]
+        assert cost == pytest.approx(wanted, rel=1e-6)
+
+
+def test_acting_interval_by_interval_is_flying():
+    plant = LinearQuadratic(horizon=2.0, noise=0.5)
+    state, exogenous = episodes(plant, 2)
+    controller = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=1.0, period=0.4, hold=0.2))
+    flown = controller.fly(state, exogenous)
+    controller.begin()
+    for k in range(plant.n_steps):
+        command = controller.act(k * plant.dt, flown.states[:, k], exogenous[:, k])
+        torch.testing.assert_close(command, flown.actions[:, k], rtol=1e-9, atol=1e-9)
+
+
+def test_late_solves_leave_the_last_plan():
+    plant = LinearQuadratic(horizon=2.0, noise=0.5)
+    state, exogenous = episodes(plant, 1)
+    config = RecedingHorizonConfig(horizon=1.0, period=0.2, deadline=1e-9)
+    late = RecedingHorizon(plant, plant.closure, config)
+    first = late.plan(0.0, state, exogenous[:, 0])
+    second = late.plan(0.2, state, exogenous[:, 2])
+    assert [solve.late for solve in late.solves] == [False, True]
+    torch.testing.assert_close(second[:, :-2], first[:, 2:], rtol=0.0, atol=1e-15)
+    assert (second[:, -2:] == first[:, -1]).all()
+    late.begin()
+    late.plan(0.0, state, exogenous[:, 0])
+    assert not late.solves[-1].late  # there is no plan to go on with
+
+
+def test_it_acts_on_a_real_system_behind_a_safety_layer_in_time():
+    plant = LinearQuadratic(horizon=3.0, noise=0.5)
+    config = SafetyConfig(interval=plant.dt, deadline=5.0, rates=(100.0,))
+    system = SafetyLayer(PlantEnv(plant, seed=4), config, fallback=(0.0,))
+    controller = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=1.0, deadline=5.0))
+    entries = system.reset()
+    start, states, inputs, applied = entries["state"], [], [], []
+    for k in range(plant.n_steps):
+        inputs.append(entries["exogenous"])
+        entries["action"] = controller.act(k * plant.dt, entries["state"], entries["exogenous"])
+        entries = system.step(entries)["next"]
+        states.append(entries["state"])
+        applied.append(entries["applied"])
+    assert not system.reports[-1].events and not any(solve.late for solve in controller.solves)
+    flown = controller.fly(start, torch.stack(inputs, 1))
+    torch.testing.assert_close(flown.states[:, 1:], torch.stack(states, 1), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(flown.actions, torch.stack(applied, 1), rtol=1e-9, atol=1e-9)
+
+
+def test_a_solve_starts_from_a_guess_that_costs_less():
+    plant = LinearQuadratic(horizon=2.0, noise=0.0)
+    state, exogenous = episodes(plant, 1)
+    best = quadratic_program(plant, state[0].numpy(), exogenous[0, :, 0].numpy())[0]
+    given = {
+        "the optimum": torch.from_numpy(best)[None, :, None],
+        "the least force": torch.full((1, 20, 1), -2.0).double(),
+    }
+    costs = {}
+    for name, commands in {"nothing": None, **given}.items():
+        guess = None if commands is None else lambda s, z, commands=commands: commands
+        config = RecedingHorizonConfig(horizon=2.0, iterations=1)
+        controller = RecedingHorizon(plant, plant.closure, config, guess=guess)
+        planned = controller.plan(0.0, state, exogenous[:, 0])
+        costs[name] = Rollout(plant, plant.closure).costs(state, exogenous, planned).item()
+    assert costs["the optimum"] < 0.99 * costs["nothing"] == pytest.approx(0.99 * costs["the least force"])
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"horizon": 0.25}, "horizon=0.25 s must be a whole multiple of 0.1 s"),
+        ({"horizon": 1.0, "hold": 0.3}, "horizon=1.0 s must be a whole multiple of 0.3 s"),
+        ({"horizon": 1.0, "hold": 0.2, "period": 0.3}, "period=0.3 s must be a whole multiple of 0.2 s"),
+        ({"horizon": 1.0, "period": 2.0}, "period=2.0 s must not be longer than horizon=1.0 s"),
+        ({"horizon": -1.0}, "horizon=-1.0 s of the receding horizon must be positive"),
+        ({"horizon": 1.0, "penalty": -1.0}, "penalty=-1.0"),
+        ({"horizon": 1.0, "iterations": 0}, "iterations=0"),
+    ],
+)
+def test_impossible_horizons_are_refused(options, message):
+    plant = LinearQuadratic()
+    with pytest.raises(ValueError, match=message):
+        RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(**options))
