@@ -4,7 +4,8 @@
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.disturbance import require_request
 from .plants.integrators import rk4_step
-from .plants.plant import Plant, Transition, require_stable_step
+from .plants.plant import Plant, Transition
+from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.signal import Signal
 from .contract import ContractReport, PlantContractError, check_plant
