@@ -4,6 +4,7 @@
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.disturbance import require_request
 from .plants.integrators import rk4_step
+from .plants.measurement import Component, Measurement, Preview
 from .plants.plant import Plant, Transition
 from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
@@ -61,6 +62,7 @@ __all__ = [
     "BoundedPerceptron",
     "CallingSimulator",
     "ClassicalController",
+    "Component",
     "ContractReport",
     "DecisionTree",
     "Descended",
@@ -79,12 +81,14 @@ __all__ = [
     "LearnerConfig",
     "LoadedRun",
     "LongTermMemoryConfig",
+    "Measurement",
     "Planner",
     "PlannerConfig",
     "Plant",
     "PlantContractError",
     "PlantEnv",
     "PositiveCoefficients",
+    "Preview",
     "Reading",
     "RealController",
     "RealSystem",
