@@ -229,9 +229,8 @@ def every_controller():
         mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=generator())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
         for observe in plant.observation_sets:
-            if observe != "preview":  # nothing computes a preview from what is measured now
-                plant = kind(observe=(observe,))
-                yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-{observe}")
+            plant = kind(observe=(observe,))
+            yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-{observe}")
     plant = WindTurbine(observe=("scheduled",))
     yield pytest.param(plant, GainScheduled(plant, generator=generator()), id="gain-scheduled")
 
