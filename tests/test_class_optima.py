@@ -1,19 +1,20 @@
-"""What a policy sees decides how near it comes to the limit: optima of classes of turbine policies.
+"""What a policy sees decides how near it comes to the limit: optima of classes of policies of turbine and drone.
 
-The limit is the clairvoyant optimum of the paper's cost on these eight episodes, 0.00509.
+The limits are the clairvoyant optima of the paper's costs on these eight episodes.
 """
 
 import pytest
 import torch
 
 from rt_torchrl import SaturatedMLP
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.costs import TASKS
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.policies import SaturatedAffine
 
-LIMIT = 0.00509
+LIMIT, LIMIT_OF_DRONE = 0.00509, 6.3582
 EPISODES, SEED = 8, 12345
 
 
@@ -33,6 +34,12 @@ def optimum(plant, make_policy, *, starts=1, approach=600, iterations=500):
 def test_a_small_perceptron_comes_near_the_limit(observe, greatest):
     plant = WindTurbine(observe=(observe,))
     assert LIMIT < optimum(plant, perceptron(plant)).cost <= greatest * LIMIT
+
+
+@pytest.mark.nightly
+def test_a_small_perceptron_of_wind_and_phase_flies_the_drone_at_the_limit():
+    plant = FlappingWing(observe=("measured+wind",))
+    assert optimum(plant, perceptron(plant), approach=240, iterations=120).cost <= 1.003 * LIMIT_OF_DRONE
 
 
 @pytest.mark.nightly
