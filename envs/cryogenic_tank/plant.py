@@ -95,8 +95,7 @@ class CryogenicTank(Plant):
     states = sensors.STATES
     actions: tuple[Signal, ...] = (COMMANDS["drop"].signal,)
     inputs = sensors.INPUTS
-    measurements = sensors.MEASUREMENTS
-    observation_sets = sensors.OBSERVATION_SETS
+    measurements, observation_sets = sensors.MEASUREMENTS, sensors.OBSERVATION_SETS
     error_sizes: Tensor
 
     def __init__(
