@@ -19,6 +19,7 @@ from rt_torchrl import (
     TwinningConfig,
     main_of,
 )
+from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
@@ -66,7 +67,15 @@ class Config(RunConfig):
     """Train twin and controllers on the cryogenic tank.
 
     Args:
-        policy: paper (a cubic of the pressure error, 3 weights) or mlp.
+        policy: paper (a cubic of the pressure error with 3 weights; an affine law of other observations) or mlp.
+        observe: what the policies observe, by names of sets and of measurements: paper or errors (of the pressure),
+            clock (this and the time of the episode), phase (this and the phase of the orbit), measured (all states),
+            measured+load (all of these and the heat load), or names such as heat_load; by default paper.
+        command: action of the policies: drop (the pressure drop of a valve that is held half open, as in the paper) or
+            duty (the share of time in which the valve is open).
+        vented_weight: weight in J_a of the vented mass [s/kg].
+        end_weight: weight in J_a of the squared pressure error at the end of an episode, as the time [s] for which that
+            error would cost as much; 0 is the paper's J_a, whose optimum stops venting 12 h before the end.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         fluid: name in CoolProp of the pure fluid in the tank.
@@ -79,6 +88,10 @@ class Config(RunConfig):
 
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
+    observe: tuple[str, ...] = ()
+    command: Literal["drop", "duty"] = "drop"
+    vented_weight: float = 5000.0
+    end_weight: float = 0.0
     closure: Literal["paper", "mlp"] = "paper"
     dt: float = 30.0
     horizon: float = 4.32e5
@@ -88,6 +101,11 @@ class Config(RunConfig):
     model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
+
+    def __post_init__(self):
+        super().__post_init__()
+        CryogenicTank.chosen(self.observe)
+        self.cost()
 
     def defaults(self) -> "Config":
         twinning = NEURAL if self.closure == "mlp" else CONVERGED
@@ -104,7 +122,14 @@ class Config(RunConfig):
             fluid=self.fluid,
             wall=self.wall,
             wall_heat_capacity=self.wall_heat_capacity,
+            cost=self.cost(),
+            command=self.command,
+            observe=self.observe,
         )
+
+    def cost(self) -> PressureCost:
+        """The cost that the options ask for."""
+        return PressureCost(vented=self.vented_weight, end=self.end_weight)
 
     def wear(self, plant: CryogenicTank) -> Callable[[int], nn.Module] | None:
         if not self.model_error:

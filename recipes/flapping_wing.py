@@ -16,6 +16,7 @@ from rt_torchrl import (
     TwinningConfig,
     main_of,
 )
+from rt_torchrl.envs.flapping_wing.costs import TrackingCost, require_rate
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -69,12 +70,19 @@ class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
     Args:
-        policy: paper (an affine law of position and speed errors with offset, 10 weights) or mlp.
+        policy: paper (an affine law of the observation with offset: 10 weights for the errors) or mlp.
+        observe: what the policies observe, by names of sets and of measurements: paper or errors (of position and
+            speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
+            these), or names such as headwind; by default paper.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         mean_wind: mean headwind [m/s].
         wind_deviation: standard deviation of the headwind [m/s].
         peak: height of the window of J_a around the target: unit, or printed as in the paper.
+        energy: weight in J_a of the power of the wings.
+        tilt: weight in J_a of the rate of the stroke plane, in (1000 deg/s)².
+        stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; by default there is none, and the angle may
+            flip within a wing beat.
         model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
     """
 
@@ -84,7 +92,11 @@ class Config(RunConfig):
     horizon: float = 5.0
     mean_wind: float = 1.0
     wind_deviation: float = 1.0
+    observe: tuple[str, ...] = ()
     peak: Literal["unit", "printed"] = "unit"
+    energy: float = 0.0
+    tilt: float = 0.0
+    stroke_plane_rate: float | None = None
     model_error: bool = False
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
@@ -93,6 +105,9 @@ class Config(RunConfig):
         super().__post_init__()
         if abs(self.mean_wind) > STORM:
             raise ValueError(f"mean_wind={self.mean_wind} m/s must lie within ±{STORM:g} m/s.")
+        FlappingWing.chosen(self.observe)
+        self.cost()
+        require_rate(self.stroke_plane_rate)
         if not 0.0 <= self.wind_deviation <= STORM:
             raise ValueError(f"wind_deviation={self.wind_deviation} m/s must lie in [0, {STORM:g}].")
 
@@ -101,7 +116,19 @@ class Config(RunConfig):
 
     def plant(self, mass: float = MASS) -> FlappingWing:
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)
-        return FlappingWing(dt=self.dt, horizon=self.horizon, wind=wind, peak=self.peak, mass=mass)
+        return FlappingWing(
+            dt=self.dt,
+            horizon=self.horizon,
+            wind=wind,
+            cost=self.cost(),
+            mass=mass,
+            stroke_plane_rate=self.stroke_plane_rate,
+            observe=self.observe,
+        )
+
+    def cost(self) -> TrackingCost:
+        """The running cost that the options ask for."""
+        return TrackingCost(peak=self.peak, energy=self.energy, rate=self.tilt)
 
     def believed(self) -> FlappingWing | None:
         """The physics of a twin that is wrong about them; None if it is right."""

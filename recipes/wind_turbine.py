@@ -19,8 +19,9 @@ from rt_torchrl import (
     main_of,
     require_device,
 )
+from rt_torchrl.envs.wind_turbine.costs import TASKS
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
-from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
+from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
@@ -64,9 +65,15 @@ class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
-        policy: paper (an affine law of e1 and e2 without bias, 4 weights), bias (that law with bias, 6 weights), mlp,
-            or scheduled (torque by the square of the speed and gain-scheduled PI pitch, which also observes speed and
-            pitch, and whose gains start detuned).
+        policy: paper (an affine law of the observation without bias: 4 weights for e1 and e2), bias (that law with
+            bias: 6 weights), mlp, or scheduled (torque by the square of the speed and gain-scheduled PI pitch, whose
+            gains start detuned).
+        observe: what the policies observe, by names of sets and of measurements: paper (the errors e1 and e2), errors
+            (these and the rotor speed), scheduled (these and what a gain-scheduled law needs), measured (all states),
+            measured+wind, preview (these and the wind in 2, 4 and 8 s, as a lidar measures it), or names such as
+            rotor_speed; by default paper, or scheduled for the policy scheduled.
+        task: what is wanted: paper (the paper's J_a), or engineering (energy up to rated power, with penalties on
+            overspeed, overshoot, and the rates of pitch and torque).
         dt: control interval [s], 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         mean_wind: mean wind speed U [m/s].
@@ -79,6 +86,8 @@ class Config(RunConfig):
 
     policy: Literal["paper", "bias", "mlp", "scheduled"] = "paper"
     closure: Literal["paper", "mlp"] = "paper"
+    observe: tuple[str, ...] = ()
+    task: Literal["paper", "engineering"] = "paper"
     dt: float = 0.5
     horizon: float = 600.0
     mean_wind: float = 11.0
@@ -94,11 +103,13 @@ class Config(RunConfig):
             raise ValueError(f"mean_wind={self.mean_wind} m/s must be positive and at most {STORM:g} m/s.")
         if not 0.0 <= self.turbulence <= 1.0:
             raise ValueError(f"turbulence={self.turbulence} must lie in [0, 1], such as 0.16 for 16 %.")
+        WindTurbine.chosen(self.observe)
         other = self.model_free_policy
-        if "scheduled" in (self.policy, other) and other not in ("same", self.policy, "mlp"):
+        if not self.observe and "scheduled" in (self.policy, other) and other not in ("same", self.policy, "mlp"):
             raise ValueError(
                 f"model_free_policy={other!r} does not go with policy={self.policy!r}: of the two, only the scheduled "
-                "one observes speed and pitch. Choose same, or policy scheduled and model_free_policy mlp."
+                "one observes speed and pitch. Choose same, or policy scheduled and model_free_policy mlp; or say by "
+                "observe what both see."
             )
 
     def defaults(self) -> "Config":
@@ -108,8 +119,8 @@ class Config(RunConfig):
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
             wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
-        kind = InstrumentedTurbine if self.policy == "scheduled" else WindTurbine
-        return kind(dt=self.dt, horizon=self.horizon, wind=wind)
+        observe = self.observe or (("scheduled",) if self.policy == "scheduled" else ())
+        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=TASKS[self.task], observe=observe)
 
     @staticmethod
     def wind_of(path: Path) -> WindRecord:
@@ -124,9 +135,11 @@ class Config(RunConfig):
             raise ValueError(f"wind_files: {error}") from error
 
     def make_policy(self, plant: WindTurbine, generator: torch.Generator) -> nn.Module:
+        if self.policy == "scheduled":
+            return GainScheduled(plant, generator=generator)
         if self.policy == "bias":
             return plant.make_policy(generator, bias=True)
-        return plant.make_policy(generator) if self.policy == "scheduled" else super().make_policy(plant, generator)
+        return super().make_policy(plant, generator)
 
     def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
         if not self.model_error:

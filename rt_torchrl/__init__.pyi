@@ -4,7 +4,9 @@
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.disturbance import require_request
 from .plants.integrators import rk4_step
-from .plants.plant import Plant, Transition, require_stable_step
+from .plants.measurement import Component, Measurement, Preview
+from .plants.plant import Plant, Transition
+from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.signal import Signal
 from .contract import ContractReport, PlantContractError, check_plant
@@ -64,6 +66,7 @@ __all__ = [
     "CallingSimulator",
     "Clairvoyant",
     "ClassicalController",
+    "Component",
     "ContractReport",
     "Decaying",
     "DecisionTree",
@@ -85,6 +88,7 @@ __all__ = [
     "LearnerConfig",
     "LoadedRun",
     "LongTermMemoryConfig",
+    "Measurement",
     "Planner",
     "PlannerConfig",
     "Plant",

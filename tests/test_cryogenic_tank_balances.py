@@ -135,7 +135,7 @@ def test_vented_mass_weighs_a_tenth_of_the_tracking_error_at_the_start():
         vented += plant.vent(state, drop, plant.closure).flow.mean().item() / n
         state = plant.step(TIME_ZERO, state, drop, load, plant.closure).state
     # A factor of two, because policies with the wrong sign dominate the tracking error.
-    assert 0.05 < plant.cost_weights[1] * vented / tracking < 0.2
+    assert 0.05 < plant.cost.vented * vented / tracking < 0.2
 
 
 # The wall

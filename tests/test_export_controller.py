@@ -11,7 +11,7 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.linalg import expm
 
 from rt_torchrl import export_controller, shipped_plants
-from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
+from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
@@ -66,11 +66,13 @@ def law(plant):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", [WindTurbine, pytest.param(InstrumentedTurbine, marks=pytest.mark.slow)])
-def test_a_turbine_flies_an_episode_by_its_controller_in_c(kind, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "observe", ["paper", *(pytest.param(s, marks=pytest.mark.slow) for s in ("scheduled", "measured+wind"))]
+)
+def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, monkeypatch):
     """Rotor speed and wind go in; the loops of C and of torch are closed one by one."""
     monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 50)
-    plant = kind()
+    plant = WindTurbine(observe=(observe,))
     policy = law(plant)
     n_memory = len(plant.states) - 1
     agreement = export_controller(policy, tmp_path / "turbine.c", plant, name="turbine")
@@ -217,8 +219,11 @@ def every_controller():
         yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
         mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=generator())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
-    plant = InstrumentedTurbine()
-    yield pytest.param(plant, plant.make_policy(generator()), id="gain-scheduled")
+        for observe in plant.observation_sets:
+            plant = kind(observe=(observe,))
+            yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-{observe}")
+    plant = WindTurbine(observe=("scheduled",))
+    yield pytest.param(plant, GainScheduled(plant, generator=generator()), id="gain-scheduled")
 
 
 @needs_compiler

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
-from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.measurements import FAST_FILTER
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import Rollout
@@ -32,7 +32,7 @@ def observed(plant, omega, beta, rate=0.0):
 
 
 def test_torque_is_the_square_law_far_below_and_constant_power_far_above():
-    plant = InstrumentedTurbine()
+    plant = WindTurbine(observe=("scheduled",))
     policy = nominal(plant)
     # The logistic blend leaves e^-20 of the other region.
     below, above = (policy(observed(plant, omega, 0.0))[0].item() for omega in (100.0, 140.0))
@@ -44,7 +44,7 @@ def test_torque_is_the_square_law_far_below_and_constant_power_far_above():
 
 @pytest.mark.parametrize(("omega", "rate", "beta"), [(126.0, 0.0, 5.0), (124.5, 0.7, 12.0), (123.0, -0.4, 8.0)])
 def test_pitch_moves_by_the_increment_of_the_scheduled_law(omega, rate, beta):
-    plant = InstrumentedTurbine()
+    plant = WindTurbine(observe=("scheduled",))
     push = 1.0787 * 1.570796 * rate + 0.462299 * (omega - 124.5)  # K_P and K_I in degrees
     expected = beta + 0.5 * push / (1.0 + beta / 6.302335)
     # The constants above have seven digits.
@@ -52,8 +52,8 @@ def test_pitch_moves_by_the_increment_of_the_scheduled_law(omega, rate, beta):
 
 
 def test_commands_stay_in_their_ranges_and_gains_start_detuned():
-    plant = InstrumentedTurbine()
-    policy = plant.make_policy(generator(3))
+    plant = WindTurbine(observe=("scheduled",))
+    policy = GainScheduled(plant, generator=generator(3))
     seen = torch.stack([observed(plant, w, b, r) for w in (0.0, 90.0, 200.0) for b in (0.0, 30.0) for r in (-9.0, 9.0)])
     commands = policy(seen)
     for column, action in zip(commands.unbind(-1), plant.actions, strict=True):
@@ -63,7 +63,7 @@ def test_commands_stay_in_their_ranges_and_gains_start_detuned():
 
 
 def test_instruments_change_nothing_of_the_turbine():
-    rich, plain = InstrumentedTurbine(horizon=50.0), WindTurbine(horizon=50.0)
+    rich, plain = WindTurbine(horizon=50.0, observe=("scheduled",)), WindTurbine(horizon=50.0)
     state, wind = rich.draw_initial_state(3, generator()), rich.draw_exogenous(3, generator())
     low, high = bounds(plain.actions)
     command = low + (high - low) * torch.rand(3, rich.n_steps, 2, generator=generator(1), dtype=torch.float64)
@@ -74,14 +74,14 @@ def test_instruments_change_nothing_of_the_turbine():
     # An exact low-pass of a speed that is about linear over an interval. Random commands bend it: by the rotor's time
     # constant of 16 s, some Δt²/8·(1 rad/s²) = 0.03 rad/s within it, which the filter hands on.
     speed, filtered = rich.gear_ratio * found[..., 0], found[..., 6]
-    decay = torch.exp(tensor(-0.5 * rich.fast_filter))
-    ramp = (1.0 - decay) / (0.5 * rich.fast_filter)
+    decay = torch.exp(tensor(-0.5 * FAST_FILTER))
+    ramp = (1.0 - decay) / (0.5 * FAST_FILTER)
     exact = decay * filtered[:, :-1] + (ramp - decay) * speed[:, :-1] + (1.0 - ramp) * speed[:, 1:]
     torch.testing.assert_close(filtered[:, 1:], exact, rtol=0.0, atol=0.1)
 
 
 def test_with_jonkmans_constants_it_flies_as_his_controller():
-    plant = InstrumentedTurbine()
+    plant = WindTurbine(observe=("scheduled",))
     state, wind = plant.draw_initial_state(4, generator(5)), plant.draw_exogenous(4, generator(5))
     flown = Rollout(plant, plant.closure, nominal(plant, reference_speed=122.9096, switch_speed=120.0))(state, wind)
     power, expected = (
@@ -93,9 +93,9 @@ def test_with_jonkmans_constants_it_flies_as_his_controller():
 
 
 def test_the_exact_gradient_of_the_gains_is_that_of_finite_differences():
-    plant = InstrumentedTurbine(horizon=60.0)
+    plant = WindTurbine(horizon=60.0, observe=("scheduled",))
     state, wind = plant.draw_initial_state(2, generator(2)), plant.draw_exogenous(2, generator(2)) + 2.0
-    policy = plant.make_policy(generator(4))
+    policy = GainScheduled(plant, generator=generator(4))
     rollout = Rollout(plant, plant.closure, policy)
 
     def cost():

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from torchdiffeq import odeint
 
 from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
-from rt_torchrl.plants.plant import require_stable_step
+from rt_torchrl.plants.stability import require_stable_step
 
 
 def tensor(*values):

@@ -1,6 +1,7 @@
 """Every run that a recipe can make is loaded again, and the recipe is found by what the run says of it."""
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import json
@@ -10,11 +11,13 @@ import sys
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from small_runs import SMALL
 from test_export_recipe import RECIPES, leave_run, recipe
 
 from rt_torchrl import load_run
 from rt_torchrl.options import choices
 from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
@@ -45,6 +48,28 @@ def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, pol
         assert type(found) is type(part)
         assert all(torch.equal(found.state_dict()[key], value) for key, value in part.state_dict().items())
     assert isinstance(run.policy("model_free"), SaturatedMLP) >= (other == "mlp")
+
+
+CHOICES = {
+    "wind_turbine": {"observe": ("preview", "speed_rate"), "task": "engineering", "horizon": 10.0},
+    "flapping_wing": {"observe": ("measured+wind",), "stroke_plane_rate": 3000.0, "energy": 0.1, "horizon": 0.05},
+    "cryogenic_tank": {"observe": ("measured+load",), "command": "duty", "end_weight": 7200.0, "horizon": 3000.0},
+}
+
+
+@pytest.mark.parametrize("plant", CHOICES)
+def test_a_training_by_other_observations_and_costs_is_loaded_and_not_mixed(plant, tmp_path):
+    made = load_recipe(RECIPES / f"{plant}.py")
+    config = made.Config(
+        **CHOICES[plant], policy="mlp", hidden=(3,), episodes=1, unseen=2, untrained=0, log_dir=tmp_path, twinning=SMALL
+    )
+    made.main(config)
+    run = load_run(tmp_path)
+    assert settings_of(run.config, plant) == settings_of(config, plant) and run.plant.cost == config.plant().cost
+    assert run.plant.observations == config.plant().observations != made.Config().plant().observations
+    assert (tmp_path / "figures" / "exogenous.png").exists()
+    with pytest.raises(ValueError, match="observe is"):
+        made.main(dataclasses.replace(config, observe=("paper",), resume=True))
 
 
 @pytest.mark.parametrize("plant", PLANTS)

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from torch import nn
 
 from rt_torchrl.envs.wind_turbine import plant as module
+from rt_torchrl.envs.wind_turbine.costs import PaperCost
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import HUB_INERTIA, WindTurbine
@@ -127,7 +128,7 @@ def test_reference_power_in_its_regions(c_p):
 
 def test_cost_counts_speed_and_power_errors():
     """e_1 = 0.1 and e_P = −0.2, put together by hand: ½(2·0.01 + 3·0.04)."""
-    plant = WindTurbine(cost_weights=(2.0, 3.0))
+    plant = WindTurbine(cost=PaperCost(speed=2.0, power=3.0))
     omega = OMEGA_RATED
     power = min(5e6, plant.optimal_gain * (N_G * omega) ** 3) - 0.2 * 5e6
     applied = torch.tensor([[power / (N_G * omega), 0.0]], dtype=torch.float64)
@@ -258,7 +259,7 @@ def test_exponent_stays_above_one_whatever_the_weight():
         SaintDrenan.from_set("Nobody2000")
 
 
-@pytest.mark.parametrize("change", [{"inertia": 0.0}, {"rate_limits": (15e3, -1.0)}, {"cost_weights": (-1.0, 1.0)}])
+@pytest.mark.parametrize("change", [{"inertia": 0.0}, {"rate_limits": (15e3, -1.0)}, {"observe": ("rotor",)}])
 def test_wrong_arguments_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         WindTurbine(**change)

@@ -5,6 +5,7 @@ from typing import cast
 import torch
 from matplotlib.figure import Figure
 
+from rt_torchrl.envs.cryogenic_tank.commands import GREATEST_DROP
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.evaluation.closure_error import visited_features
 from rt_torchrl.figures.snapshot import Snapshot
@@ -41,7 +42,7 @@ def coefficients(snapshot: Snapshot) -> Figure:
         ("pressure [kPa]", 1e-3 * plant.set_point),
         ("liquid volume [m³]", plant.volume),
         ("wall-fluid difference [mK]", 1e3 * plant.superheat_unit),
-        ("valve drop [kPa]", 1e-3 * plant.actions[0].high),
+        ("valve drop [kPa]", 1e-3 * GREATEST_DROP),
     )
     title = f"Coefficients, episode {last_episode(snapshot)}\nother features at their mean in the episode"
     figure, axes = panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")

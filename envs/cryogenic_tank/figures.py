@@ -43,7 +43,9 @@ DAY = 86_400.0
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
     """Every figure of the tank, by name; its ``closure_weights`` replaces the general figure, which knows no units."""
-    drawn = {figure.__name__: figure(snapshot) for figure in (tank, heat_exchanger, vent_path)}
+    # A duty cycle has no pressure drops to draw the exchanger over.
+    over_drops = [heat_exchanger] if snapshot.plant.actions[0].name == "valve_drop" else []
+    drawn = {figure.__name__: figure(snapshot) for figure in (tank, *over_drops, vent_path)}
     if snapshot.large_scale is not None and tracked_weights(snapshot.episodes):
         drawn["closure_weights"] = closure_weights(snapshot, LABELS)
     if not isinstance(snapshot.closure, ConstantCoefficients):
@@ -163,7 +165,7 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
 def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
     """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
-    return p - plant.valve_outlet(p, actions[:, 0])
+    return p - plant.valve_outlet(p, plant.command.opening(actions[:, 0])[0])
 
 
 @torch.no_grad()
@@ -177,7 +179,7 @@ def vent_path(snapshot: Snapshot) -> Figure:
     last = slice(-min(len(record.actions), round(DAY / plant.dt)), None)
     states, drop = record.states[:-1][last], _drop(plant, record.states[:-1][last], record.actions[last]).mean()
     state = states.mean(0)
-    effectiveness = plant.vent(state, drop[None], plant.closure).effectiveness.item()
+    effectiveness = plant.vent(state, plant.command.of_drop(drop)[None], plant.closure).effectiveness.item()
     path = VentPath.of(plant.saturation.fluid, state[2].item(), drop.item(), effectiveness)
     hours = len(states) * plant.dt / 3600.0
     title = f"Path of the vented {plant.saturation.fluid.lower()}, episode {last_episode(snapshot)}"

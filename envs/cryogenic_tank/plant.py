@@ -1,23 +1,28 @@
 r"""The cryogenic tank as a plant: a wall, a saturated mixture and a thermodynamic vent (paper, section 5.3)."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.envs.cryogenic_tank import measurements as sensors
+from rt_torchrl.envs.cryogenic_tank import merit as judgement
+from rt_torchrl.envs.cryogenic_tank.commands import COMMANDS, GREATEST_DROP
+from rt_torchrl.envs.cryogenic_tank.costs import PressureCost, TankCost, require_sizes
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad, LoadModel
-from rt_torchrl.envs.cryogenic_tank.merit import merit
 from rt_torchrl.envs.cryogenic_tank.mixture import Conditions, evaporation_heat, mixture_rates
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.neural import first_neural_guess
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
-from rt_torchrl.envs.cryogenic_tank.vent import Vent, valve_conductance, vent
+from rt_torchrl.envs.cryogenic_tank.vent import Vent, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
 from rt_torchrl.plants.integrators import rk4_step
-from rt_torchrl.plants.plant import Plant, Transition, require_stable_step
+from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.stability import require_stable_step
 
 Wall = Literal["explicit", "exponential"]
 
@@ -44,6 +49,8 @@ class CryogenicTank(Plant):
     e     pressure_error     :math:`e = (p - \tilde p)/10\,\mathrm{kPa}`    -      about ±15
     ====  =================  =============================================  =====  =========================
 
+    The table shows the paper's action a and observation e; ``command`` and ``observe`` choose others.
+
     A pressure outside the range makes the rates NaN, which the library reports as a ``DivergenceError``.
 
     Note: the paper prints no mass of the wall; here m_s c_s is 500 kJ/K, because a bare shell of aluminium at 27 K
@@ -61,8 +68,10 @@ class CryogenicTank(Plant):
         fluid: pure fluid in the tank, by its name in CoolProp; ``ParaHydrogen`` is what hydrogen becomes when stored.
         wall: ``explicit`` integrates the wall with the rest, ``exponential`` by its own solution, see :meth:`step`.
         wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
-        cost_weights: α1 [-] and α2 [s/kg] of J_a. With 5000 s/kg the vented mass weighs a tenth of the tracking error
-            under the random policies that a training starts from.
+        cost: running and terminal cost of J_a, see ``costs.py``; None for the paper's.
+        command: action: the drop of a valve that is held half open, or the duty cycle of a valve that is either shut or
+            open. A half-open valve takes less heat per mass that it vents.
+        observe: names of measurements and observation sets in ``measurements.py``; by default the paper's error.
         error_sizes: errors of T_s [K], V_l [m³] and p [Pa] that weigh the same in J_p, α_3 = 0.05⁻² K⁻² and so on.
 
     Raises:
@@ -73,24 +82,20 @@ class CryogenicTank(Plant):
 
     volume = 60.0  # V_t [m³]
     first_fill = 0.7  # V_l/V_t at the start
-    set_point = 500e3  # p̃ [Pa]
+    set_point = sensors.SET_POINT
     first_pressure_spread = 25e3  # standard deviation of p(0) [Pa]
-    error_unit = 10e3  # [Pa]
+    error_unit = sensors.ERROR_UNIT
+    orbit = 5400.0  # T_h, by which the phase of the orbit is observed [s]
     wall_area = 74.1  # A_s [m²]
     back_pressure = 80e3  # least p_1 [Pa], held by a regulator at the end of the vent line
     greatest_pressure = 900e3  # end of the saturation table [Pa]; a shut tank reaches 700 kPa in an episode
     superheat_unit = 0.05  # typical T_s − T [K]
     rated_valve = ConstantCoefficients.true_coefficients[2]  # K_JT of the valve's data sheet, for the cost [Pa s²/kg²]
 
-    states = (
-        Signal(symbol="T_s", name="wall_temperature", unit="K", low=0.0),
-        Signal(symbol="V_l", name="liquid_volume", unit="m³", low=0.0, high=60.0),
-        Signal(symbol="p", name="pressure", unit="Pa", low=80e3, high=900e3),
-    )
-    actions = (Signal(symbol=r"\Delta p_V", name="valve_drop", unit="Pa", low=0.0, high=200e3),)
-    inputs = (Signal(symbol="Q_h", name="heat_load", unit="W", low=0.0),)
-    observations = (Signal(symbol="e", name="pressure_error", unit="-"),)
-
+    states = sensors.STATES
+    actions: tuple[Signal, ...] = (COMMANDS["drop"].signal,)
+    inputs = sensors.INPUTS
+    measurements, observation_sets = sensors.MEASUREMENTS, sensors.OBSERVATION_SETS
     error_sizes: Tensor
 
     def __init__(
@@ -103,20 +108,24 @@ class CryogenicTank(Plant):
         fluid: str = "Hydrogen",
         wall: Wall = "explicit",
         wall_heat_capacity: float = 500e3,
-        cost_weights: tuple[float, float] = (1.0, 5000.0),
+        cost: TankCost | None = None,
+        command: Literal["drop", "duty"] = "drop",
         error_sizes: tuple[float, float, float] = (0.05, 0.05, 1e3),
+        observe: Sequence[str] = (),
     ):
-        super().__init__(dt=dt, horizon=horizon, closure=ConstantCoefficients.true() if closure is None else closure)
+        constants = ConstantCoefficients.true() if closure is None else closure
+        super().__init__(dt=dt, horizon=horizon, closure=constants, observe=observe)
+        if command not in COMMANDS:
+            raise ValueError(f"command={command!r} does not exist; choose one of {', '.join(COMMANDS)}.")
         if wall not in get_args(Wall):
             raise ValueError(f"wall={wall!r} does not exist; choose one of {', '.join(get_args(Wall))}.")
-        if not (math.isfinite(wall_heat_capacity) and wall_heat_capacity > 0.0):
+        if not 0.0 < wall_heat_capacity < math.inf:
             raise ValueError(f"wall_heat_capacity={wall_heat_capacity} J/K must be positive and finite.")
-        if not all(0.0 <= weight < math.inf for weight in cost_weights):
-            raise ValueError(f"cost_weights={cost_weights} must be finite and not negative.")
-        if not all(0.0 < size < math.inf for size in error_sizes):
-            raise ValueError(f"error_sizes={error_sizes} (K, m³, Pa) must be positive and finite.")
+        require_sizes(error_sizes)
         self.load = CyclicLoad() if load is None else load
-        self.wall, self.wall_heat_capacity, self.cost_weights = wall, float(wall_heat_capacity), cost_weights
+        self.wall, self.wall_heat_capacity = wall, float(wall_heat_capacity)
+        self.command, self.actions = COMMANDS[command], (COMMANDS[command].signal,)
+        self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)
         self.register_buffer("error_sizes", torch.tensor(error_sizes, dtype=torch.float64))
         if wall == "explicit":
@@ -200,18 +209,20 @@ class CryogenicTank(Plant):
     ) -> Float[Tensor, "*batch 4"]:
         """The features of a closure, all of order one: p/p̃, V_l/V_t, (T_s − T)/0.05 K and Δp_V/Δp_max."""
         T_s, V_l, p = state.unbind(-1)
-        superheat, opening = (T_s - T) / self.superheat_unit, action[..., 0] / self.actions[0].high
-        return torch.stack([p / self.set_point, V_l / self.volume, superheat, opening], -1)
+        superheat, (drop, _) = (T_s - T) / self.superheat_unit, self.command.opening(action[..., 0])
+        return torch.stack([p / self.set_point, V_l / self.volume, superheat, drop / GREATEST_DROP], -1)
 
     def _conditions(self, state: Tensor, action: Tensor, closure: nn.Module) -> Conditions:
         p = state[..., 2]
-        p_1 = self.valve_outlet(p, action[..., 0])
+        drop, share = self.command.opening(action[..., 0])
+        p_1 = self.valve_outlet(p, drop)
         # Both pressures stand side by side, so that one gather in the table serves both.
         values, slopes = self.saturation.with_slopes(torch.stack([p, p_1], -1))
         tank, line = (Properties(*(x[..., k] for x in values)) for k in (0, 1))
         slope = Properties(*(x[..., 0] for x in slopes))
         U_s, U_HX, K_JT = closure(self.features(state, action, tank.T)).unbind(-1)
-        vented = vent(p - p_1, tank, line, slope.T, U_HX, K_JT)
+        flow, heat, effectiveness, pumped = vent(p - p_1, tank, line, slope.T, U_HX, K_JT)
+        vented = Vent(share * flow, share * heat, effectiveness, share * pumped)
         return Conditions(tank, slope, U_s * self.wall_area, vented)
 
     def _mixture_rates(self, V_l: Tensor, now: Conditions, Q_sf: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,12 +256,6 @@ class CryogenicTank(Plant):
 
     # The control problem
 
-    def observe(
-        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 3"], exogenous: Float[Tensor, "*#batch 1"]
-    ) -> Float[Tensor, "*batch 1"]:
-        """The error e = (p − p̃)/10 kPa; the load is not observed."""
-        return (state[..., 2:] - self.set_point) / self.error_unit
-
     def running_cost(
         self,
         t: Float[Tensor, "*#batch"],
@@ -258,16 +263,12 @@ class CryogenicTank(Plant):
         applied: Float[Tensor, "*batch 1"],
         exogenous: Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch"]:
-        r"""The cost α_1 e² + α_2 ṁ_c (paper, eq. cryo_J_a).
+        """The cost of the task, see ``costs.py``."""
+        return self.cost(self, t, state, applied, exogenous)
 
-        Note: in the paper ṁ_c is that of the twin's own valve; here it is that of a valve with the rated K_JT, in the
-        real plant and in the twin, because a cost is a function of state and action alone.
-        """
-        p = state[..., 2]
-        drop = p - self.valve_outlet(p, applied[..., 0])
-        rated_flow = drop * valve_conductance(drop, torch.full_like(drop, self.rated_valve))
-        e = self.observe(t, state, exogenous)[..., 0]
-        return self.cost_weights[0] * e**2 + self.cost_weights[1] * rated_flow
+    def terminal_cost(self, state: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The cost of the pressure at the end, see ``costs.py``."""
+        return self.cost.terminal(self, state)
 
     def discrepancy(
         self, state: Float[Tensor, "*#batch 3"], measured: Float[Tensor, "*#batch 3"]
@@ -275,8 +276,7 @@ class CryogenicTank(Plant):
         r"""The sum of the squared errors of T_s, V_l and p over their natural sizes, over T_o (paper, eq. of J_p)."""
         return (((state - measured) / self.error_sizes) ** 2).sum(-1) / self.horizon
 
-    def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
-        return merit(self, states, applied, exogenous)
+    merit, make_neural_closure = judgement.merit, first_neural_guess
 
     # Randomness
 
@@ -293,8 +293,8 @@ class CryogenicTank(Plant):
         """The paper's first guess, U_s = U_HX = 1 W/(m² K) and K_JT = 10 GPa s²/kg²; nothing is drawn."""
         return ConstantCoefficients.first_guess(generator.device)
 
-    make_neural_closure = first_neural_guess
-
     def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """The paper's policy with three weights."""
-        return CubicVentLaw(self.actions[0], generator=generator)
+        """The paper's policy with three weights; a saturated affine law if other signals are observed."""
+        if [measurement.name for measurement in self.observed] == ["pressure_error"]:
+            return CubicVentLaw(self.actions[0], generator=generator)
+        return super().make_policy(generator)

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.envs.cryogenic_tank.commands import GREATEST_DROP
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
 
@@ -27,7 +28,7 @@ class OnOffValve(ClassicalController):
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
         error = state[..., 2:] - self.plant.set_point
         is_open = torch.where(error > self.half_band, 1.0, torch.where(error < -self.half_band, 0.0, memory))
-        return is_open * self.log_gains.exp(), is_open
+        return self.plant.command.of_drop(is_open * self.log_gains.exp()), is_open
 
 
 class PIValve(ClassicalController):
@@ -53,5 +54,5 @@ class PIValve(ClassicalController):
         K_P, K_I = self.log_gains.exp().unbind()
         error = state[..., 2:] - self.plant.set_point
         # The contribution of the integral to the drop stays within the range of the valve.
-        integral = (memory + K_I * error * self.plant.dt).clamp(self.low_action, self.high_action)
-        return K_P * error + integral, integral
+        integral = (memory + K_I * error * self.plant.dt).clamp(0.0, GREATEST_DROP)
+        return self.plant.command.of_drop(K_P * error + integral), integral

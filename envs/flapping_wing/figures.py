@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
+from rt_torchrl.envs.flapping_wing.measurements import ERRORS
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.closure_error import visited_features as features_of
 from rt_torchrl.figures.policy import contours
@@ -45,8 +46,10 @@ BIN = 5.0
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
-    """Every figure of the flapping wing, by name."""
-    return {figure.__name__: figure(snapshot) for figure in (flight_path, flight, polars, control_surfaces)}
+    """Every figure of the flapping wing, by name; the control surfaces only for policies that observe the errors."""
+    observed = tuple(signal.name for signal in snapshot.plant.observations)
+    of_errors = [control_surfaces] if observed[: len(ERRORS)] == ERRORS else []
+    return {figure.__name__: figure(snapshot) for figure in (flight_path, flight, polars, *of_errors)}
 
 
 def flight_path(snapshot: Snapshot) -> Figure:
@@ -254,15 +257,15 @@ def _coefficients(snapshot: Snapshot) -> list[str]:
 
 
 def control_surfaces(snapshot: Snapshot) -> Figure:
-    """Both actions over the errors of x and of z and their rates; the other two errors are zero (paper, fig. 18)."""
+    """Both actions over the errors of x and of z and their rates; other observations are zero (paper, fig. 18)."""
     actions = snapshot.plant.actions
     figure, axes = panels(
         2,
         2 * len(actions),
-        title=f"Policies after episode {last_episode(snapshot)}\nthe two errors not shown are zero",
+        title=f"Policies after episode {last_episode(snapshot)}\nobservations that are not shown are zero",
         size=(16.0, 6.8),
     )
-    zero = torch.zeros(4, dtype=torch.float64, device=snapshot.record.states.device)
+    zero = torch.zeros(len(snapshot.plant.observations), dtype=torch.float64, device=snapshot.record.states.device)
     for k in range(len(actions)):
         pair = axes[:, 2 * k : 2 * k + 2]
         contours(snapshot, k, {(0, 2): pair[0], (1, 3): pair[1]}, others=zero)

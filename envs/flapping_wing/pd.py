@@ -30,11 +30,11 @@ class TrimmedPD(ClassicalController):
     trim = (76.74, -12.50)
 
     def act(
-        self, state: Float[Tensor, "batch 4"], memory: Float[Tensor, "batch 0"]
+        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 0"]
     ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 0"]]:
         K_Pz, K_Dz, K_Px, K_Dx = self.log_gains.exp().unbind()
         e_x, e_z = (self.plant.target - state[..., :2]).unbind(-1)
-        v_x, v_z = state[..., 2:].unbind(-1)
+        v_x, v_z = state[..., 2:4].unbind(-1)
         amplitude = self.trim[0] + K_Pz * e_z - K_Dz * v_z
         angle = self.trim[1] - K_Px * e_x + K_Dx * v_x
         return torch.stack([amplitude, angle], -1), memory

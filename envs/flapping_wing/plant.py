@@ -1,22 +1,23 @@
 r"""The flapping-wing micro air vehicle as a plant: a point mass under two beating wings (paper, section 5.2)."""
 
 import math
-from typing import Literal, get_args
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.envs.flapping_wing import measurements as sensors
 from rt_torchrl.envs.flapping_wing import merit as judgement
+from rt_torchrl.envs.flapping_wing.costs import FlightCost, TrackingCost, needs_memory, require_rate
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
 from rt_torchrl.envs.flapping_wing.wings import Wings
-from rt_torchrl.plants.plant import Plant, require_stable_step
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
-
-Peak = Literal["unit", "printed"]
+from rt_torchrl.plants.stability import require_stable_step
 
 
 class FlappingWing(Plant):
@@ -44,6 +45,8 @@ class FlappingWing(Plant):
     e     error_rate_z         :math:`\dot e_z = -\dot z/v`                       -     about ±5
     ====  ===================  =================================================  ====  =============
 
+    The table shows the paper's observation e; ``observe`` chooses others.
+
     Note: the paper prints no number of wings; here there are two, which carry the weight at 77.2 deg, because a single
     wing cannot within the range of A_φ.
 
@@ -53,13 +56,15 @@ class FlappingWing(Plant):
         closure: closure for C_L and C_D of the real wings; None for the paper's polar.
         wind: source of the headwind.
         target: position x_f and z_f of the target [m].
-        velocity_weight: weight α1 of J_a.
-        peak: height of the Gaussian window h of J_a: 1, or the printed x_f²/2.
+        cost: running cost L_a, see ``costs.py``; None for the paper's.
         mass: mass m_b of the body [kg].
+        stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; None for none, as in the paper, so that the
+            angle may flip within a wing beat. With it the angle that was applied last is a fifth state.
+        observe: names of measurements and observation sets in ``measurements.py``; by default the paper's errors.
 
     Raises:
-        ValueError: for a mass that is not positive, a negative weight, an unknown peak, a target that is not finite, or
-            a step that is unstable or does not resolve the wing beat.
+        ValueError: for a mass or rate that is not positive, a target that is not finite, an unknown measurement, or a
+            step that is unstable or does not resolve the wing beat.
     """
 
     name = "flapping_wing"
@@ -74,33 +79,16 @@ class FlappingWing(Plant):
     span_nodes = 6  # positions after 2 s differ by 2e-6 m from those with forty nodes
     body_drag_area = 5e-4  # S_b C_D,b [m²]
     smallest_airspeed = 0.01  # ε [m/s], the floor of |U|
-    window_width = 0.71  # σ of h [m]
     strongest_wind = 2.554  # [m/s]; the trim in it needs β_w = −30 deg
     least_steps_per_beat = 20
 
-    states = (
-        Signal(symbol="x", name="forward_position", unit="m"),
-        Signal(symbol="z", name="height", unit="m"),
-        Signal(symbol=r"\dot x", name="forward_speed", unit="m/s"),
-        Signal(symbol=r"\dot z", name="climb_speed", unit="m/s"),
-    )
-    actions = (
-        Signal(symbol=r"A_\phi", name="flapping_amplitude", unit="deg", low=50.0, high=88.0),
-        Signal(symbol=r"\beta_w", name="stroke_plane_angle", unit="deg", low=-30.0, high=30.0),
-    )
-    inputs = (Signal(symbol=r"u_\infty", name="headwind", unit="m/s"),)
-    observations = (
-        Signal(symbol="e_x", name="error_x", unit="-"),
-        Signal(symbol="e_z", name="error_z", unit="-"),
-        Signal(symbol=r"\dot e_x", name="error_rate_x", unit="-"),
-        Signal(symbol=r"\dot e_z", name="error_rate_z", unit="-"),
-    )
-    # ℓ [m], ℓ [m], v [m/s], v [m/s]: with these, good policies have weights of 1 to 2, which suit one learning rate.
-    observation_scale = (2.0, 2.0, 1.0, 1.0)
+    states: tuple[Signal, ...] = sensors.STATES
+    actions = sensors.ACTIONS
+    inputs = sensors.INPUTS
+    measurements = sensors.MEASUREMENTS
+    observation_sets = sensors.OBSERVATION_SETS
 
     target: Tensor
-    window_peak: Tensor
-    error_scale: Tensor
     mass: Tensor
     weight: Tensor
 
@@ -112,25 +100,26 @@ class FlappingWing(Plant):
         closure: nn.Module | None = None,
         wind: GustModel | None = None,
         target: tuple[float, float] = (5.0, 5.0),
-        velocity_weight: float = 1.0,
-        peak: Peak = "unit",
+        cost: FlightCost | None = None,
         mass: float = 3e-3,
+        stroke_plane_rate: float | None = None,
+        observe: Sequence[str] = (),
     ):
-        super().__init__(dt=dt, horizon=horizon, closure=QuasiSteadyPolar.true() if closure is None else closure)
+        polar = QuasiSteadyPolar.true() if closure is None else closure
+        super().__init__(dt=dt, horizon=horizon, closure=polar, observe=observe)
         if not all(math.isfinite(coordinate) for coordinate in target):
             raise ValueError(f"target={target} m must be finite.")
-        if not velocity_weight >= 0:
-            raise ValueError(f"velocity_weight={velocity_weight} must not be negative.")
-        if peak not in get_args(Peak):
-            raise ValueError(f"peak={peak!r} does not exist; choose one of {', '.join(get_args(Peak))}.")
         if not (math.isfinite(mass) and mass > 0):
             raise ValueError(f"mass={mass} kg of plant {self.name!r} must be positive and finite.")
         self.wind = GaussianGust() if wind is None else wind
-        self.velocity_weight = velocity_weight
+        self.cost = TrackingCost() if cost is None else cost
+        require_rate(stroke_plane_rate)
+        self.stroke_plane_rate, self._greatest_turn = stroke_plane_rate, (stroke_plane_rate or 0.0) * dt
+        if stroke_plane_rate or needs_memory(self.cost) or sensors.STROKE_PLANE in self.observed:
+            self.states = (*sensors.STATES, sensors.ACTIONS[1])
+            self.controller_states = (sensors.ACTIONS[1].name,)
         x_f = torch.tensor(target, dtype=torch.float64)
         self.register_buffer("target", x_f)
-        self.register_buffer("window_peak", torch.ones_like(x_f) if peak == "unit" else 0.5 * x_f**2)
-        self.register_buffer("error_scale", torch.tensor(self.observation_scale, dtype=torch.float64))
         self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor([0.0, -mass * self.gravity], dtype=torch.float64))
         self.wings = Wings(
@@ -176,11 +165,11 @@ class FlappingWing(Plant):
     def vector_field(
         self,
         t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 4"],
+        state: Float[Tensor, "*batch n_s"],
         action: Float[Tensor, "*batch 2"],
         exogenous: Float[Tensor, "*#batch 1"],
         closure: nn.Module,
-    ) -> Float[Tensor, "*batch 4"]:
+    ) -> Float[Tensor, "*batch n_s"]:
         r"""Velocity and acceleration of the body, paper eqs. (drone_eq_x) and (drone_eq_y).
 
         Args:
@@ -190,11 +179,12 @@ class FlappingWing(Plant):
             exogenous: headwind u_∞ [m/s].
             closure: closure from (sin α_e, cos α_e) to C_L and C_D [-] of a blade element.
         """
-        velocity = state[..., 2:]
+        velocity = state[..., 2:4]
         # The air comes with −u_∞ along x, so the body moves with ẋ + u_∞ relative to it.
         relative = torch.cat([velocity[..., :1] + exogenous, velocity[..., 1:]], -1)
         force = self.force(t, relative, action, closure)
-        return torch.cat([velocity, (force + self.weight) / self.mass], -1)
+        # The angle that was applied last is held, or there is no such state.
+        return torch.cat([velocity, (force + self.weight) / self.mass, torch.zeros_like(state[..., 4:])], -1)
 
     def force(
         self,
@@ -224,45 +214,51 @@ class FlappingWing(Plant):
         speed = torch.sqrt(v_x**2 + v_z**2 + self.smallest_airspeed**2).unsqueeze(-1)
         return wings - 0.5 * self.air_density * self.body_drag_area * speed * relative
 
-    # The control problem
+    def actuate(
+        self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch 2"]
+    ) -> Float[Tensor, "*batch 2"]:
+        """The command, in which the stroke plane turns by at most its rate times dt."""
+        if self.stroke_plane_rate is None:
+            return command
+        change = (command[..., 1] - state[..., 4]).clamp(-self._greatest_turn, self._greatest_turn)
+        return torch.stack([command[..., 0], state[..., 4] + change], -1)
 
-    def observe(
-        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 4"], exogenous: Float[Tensor, "*#batch 1"]
-    ) -> Float[Tensor, "*batch 4"]:
-        """Errors to the target and their rates, over ``observation_scale``; the wind is not observed."""
-        return torch.cat([self.target - state[..., :2], -state[..., 2:]], -1) / self.error_scale
+    def latch(
+        self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch 2"]
+    ) -> Float[Tensor, "*batch n_s"]:
+        """Remember the stroke plane angle, if there is a state for it."""
+        return torch.cat([state[..., :4], applied[..., 1:]], -1)[..., : len(self.states)]
+
+    # The control problem
 
     def running_cost(
         self,
         t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 4"],
+        state: Float[Tensor, "*batch n_s"],
         applied: Float[Tensor, "*batch 2"],
         exogenous: Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch"]:
-        r"""The cost ½(‖e‖² + α_1‖ė∘h‖²) with the position error e (paper, eq. drone_eq_rewardCont).
-
-        .. math:: h_i = \hat h_i\exp\Big[-\frac12\Big(\frac{x_i - x_{f,i}}{\sigma}\Big)^2\Big]
-
-        Note: the paper prints a peak of x_f²/2; here it is 1, because its text calls the function unitary.
-        ``peak="printed"`` gives the printed peak.
-        """
-        e = self.target - state[..., :2]
-        h = self.window_peak * torch.exp(-0.5 * (e / self.window_width) ** 2)
-        return 0.5 * ((e**2).sum(-1) + self.velocity_weight * ((state[..., 2:] * h) ** 2).sum(-1))
+        """The cost of the task, see ``costs.py``."""
+        return self.cost(self, t, state, applied, exogenous)
 
     def discrepancy(
-        self, state: Float[Tensor, "*#batch 4"], measured: Float[Tensor, "*#batch 4"]
+        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
     ) -> Float[Tensor, "*batch"]:
         """The discrepancy ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
     merit, categories, make_neural_closure = judgement.merit, judgement.categories, drawn_neural_polar
 
+    def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
+        """All states; the stroke plane angle that was applied last is that of the record."""
+        last = torch.cat([actions[:1, 1], actions[:, 1]])
+        return super().complete_states({sensors.ACTIONS[1].name: last} | measured, exogenous, actions)
+
     # Randomness
 
-    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} 4"]:
-        """Initial states at rest in the origin; nothing is drawn."""
-        return torch.zeros(batch, 4, dtype=torch.float64, device=generator.device)
+    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
+        """Initial states at rest in the origin, with an upright stroke plane; nothing is drawn."""
+        return torch.zeros(batch, len(self.states), dtype=torch.float64, device=generator.device)
 
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 1"]:
         """Headwind u_∞ [m/s]."""
@@ -273,5 +269,5 @@ class FlappingWing(Plant):
         return QuasiSteadyPolar.draw(generator)
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
-        """The paper's policy: one affine law with offset per action through the smooth clip, ten weights."""
-        return SaturatedAffine(4, self.actions, weight_scale=0.2, generator=generator)
+        """The paper's policy: one affine law with offset per action through the smooth clip, ten weights for errors."""
+        return SaturatedAffine(len(self.observations), self.actions, weight_scale=0.2, generator=generator)

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.envs.wind_turbine.measurements import FAST_FILTER, FAST_SPEED, STATES
+
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
@@ -21,10 +23,10 @@ if TYPE_CHECKING:
 def completed(
     plant: "WindTurbine",
     measured: dict[str, Float[Tensor, " samples"]],
-    exogenous: Float[Tensor, "n 1"],
+    exogenous: Float[Tensor, "n n_z"],
     actions: Float[Tensor, "n 2"],
-) -> Float[Tensor, "samples 6"]:
-    """All six states; the logged values of a filter are used if the log has them."""
+) -> Float[Tensor, "samples n_s"]:
+    """All states; the logged values of a filter are used if the log has them."""
     omega_g = plant.gear_ratio * measured["rotor_speed"]
     wind = exogenous[:, 0]
     constant = 1.0 / (2.0 * math.pi * plant.filter_frequency)
@@ -39,16 +41,21 @@ def completed(
     e2 = filtered("speed_error_integral", e1[0], between(e1), window)
     # The action before the record is not known; the first action of the record never meets a rate limit.
     last = torch.cat([actions[:1], actions])
-    return torch.cat([torch.stack([measured["rotor_speed"], omega_hat, u_hat, e2], -1), last], -1)
+    states = torch.cat([torch.stack([measured["rotor_speed"], omega_hat, u_hat, e2], -1), last], -1)
+    if len(plant.states) == len(STATES):
+        return states
+    fast = filtered(FAST_SPEED.name, omega_g[0], between(omega_g), 1.0 / FAST_FILTER)
+    return torch.cat([states, fast.unsqueeze(-1)], -1)
 
 
 def started(
-    plant: "WindTurbine", measured: Float[Tensor, "*batch 1"], exogenous: Float[Tensor, "*batch 1"]
-) -> Float[Tensor, "*batch 5"]:
+    plant: "WindTurbine", measured: Float[Tensor, "*batch 1"], exogenous: Float[Tensor, "*batch n_z"]
+) -> Float[Tensor, "*batch n_c"]:
     """Settled filters, a torque by K ω_g² and blades at 0 deg, in the order of the states."""
     omega_g, wind = plant.gear_ratio * measured[..., 0], exogenous[..., 0]
     torque = (plant.optimal_gain * omega_g**2).clamp(max=plant.actions[0].high)
-    return torch.stack([omega_g, wind, plant.speed_error(omega_g, wind), torque, torch.zeros_like(wind)], -1)
+    fast = [omega_g] * (len(plant.states) - len(STATES))
+    return torch.stack([omega_g, wind, plant.speed_error(omega_g, wind), torque, torch.zeros_like(wind), *fast], -1)
 
 
 def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:

@@ -7,10 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.envs.wind_turbine.measurements import FAST_FILTER
 from rt_torchrl.plants.signal import bounds
 
 if TYPE_CHECKING:
-    from rt_torchrl.envs.wind_turbine.instrumented import InstrumentedTurbine
+    from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+
+SEES = ("speed_above_rated", "speed_rate", "blade_pitch")
 
 
 class GainScheduled(nn.Module):
@@ -32,7 +35,8 @@ class GainScheduled(nn.Module):
     above rated speed.
 
     Args:
-        plant: an :class:`InstrumentedTurbine`, which gives scales, ranges and the control interval.
+        plant: a turbine whose policies observe speed above rated, speed rate and pitch, as by
+            ``observe=("scheduled",)``; other observations are ignored. It gives scales, ranges and control interval.
         detuning: width of the draw of the first gains, exp(U(−detuning, detuning)) times the nominal gains.
         reference_speed: reference speed ω_ref of the pitch law [rad/s].
         switch_speed: speed ω_s at which the torque leaves region 2 [rad/s].
@@ -41,7 +45,8 @@ class GainScheduled(nn.Module):
         generator: source of the detuning.
 
     Raises:
-        ValueError: if the detuning is negative or the width of the transition is not positive.
+        ValueError: if the detuning is negative, the width of the transition is not positive, or the plant does not
+            observe the signals.
 
     Source: the regions and constants of Jonkman et al., NREL/TP-500-38060, section 7.
     """
@@ -59,7 +64,7 @@ class GainScheduled(nn.Module):
 
     def __init__(
         self,
-        plant: "InstrumentedTurbine",
+        plant: "WindTurbine",
         *,
         detuning: float = math.log(2.0),
         reference_speed: float = 124.5,
@@ -73,6 +78,13 @@ class GainScheduled(nn.Module):
             raise ValueError(f"detuning={detuning} of the gains must not be negative.")
         if not switch_width > 0.0:
             raise ValueError(f"switch_width={switch_width} rad/s must be positive; Jonkman's table takes about 1.")
+        names = [signal.name for signal in plant.observations]
+        if not set(SEES) <= set(names):
+            raise ValueError(
+                f"the gain-scheduled law sees {', '.join(SEES)}, but the plant observes {', '.join(names)}; make the "
+                'turbine with observe=("scheduled",).'
+            )
+        self._places = [names.index(name) for name in SEES]
         share = torch.rand(len(self.NOMINAL), generator=generator, dtype=torch.float64, device=generator.device)
         self.weights = nn.Parameter(detuning * (2.0 * share - 1.0))
         self.register_buffer("nominal", torch.tensor(list(self.NOMINAL.values()), dtype=torch.float64))
@@ -81,7 +93,7 @@ class GainScheduled(nn.Module):
         self.register_buffer("high", high)
         self.reference_speed, self.switch_speed = reference_speed, switch_speed
         self.switch_width, self.switch_pitch = switch_width, switch_pitch
-        self.dt, self.fast_filter = plant.dt, plant.fast_filter
+        self.dt = plant.dt
         self.rated_speed, self.speed_scale = plant.rated_generator_speed, plant.speed_error_scale
         self.power = plant.actions[0].high * plant.rated_generator_speed
 
@@ -89,15 +101,15 @@ class GainScheduled(nn.Module):
         """The gains by name, in the units of ``NOMINAL``."""
         return dict(zip(self.NOMINAL, (self.nominal * torch.exp(self.weights)).unbind(), strict=True))
 
-    def forward(self, observation: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 2"]:
-        _, _, above, rate, pitch = observation.unbind(-1)
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch 2"]:
+        above, rate, pitch = (observation[..., place] for place in self._places)
         omega, beta = self.rated_speed + self.speed_scale * above, pitch * self.high[1]
         g = self.gains()
         share = torch.sigmoid((omega - self.switch_speed + self.switch_pitch * beta) / self.switch_width)
         # At standstill no torque gives constant power; region 3 does not reach there.
         region_3 = self.power / torch.where(omega > 0.5 * self.rated_speed, omega, 0.5 * self.rated_speed)
         torque = (1.0 - share) * g["torque_gain"] * omega**2 + share * region_3
-        push = g["proportional"] * self.fast_filter * self.speed_scale * rate
+        push = g["proportional"] * FAST_FILTER * self.speed_scale * rate
         push = push + g["integral"] * (omega - self.reference_speed)
         command = beta + self.dt * push / (1.0 + beta / g["schedule"])
         return torch.stack([torque, command], -1).clamp(self.low, self.high)

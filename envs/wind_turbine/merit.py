@@ -13,7 +13,7 @@ def merit(
     plant: "WindTurbine",
     states: Float[Tensor, "batch samples n_s"],
     applied: Float[Tensor, "batch n 2"],
-    exogenous: Float[Tensor, "batch n 1"],
+    exogenous: Float[Tensor, "batch n n_z"],
 ) -> dict[str, Float[Tensor, " batch"]]:
     """Mean and deviation of generator power, RMS of the speed above rated, top speed, and travel of the blade pitch."""
     speed = plant.gear_ratio * states[..., 0]

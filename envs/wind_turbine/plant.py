@@ -7,15 +7,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.envs.wind_turbine import measurements as sensors
 from rt_torchrl.envs.wind_turbine import merit as judgement
 from rt_torchrl.envs.wind_turbine.completion import completed, started
+from rt_torchrl.envs.wind_turbine.costs import PaperCost, TurbineCost
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
-from rt_torchrl.plants.plant import Plant, require_stable_step
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.stability import require_stable_step
 
 DRIVETRAIN_INERTIA = 38_759_228.0 + 534.116 * 97.0**2
 """Inertia of rotor and generator on the low-speed shaft, 43 784 725 kg m² (NREL/TP-500-38060)."""
@@ -46,6 +49,8 @@ class WindTurbine(Plant):
     e     speed_error_integral       :math:`e_2`                                     -        about [-1, 1]
     ====  =========================  ==============================================  =======  ======================
 
+    The table shows the paper's observation e; ``observe`` chooses others.
+
     Note: the paper prints J = 115 926 kg m²; here J is that of rotor and generator, because 115 926 is the hub alone,
     with which the rotor would follow the wind within 44 ms. ``inertia=HUB_INERTIA`` with a step below 0.12 s shows it.
     Note: the paper prints τ_a with C_p/ω_r; here it has C_p/λ, which is equal where both exist, because a braked rotor
@@ -58,10 +63,13 @@ class WindTurbine(Plant):
         wind: source of the wind speed.
         inertia: inertia J of the drivetrain on the low-speed shaft [kg m²].
         rate_limits: greatest |dτ_g/dt| [N m/s] and |dβ/dt| [deg/s] of the actuators; None for ideal ones.
-        cost_weights: weights α1 and α2 of J_a.
+        cost: running cost L_a, see ``costs.py``; None for the paper's.
+        observe: names of measurements and observation sets in ``measurements.py``; by default the paper's errors. A
+            seventh state, the fast filter, is there if one of these needs it.
 
     Raises:
-        ValueError: for a non-positive inertia or rate limit, a negative cost weight, or a step that is unstable.
+        ValueError: for a non-positive inertia or rate limit, an unknown measurement, or a step
+            that is unstable.
     """
 
     name = "wind_turbine"
@@ -71,29 +79,20 @@ class WindTurbine(Plant):
     rated_power = 5e6  # P_N [W]; τ_max·ω_rated = 5.297 MW is mechanical, 5 MW is the electrical target of the paper
     rated_rotor_speed = 1.26711  # [rad/s]
     rated_wind_speed = 11.4  # [m/s]
-    rated_generator_speed = 122.9096  # [rad/s]
+    rated_generator_speed = sensors.RATED_SPEED
     minimum_generator_speed = 70.16  # [rad/s]
     filter_frequency = 0.04  # f_c [Hz]
-    speed_error_scale = 20.0  # γ1 [rad/s]
+    speed_error_scale = sensors.SPEED_SCALE
     cut_in_generator_speed = 20.0  # middle of the band in which the generator torque sets in [rad/s]
     cut_in_band = 10.0  # half width of that band [rad/s]
     standstill_tip_speed_ratio = 1.0  # λ below which the blades are taken out of the flow [-]
 
-    states: tuple[Signal, ...] = (
-        Signal(symbol=r"\omega_r", name="rotor_speed", unit="rad/s", low=0.0),
-        Signal(symbol=r"\hat\omega_g", name="filtered_generator_speed", unit="rad/s"),
-        Signal(symbol=r"\hat u", name="filtered_wind_speed", unit="m/s"),
-        Signal(symbol="e_2", name="speed_error_integral", unit="-"),
-        Signal(symbol=r"\tau_g", name="generator_torque", unit="N m", low=0.0, high=43_093.55),
-        Signal(symbol=r"\beta", name="blade_pitch", unit="deg", low=0.0, high=30.0),
-    )
-    actions = states[4:]
-    inputs = (Signal(symbol="u", name="wind_speed", unit="m/s", low=3.0),)
-    observations: tuple[Signal, ...] = (
-        Signal(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0),
-        Signal(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0),
-    )
-    controller_states: tuple[str, ...] = tuple(signal.name for signal in states[1:])
+    states: tuple[Signal, ...] = sensors.STATES
+    actions = sensors.STATES[4:]
+    inputs = sensors.INPUTS
+    measurements = sensors.MEASUREMENTS
+    observation_sets = sensors.OBSERVATION_SETS
+    controller_states: tuple[str, ...] = tuple(signal.name for signal in sensors.STATES[1:])
     greatest_increment: Tensor
 
     def __init__(
@@ -105,18 +104,20 @@ class WindTurbine(Plant):
         wind: WindModel | None = None,
         inertia: float = DRIVETRAIN_INERTIA,
         rate_limits: tuple[float, float] | None = (15e3, 8.0),
-        cost_weights: tuple[float, float] = (1.0, 1.0),
+        cost: TurbineCost | None = None,
+        observe: Sequence[str] = (),
     ):
         table = PowerCoefficientTable.nrel5mw()
-        super().__init__(dt=dt, horizon=horizon, closure=table if closure is None else closure)
+        super().__init__(dt=dt, horizon=horizon, closure=table if closure is None else closure, observe=observe)
+        if any(measurement in sensors.OF_FAST_SPEED for measurement in self.observed):
+            self.states = (*sensors.STATES, sensors.FAST_SPEED)
+            self.controller_states = tuple(signal.name for signal in self.states[1:])
         if not inertia > 0:
             raise ValueError(f"inertia={inertia} kg m² must be positive.")
         if rate_limits is not None and not min(rate_limits) > 0:
             raise ValueError(f"rate_limits={rate_limits} (N m/s, deg/s) must be positive; None means ideal actuators.")
-        if min(cost_weights) < 0:
-            raise ValueError(f"cost_weights={cost_weights} must not be negative.")
         self.wind = KaimalWind() if wind is None else wind
-        self.inertia, self.cost_weights = inertia, cost_weights
+        self.inertia, self.cost = inertia, PaperCost() if cost is None else cost
         self.best_power_coefficient, self.best_tip_speed_ratio, _ = table.maximum()
         self.optimal_gain = self._optimal_gain()
         limits = (math.inf, math.inf) if rate_limits is None else rate_limits
@@ -149,7 +150,7 @@ class WindTurbine(Plant):
         t: Float[Tensor, "*#batch"],
         state: Float[Tensor, "*batch n_s"],
         action: Float[Tensor, "*batch 2"],
-        exogenous: Float[Tensor, "*#batch 1"],
+        exogenous: Float[Tensor, "*#batch n_z"],
         closure: nn.Module,
     ) -> Float[Tensor, "*batch n_s"]:
         r"""Rotor acceleration, paper eqs. (first_order_wt) and (tau_a), with the filters of eq. (etilde) as states.
@@ -168,7 +169,7 @@ class WindTurbine(Plant):
             t: time [s], unused; the wind enters through ``exogenous``.
             state: states in the order of the class.
             action: applied generator torque τ_g [N m] and pitch β [deg].
-            exogenous: wind speed u [m/s].
+            exogenous: wind speed u [m/s], and previews of it, which do not act.
             closure: closure for C_p(λ, β) [-]: the table in the real plant, the learned law in the twin.
         """
         omega_r, omega_hat, u_hat, e2 = state[..., :4].unbind(-1)
@@ -181,7 +182,9 @@ class WindTurbine(Plant):
         held = torch.zeros_like(acceleration)
         filters = (cutoff * (omega_g - omega_hat), cutoff * (u - u_hat))
         integral = (self.speed_error(omega_hat, u_hat) - e2) / window
-        return torch.stack([acceleration, *filters, integral, held, held], -1)
+        rates = torch.stack([acceleration, *filters, integral, held, held], -1)
+        # The fast filter is the seventh state, or there is none.
+        return torch.cat([rates, sensors.FAST_FILTER * (omega_g.unsqueeze(-1) - state[..., 6:])], -1)
 
     def aerodynamic_torque(self, omega_r: Tensor, beta: Tensor, u: Tensor, closure: nn.Module) -> Tensor:
         r"""Torque τ_a = ½ρπR³(C_p/λ)u² [N m], which fades to zero over λ < 1 (standstill), where no closure is defined.
@@ -211,7 +214,7 @@ class WindTurbine(Plant):
         self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch n_s"]:
         """Remember the applied action for the rate limits of the next interval."""
-        return torch.cat([state[..., :4], applied], -1)
+        return torch.cat([state[..., :4], applied, state[..., 6:]], -1)
 
     # The control problem
 
@@ -233,23 +236,15 @@ class WindTurbine(Plant):
         omega_g = self.gear_ratio * state[..., 0]
         return applied[..., 0] * self.cut_in(omega_g) * omega_g
 
-    def observe(
-        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch n_s"], exogenous: Float[Tensor, "*#batch 1"]
-    ) -> Float[Tensor, "*batch 2"]:
-        return torch.stack([self.speed_error(state[..., 1], state[..., 2]), state[..., 3]], -1)
-
     def running_cost(
         self,
         t: Float[Tensor, "*#batch"],
         state: Float[Tensor, "*batch n_s"],
         applied: Float[Tensor, "*batch 2"],
-        exogenous: Float[Tensor, "*#batch 1"],
+        exogenous: Float[Tensor, "*#batch n_z"],
     ) -> Float[Tensor, "*batch"]:
-        r"""The cost ½(α_1 e_1² + α_2 e_P²) with e_P = (τ_g ω_g − P̃)/P_N (paper, eq. control_functional_mb)."""
-        e1 = self.speed_error(state[..., 1], state[..., 2])
-        reference = self.reference_power(self.gear_ratio * state[..., 0])
-        e_P = (self.generator_power(state, applied) - reference) / self.rated_power
-        return 0.5 * (self.cost_weights[0] * e1**2 + self.cost_weights[1] * e_P**2)
+        """The cost of the task, see ``costs.py``."""
+        return self.cost(self, t, state, applied, exogenous)
 
     def discrepancy(
         self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
@@ -275,11 +270,12 @@ class WindTurbine(Plant):
         wind = torch.full_like(omega_r, self.wind.mean)
         zero = torch.zeros_like(omega_r)
         torque = (self.optimal_gain * omega_g**2).clamp(max=self.actions[0].high)
-        return torch.stack([omega_r, omega_g, wind, zero, torque, zero], -1)
+        fast = [omega_g] * (len(self.states) - len(sensors.STATES))
+        return torch.stack([omega_r, omega_g, wind, zero, torque, zero, *fast], -1)
 
-    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps 1"]:
-        """Hub-height wind speed u [m/s]."""
-        return self.wind.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1)
+    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps n_z"]:
+        """Hub-height wind speed u [m/s], and previews of it."""
+        return self.with_previews(self.wind.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1))
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """Saint-Drenan's C_p with the coefficients of Dai 2016; nothing is drawn."""
@@ -291,7 +287,7 @@ class WindTurbine(Plant):
 
     def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
         """The paper's policy: one affine law per action through the smooth clip, by default without bias."""
-        return SaturatedAffine(2, self.actions, bias=bias, weight_scale=0.5, generator=generator)
+        return SaturatedAffine(len(self.observations), self.actions, bias=bias, weight_scale=0.5, generator=generator)
 
 
 def smoothstep(x: Tensor) -> Tensor:

@@ -209,9 +209,13 @@ def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | s
         device: device of the reported tensors.
 
     Raises:
-        ValueError: if ROSCO is not installed, or the plant's control interval does not fit.
+        ValueError: if ROSCO is not installed, the plant's control interval does not fit, or the plant observes a
+            preview of the wind.
     """
     every = steps_of(plant)
+    if plant.previews:
+        names = ", ".join(signal.name for signal in plant.inputs[len(plant.acting_inputs) :])
+        raise ValueError(f"ROSCO's simulator has no lidar, but the plant observes {names}; observe measured+wind.")
     rosco()
     machine = copy.deepcopy(plant).cpu()  # the simulator's side, wherever the twin's is
 

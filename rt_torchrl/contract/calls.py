@@ -78,6 +78,7 @@ class Calls:
         found = [
             Method("observe", plant.observe, ("t", "state", "exogenous"), {"observation": (n_o,)}),
             Method("running_cost", plant.running_cost, now, {"cost": ()}),
+            Method("terminal_cost", plant.terminal_cost, ("state",), {"cost": ()}),
             Method("discrepancy", plant.discrepancy, ("state", "measured"), {"cost": ()}),
             Method("actuate", plant.actuate, ("state", "command"), {"action": (n_a,)}),
             Method("latch", plant.latch, ("state", "applied"), {"state": (n_s,)}),

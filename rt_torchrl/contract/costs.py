@@ -12,7 +12,7 @@ def costs(calls: Calls) -> Iterator[str]:
     """Violations in the signs of the costs, in the applied action of a step, and in commanding that action again."""
     plant, found = calls.plant, calls.arguments
     for method in calls.methods():
-        if method.name in ("running_cost", "discrepancy"):
+        if method.name in ("running_cost", "terminal_cost", "discrepancy"):
             (cost,) = method.outputs(found)
             if (cost < 0.0).any():
                 k, b = (cost == cost.min()).nonzero()[0].tolist()

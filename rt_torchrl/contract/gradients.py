@@ -15,7 +15,7 @@ STEP = 1e-6
 RELATIVE, ABSOLUTE = 1e-5, 1e-6
 """Greatest gap, as a share of the derivative and of the size of the method's value."""
 SIGNALS = {"state": "states", "command": "actions", "applied": "actions", "exogenous": "inputs"}
-CHECKED = ("vector_field", "step", "running_cost", "observe")
+CHECKED = ("vector_field", "step", "running_cost", "terminal_cost", "observe")
 
 
 def gradients(calls: Calls) -> Iterator[str]:

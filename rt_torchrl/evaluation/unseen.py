@@ -1,6 +1,6 @@
 """Evaluation of twin and policies on episodes that they were never trained on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -170,6 +170,11 @@ def untrained_costs(
     return torch.tensor(costs, dtype=torch.float64, device=device)
 
 
+TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
+APPROACH = tuple(DescentConfig(rate=rate, gradient_limit=0.1, second_moment=0.99) for rate in (0.02, 0.005))
+"""Adam's options for the two halves of an approach."""
+
+
 class Optimum(NamedTuple):
     """Best mean J_a found, its policy, and the cost that each start reached on the first few episodes."""
 
@@ -186,6 +191,7 @@ def exact_optimum(
     iterations: int = 80,
     few: int = 10,
     polish: int = 20,
+    approach: int = 0,
     seed: int = UNSEEN_SEED,
 ) -> Optimum:
     """The best policy of a class, found by exact gradients on the *true* plant and on the unseen episodes themselves.
@@ -197,26 +203,29 @@ def exact_optimum(
         unseen: the unseen episodes.
         make_policy: function that draws a random policy of the class.
         starts: number of random initial policies.
-        iterations: gradients from each start, on the first ``few`` episodes.
+        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes.
         few: number of episodes on which every start descends.
         polish: gradients of the best start, on all episodes.
+        approach: gradients of Adam from each start before those of L-BFGS. Perceptrons need some 600; L-BFGS alone
+            takes them to the next poor minimum.
         seed: seed of the initial weights.
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
-    def descend(policy: nn.Module, count: int, iterations: int) -> float:
+    def descend(policy: nn.Module, count: int, steps: Sequence[tuple[DescentConfig, int]]) -> float:
         rollout = unseen._rollout(policy)
         state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
 
         def cost() -> Tensor:
             return rollout.costs(state, exogenous).mean()
 
-        return Descent(policy, DescentConfig(optimiser="lbfgs", rate=1.0)).run(cost, iterations).best
+        return [Descent(policy, config).run(cost, iterations).best for config, iterations in steps][-1]
 
+    first = [(config, approach // 2) for config in APPROACH if approach]
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
-    costs = [descend(policy, few, iterations) for policy in policies]
+    costs = [descend(policy, few, [*first, (TO_THE_END, iterations)]) for policy in policies]
     best = policies[min(range(starts), key=costs.__getitem__)]
-    return Optimum(descend(best, len(unseen.initial_state), polish), best, costs)
+    return Optimum(descend(best, len(unseen.initial_state), [(TO_THE_END, polish)]), best, costs)
 
 
 def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:

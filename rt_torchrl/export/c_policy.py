@@ -89,6 +89,7 @@ def _comment(policy: nn.Module, plant: Plant, function: str) -> list[str]:
         "A NaN in an observation gives NaN in every action that depends on it: check your sensors before.",
         "",
         *signal_table({"observation": plant.observations, "action": plant.actions}),
+        *(f"observation[{k}] is {m.scaling}." for k, m in enumerate(plant.observed) if m.scaling),
         "",
         f"Observations are made of states and inputs by {kind.__name__}.observe, in {kind.__module__}.",
         "A range of observations is where they usually lie; actions never leave theirs, if the policy saturates.",

@@ -56,7 +56,10 @@ def layer_of(node: torch.fx.Node, policy: str) -> str:
 
 
 def interface(plant: Plant) -> dict[str, Any]:
-    """The description of a policy's observations and actions, as JSON can hold it; an absent bound is None."""
+    """The description of a policy's observations and actions, as JSON can hold it; an absent bound is None.
+
+    An observation that is a scaled measurement is (measurement − offset)/scale, both in the unit ``measured_in``.
+    """
 
     def described(signals: Sequence[Signal]) -> list[dict[str, Any]]:
         return [{"name": s.name, "unit": s.unit, "low": finite(s.low), "high": finite(s.high)} for s in signals]
@@ -64,10 +67,12 @@ def interface(plant: Plant) -> dict[str, Any]:
     def finite(bound: float) -> float | None:
         return bound if math.isfinite(bound) else None
 
+    scaled = [{"offset": m.offset, "scale": m.scale, "measured_in": m.unit} for m in plant.observed]
+    observed = scaled or [{} for _ in plant.observations]
     return {
         "plant": plant.name,
         "control_interval_s": plant.dt,
-        "observation": described(plant.observations),
+        "observation": [one | more for one, more in zip(described(plant.observations), observed, strict=True)],
         "action": described(plant.actions),
     }
 

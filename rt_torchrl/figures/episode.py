@@ -76,11 +76,11 @@ def actions(snapshot: Snapshot) -> Figure:
 
 
 def exogenous(snapshot: Snapshot) -> Figure:
-    """Each exogenous input as recorded, with its large scale, and below it samples of other possible inputs.
+    """Each input that acts on the plant as recorded, with its large scale, and below it samples of other possible ones.
 
     Each input has a column. In an arm that trains no twin the figure shows the record alone.
     """
-    signals, recorded = snapshot.plant.inputs, array(snapshot.record.exogenous)
+    signals, recorded = snapshot.plant.acting_inputs, array(snapshot.record.exogenous)
     time, label = time_axis(snapshot.plant, len(recorded))
     rows = 1 if snapshot.large_scale is None else 2
     figure, axes = panels(

@@ -26,7 +26,7 @@ class Snapshot:
         live: role of the live policy.
         record: the last real episode.
         replay: states of the twin with the record's actions and exogenous input.
-        large_scale: large scale d̃ of the record's exogenous input; None if the arm trains no twin.
+        large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin.
         realisations: samples of the exogenous process of the record; None if the arm trains no twin.
         episodes: entries of the episodes, as in ``metrics.json``.
     """
@@ -39,8 +39,8 @@ class Snapshot:
     live: Role
     record: Trajectory
     replay: Float[Tensor, "samples n_s"]
-    large_scale: Float[Tensor, "n n_z"] | None
-    realisations: Float[Tensor, "k n n_z"] | None
+    large_scale: Float[Tensor, "n n_acting"] | None
+    realisations: Float[Tensor, "k n n_acting"] | None
     episodes: list[dict[str, Any]]
 
     @classmethod

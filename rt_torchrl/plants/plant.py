@@ -9,21 +9,20 @@ integrates the vector field over that interval. :meth:`Plant.step` is the map of
 The real system and its digital twin have the *same* map: they differ in the closure that they pass to it.
 """
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
+from rt_torchrl.plants.episode_length import whole_steps
+from rt_torchrl.plants.integrators import rk4_step
+from rt_torchrl.plants.measurement import Measurement, Preview, chosen
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
-
-MOST_STEPS = 10_000_000
-"""Control intervals of the longest episode; a hundred numbers for each interval take 8 GB."""
 
 
 class Transition(NamedTuple):
@@ -38,9 +37,10 @@ class Plant(nn.Module, ABC):
 
     A subclass declares its signals in the four class attributes (``inputs`` may be empty), and defines
     :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`discrepancy`, :meth:`draw_initial_state`,
-    :meth:`draw_exogenous` and :meth:`make_closure`. Every method is pure and takes any leading batch dimensions; the
-    last dimension is that of the signals. A method must work when it is compiled, batched and differentiated: it
-    contains no clamp, detach, random number, device choice or Python branch on a tensor.
+    :meth:`draw_exogenous` and :meth:`make_closure`. If it declares ``measurements``, of which a policy may observe any
+    choice, ``observations`` and :meth:`observe` follow from the choice. Every method is pure and takes any leading
+    batch dimensions; the last dimension is that of the signals. A method must work when it is compiled, batched and
+    differentiated: it contains no clamp, detach, random number, device choice or Python branch on a tensor.
     :func:`rt_torchrl.check_plant` finds where a subclass does not fulfil this.
 
     Args:
@@ -48,10 +48,12 @@ class Plant(nn.Module, ABC):
         horizon: length of an episode T_o [s], a whole number of steps.
         closure: the true closure, which the real system uses; it maps the features that :meth:`vector_field` passes to
             it to coefficients.
+        observe: names of the ``measurements`` that the policies observe, and of ``observation_sets``; by default the
+            first set.
 
     Raises:
-        ValueError: if ``dt`` or ``horizon`` is not positive, or ``horizon`` is no multiple of ``dt`` or exceeds
-            ``MOST_STEPS`` intervals.
+        ValueError: if ``dt`` or ``horizon`` is not positive, ``horizon`` is no multiple of ``dt`` or exceeds
+            ten million intervals, or ``observe`` names what the plant does not measure.
     """
 
     name: str
@@ -59,6 +61,10 @@ class Plant(nn.Module, ABC):
     actions: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     observations: tuple[Signal, ...]
+    measurements: tuple[Measurement, ...] = ()
+    """What the sensors give; empty in a plant that defines ``observations`` and :meth:`observe` itself."""
+    observation_sets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    """Names of measurements that are observed together, by the name of the set."""
     own_scheme: bool = False
     """Whether :meth:`step` has a scheme of its own, which a twin must follow to the last digit.
 
@@ -70,24 +76,31 @@ class Plant(nn.Module, ABC):
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
 
-    def __init__(self, *, dt: float, horizon: float, closure: nn.Module):
+    def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
-        for argument, value in (("dt", dt), ("horizon", horizon)):
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{argument}={value} s of plant {self.name!r} must be positive and finite.")
-        if not horizon / dt <= MOST_STEPS:
-            raise ValueError(
-                f"horizon={horizon} s of plant {self.name!r} is {horizon / dt:.3g} steps dt={dt} s; it must be at most "
-                f"{MOST_STEPS:.0e}, because an episode is kept in memory."
-            )
         self.dt = float(dt)
-        self.n_steps = round(horizon / dt)
-        if self.n_steps < 1 or abs(self.n_steps * dt - horizon) > 1e-6 * dt:
-            raise ValueError(
-                f"horizon={horizon} s of plant {self.name!r} must be a whole number of steps dt={dt} s; "
-                f"try {max(1, self.n_steps) * dt} s."
-            )
+        self.n_steps = whole_steps(self.name, dt, horizon)
         self.closure = closure
+        self.observed = self.chosen(observe)
+        self.previews = tuple(m.read for m in self.observed if isinstance(m.read, Preview))
+        if self.observed:
+            self.observations = tuple(measurement.observation for measurement in self.observed)
+        if self.previews:
+            self.inputs = (*self.inputs, *(m.signal for m in self.observed if m.read in self.previews))
+
+    @classmethod
+    def chosen(cls, observe: Sequence[str]) -> tuple[Measurement, ...]:
+        """The measurements that ``observe`` names.
+
+        Raises:
+            ValueError: if there is no such measurement or set.
+        """
+        return chosen(cls.name, observe, cls.measurements, cls.observation_sets)
+
+    @property
+    def acting_inputs(self) -> tuple[Signal, ...]:
+        """Inputs that act on the plant; previews of these stand after them in ``inputs``."""
+        return self.inputs[: len(self.inputs) - len(self.previews)]
 
     @property
     def horizon(self) -> float:
@@ -142,14 +155,22 @@ class Plant(nn.Module, ABC):
 
     # The control problem
 
-    @abstractmethod
     def observe(
         self,
         t: Float[Tensor, "*#batch"],
         state: Float[Tensor, "*batch n_s"],
         exogenous: Float[Tensor, "*#batch n_z"],
     ) -> Float[Tensor, "*batch n_o"]:
-        """The observation of the policies: the tracking errors e, scaled to order one."""
+        """The observation of the policies, scaled to order one, such as tracking errors.
+
+        Raises:
+            NotImplementedError: if the plant has neither ``measurements`` nor a method of its own.
+        """
+        if not self.observed:
+            raise NotImplementedError(f"plant {self.name!r} declares no measurements and defines no observe().")
+        seen = [measurement.observed(self, t, state, exogenous) for measurement in self.observed]
+        _, *seen = torch.broadcast_tensors(state[..., 0], *seen)
+        return torch.stack(seen, -1)
 
     @abstractmethod
     def running_cost(
@@ -159,7 +180,14 @@ class Plant(nn.Module, ABC):
         applied: Float[Tensor, "*batch n_a"],
         exogenous: Float[Tensor, "*#batch n_z"],
     ) -> Float[Tensor, "*batch"]:
-        r"""Lagrangian L_a of the control problem; :math:`J_a = \frac1{T_o}\int L_a\,dt`, the reward is −L_a."""
+        r"""Lagrangian L_a of the control problem; the reward is −L_a.
+
+        .. math:: J_a = \frac1{T_o}\Big(\int L_a\,dt + \Phi_a(s(T_o))\Big)
+        """
+
+    def terminal_cost(self, state: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch"]:
+        """Cost Φ_a of the state at the end of an episode, in the unit of L_a times seconds; by default zero."""
+        return state.new_zeros(state.shape[:-1])
 
     @abstractmethod
     def discrepancy(
@@ -217,6 +245,18 @@ class Plant(nn.Module, ABC):
         """
         return measured.new_zeros(*measured.shape[:-1], len(self.controller_states))
 
+    def with_previews(self, exogenous: Float[Tensor, "*batch n n_b"]) -> Float[Tensor, "*batch n n_z"]:
+        """All exogenous inputs of whole episodes, from those that act on the plant: previews are their shifts.
+
+        Args:
+            exogenous: ``acting_inputs`` at all n control intervals.
+
+        Raises:
+            ValueError: if the time ahead of a preview is no whole number of control intervals.
+        """
+        ahead = [preview.shifted(exogenous, self.dt) for preview in self.previews]
+        return torch.cat([exogenous, torch.stack(ahead, -1)], -1) if ahead else exogenous
+
     # Randomness, always from the generator that is passed in
 
     @abstractmethod
@@ -247,25 +287,3 @@ class Plant(nn.Module, ABC):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
-
-
-def require_stable_step(plant: str, dt: float, rate: float, *, mode: str, remedy: str) -> None:
-    """Refuse a step that makes an explicit Runge-Kutta step unstable.
-
-    Args:
-        plant: name of the plant, for the message.
-        dt: step [s].
-        rate: fastest decay rate |Re μ| of the linearised plant [1/s].
-        mode: name of the state that decays at that rate, for the message.
-        remedy: another remedy than a smaller step, for the message.
-
-    Raises:
-        ValueError: if dt·rate exceeds the stability limit of RK4 on the negative real axis, 2.785.
-    """
-    if dt * rate > RK4_REAL_STABILITY:
-        raise ValueError(
-            f"dt={dt} s makes plant {plant!r} unstable: {mode} decays at {rate:.4g} 1/s, so dt·rate = {dt * rate:.3g} "
-            f"exceeds the limit {RK4_REAL_STABILITY} of an explicit fourth-order Runge-Kutta step. "
-            # The share keeps the rounded advice below the limit.
-            f"Use dt <= {0.995 * RK4_REAL_STABILITY / rate:.3g} s, or {remedy}."
-        )

@@ -139,6 +139,7 @@ def flown(
     command = interval.command(states[:-1], drive)
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
+    reward[-1] -= plant.terminal_cost(states[-1]) / plant.dt
     # There is no input after the last interval; the last input takes its place.
     exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)

@@ -30,7 +30,7 @@ class PlantEnv(EnvBase):
     ``state``, ``exogenous``               n_s, z  s_k and z_k, which a record holds beside the actions
     ``action``                             n_a     the command, within the ranges of the plant's actions
     ``("next", "applied")``                n_a     the action that the actuators applied
-    ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k)
+    ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k); at the horizon also −Φ_a(s_n)/Δt
     ``("next", "truncated")``, ``"done"``  1       true at the horizon; ``terminated`` is never true
     =====================================  ======  ===================================================================
 
@@ -154,10 +154,11 @@ class PlantEnv(EnvBase):
         self._state = transition.state.clone()
         self._step_count = self._step_count + 1
         truncated = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        ended = truncated.squeeze(-1) * self.plant.terminal_cost(self._state) / self.plant.dt
         return self._observed(
             {
                 "applied": transition.applied.clone(),
-                "reward": -cost.unsqueeze(-1),
+                "reward": -(cost + ended).unsqueeze(-1),
                 "done": truncated,
                 "terminated": torch.zeros_like(truncated),
                 "truncated": truncated.clone(),

@@ -194,7 +194,10 @@ class RealSystem(EnvBase):
             applied = self._applied.read(stepped["next"], self.plant.actions, "applied").to(self.device)
         t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
         cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
-        return self._entries(applied, ended=last).set("reward", -cost.unsqueeze(-1))
+        after = self._entries(applied, ended=last)
+        if last:
+            cost = cost + self.plant.terminal_cost(after["state"]) / self.plant.dt
+        return after.set("reward", -cost.unsqueeze(-1))
 
     def _require_reported(self, found: TensorDictBase) -> None:
         """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""

@@ -117,7 +117,8 @@ class Rollout:
         drive = self._drive(initial_state, exogenous, command, start)
         found = self._engine.costs(self.interval, initial_state, drive)
         if found is not None and all_finite(found):
-            return found / exogenous.shape[1]
+            first = self.plant.terminal_cost(initial_state) / self.plant.dt  # the sum holds the change from it
+            return (found + first) / exogenous.shape[1]
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
 
     def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:

@@ -66,11 +66,13 @@ class Trajectory(NamedTuple):
 
 
 def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"]:
-    r"""J_a of each trajectory, :math:`\frac1{T_o}\int L_a\,dt` as the mean of the samples t_0 ... t_{n−1}."""
+    r"""J_a of each trajectory, :math:`\frac1{T_o}\big(\int L_a\,dt + \Phi_a(s_n)\big)` by its samples."""
     states, actions, exogenous, start = trajectory
-    clock = plant.dt * torch.arange(actions.shape[-2], dtype=torch.float64, device=states.device)
+    n = actions.shape[-2]
+    clock = plant.dt * torch.arange(n, dtype=torch.float64, device=states.device)
     t = (start.unsqueeze(-1) if isinstance(start, Tensor) else start) + clock
-    return plant.running_cost(t, states[..., :-1, :], actions, exogenous).mean(-1)
+    running = plant.running_cost(t, states[..., :-1, :], actions, exogenous).mean(-1)
+    return running + plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
 
 
 def identification_cost(

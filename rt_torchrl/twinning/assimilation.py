@@ -123,7 +123,8 @@ class Assimilation:
         if self.config.inputs == "record":
             count, exogenous = 1, torch.stack([record.exogenous for record in records])
         else:
-            exogenous = torch.cat([process.sample(count, generator) for process in processes])
+            sampled = torch.cat([process.sample(count, generator) for process in processes])
+            exogenous = self.twin.plant.with_previews(sampled)
         measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
         actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
         whole = Trajectory(measured, actions, exogenous)

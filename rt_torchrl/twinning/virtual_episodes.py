@@ -27,9 +27,10 @@ class VirtualEpisodes:
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
 
     def learn(self, record: Trajectory) -> None:
-        """Fit a process to the exogenous input of a real episode, and keep it."""
-        plant = self.twin.plant
-        self.processes.append(ExogenousProcess(record.exogenous, dt=plant.dt, signals=plant.inputs, config=self.config))
+        """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
+        plant, signals = self.twin.plant, self.twin.plant.acting_inputs
+        acted = record.exogenous[:, : len(signals)]
+        self.processes.append(ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config))
 
     def draw(self, count: int) -> Scenario:
         """Draw random initial states, and exogenous inputs from the processes that are kept.
@@ -39,8 +40,9 @@ class VirtualEpisodes:
         optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
         one wind of twenty.
         """
-        initial_state = self.twin.plant.draw_initial_state(count, self.generator)
-        return Scenario(initial_state, sample_experience(self.processes, count, self.generator))
+        plant = self.twin.plant
+        initial_state = plant.draw_initial_state(count, self.generator)
+        return Scenario(initial_state, plant.with_previews(sample_experience(self.processes, count, self.generator)))
 
     @torch.no_grad()
     def cost(self, policy: nn.Module, episodes: Scenario) -> Tensor:
@@ -57,5 +59,5 @@ class VirtualEpisodes:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.processes.clear()
         self.processes.extend(
-            ExogenousProcess.from_state(saved, self.twin.plant.inputs) for saved in state["processes"]
+            ExogenousProcess.from_state(saved, self.twin.plant.acting_inputs) for saved in state["processes"]
         )

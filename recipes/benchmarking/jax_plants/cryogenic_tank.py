@@ -9,10 +9,13 @@ from torch import nn
 
 from benchmarking.jax_plants.jax_plant import Array, JaxPlant, Weights
 from benchmarking.jax_plants.networks import bounded_perceptron, saturated, smooth_clip
+from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
 from rt_torchrl.envs.cryogenic_tank.models import CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.saturation import CELLS, DEGREE, Saturation
 from rt_torchrl.envs.cryogenic_tank.vent import EXCHANGER_AREA, LAMINAR_DROP, ROUNDING_DROP
+
+VENTED = PressureCost().vented
 
 
 class Properties(NamedTuple):
@@ -36,7 +39,7 @@ def cryogenic_tank(plant: CryogenicTank, closure: nn.Module, policy: nn.Module) 
         p = state[2]
         drop = p - _outlet(plant, p, applied[0])
         e = observe(state)[0]
-        return plant.cost_weights[0] * e**2 + plant.cost_weights[1] * drop * _conductance(drop, plant.rated_valve)
+        return e**2 + VENTED * drop * _conductance(drop, plant.rated_valve)
 
     def same_action(state: Array, command: Array) -> Array:
         return command

@@ -3,17 +3,19 @@
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from torch import nn
 
 from benchmarking.jax_plants.jax_plant import Array, JaxPlant, Weights
 from benchmarking.jax_plants.networks import bounded_perceptron, column, saturated, smooth_clip
+from rt_torchrl.envs.flapping_wing.costs import WINDOW_WIDTH
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
 
 def flapping_wing(plant: FlappingWing, closure: nn.Module, policy: nn.Module) -> JaxPlant:
     """The plant with its constants, and its closures and policies with theirs."""
-    target, scale = column(plant.target.numpy()), column(plant.error_scale.numpy())
-    peak, dt = column(plant.window_peak.numpy()), plant.dt
+    target, dt = column(plant.target.numpy()), plant.dt
+    scale = column(np.array([measurement.scale for measurement in plant.observed]))
     field, closures = _field(plant), _closures(closure)
 
     def observe(state: Array) -> Array:
@@ -21,8 +23,8 @@ def flapping_wing(plant: FlappingWing, closure: nn.Module, policy: nn.Module) ->
 
     def running_cost(state: Array, applied: Array) -> Array:
         e = target - state[:2]
-        h = peak * jnp.exp(-0.5 * (e / plant.window_width) ** 2)
-        return 0.5 * ((e**2).sum(0) + plant.velocity_weight * ((state[2:] * h) ** 2).sum(0))
+        h = jnp.exp(-0.5 * (e / WINDOW_WIDTH) ** 2)
+        return 0.5 * ((e**2).sum(0) + ((state[2:] * h) ** 2).sum(0))
 
     policies = saturated(smooth_clip(policy.get_submodule("clip")))
     return JaxPlant(dt, field, observe, _same_action, _same_state, running_cost, closures, policies)

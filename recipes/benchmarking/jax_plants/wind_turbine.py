@@ -29,7 +29,7 @@ def wind_turbine(plant: WindTurbine, closure: nn.Module, policy: nn.Module) -> J
         reference = jnp.minimum(plant.optimal_gain * omega_g**3, plant.rated_power)
         e1 = _speed_error(plant, state[1], state[2])
         e_P = (applied[0] * _cut_in(plant, omega_g) * omega_g - reference) / plant.rated_power
-        return 0.5 * (plant.cost_weights[0] * e1**2 + plant.cost_weights[1] * e_P**2)
+        return 0.5 * (e1**2 + e_P**2)
 
     policies = saturated(smooth_clip(policy.get_submodule("clip")))
     return JaxPlant(plant.dt, _field(plant), observe, actuate, latch, running_cost, _closures(closure), policies)

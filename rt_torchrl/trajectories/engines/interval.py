@@ -44,7 +44,11 @@ class Interval(nn.Module):
 
 
 class CostInterval(nn.Module):
-    """An interval whose state (s, J) also sums the running cost, J_{k+1} = J_k + L_a(t_k, s_k, a_k, z_k).
+    r"""An interval whose state (s, J) also sums the cost.
+
+    .. math:: J_{k+1} = J_k + L_a(t_k, s_k, a_k, z_k) + \big(\Phi_a(s_{k+1}) - \Phi_a(s_k)\big)/\Delta t
+
+    The last term sums to the terminal cost of the last state, less that of the first one.
 
     Args:
         interval: the interval of the states s.
@@ -58,8 +62,10 @@ class CostInterval(nn.Module):
         """State and cost, (s, J), at the end of the interval."""
         plant, s = self.interval.plant, state[..., :-1]
         applied = plant.actuate(s, self.interval.command(s, drive))
-        cost = state[..., -1] + plant.running_cost(drive.t, s, applied, drive.exogenous)
-        return torch.cat([self.interval(s, drive), cost.unsqueeze(-1)], -1)
+        end = self.interval(s, drive)
+        change = (plant.terminal_cost(end) - plant.terminal_cost(s)) / plant.dt
+        cost = state[..., -1] + plant.running_cost(drive.t, s, applied, drive.exogenous) + change
+        return torch.cat([end, cost.unsqueeze(-1)], -1)
 
 
 def with_weights(interval: nn.Module, weights: dict[str, Tensor], state: Tensor, drive: Drive) -> Tensor:

@@ -37,7 +37,8 @@ class ShortHorizon:
     """Descends J_w of one window after the other, along virtual episodes.
 
     A copy of the policy descends, because a policy gets worse before it gets better while the critic is still wrong.
-    The copy goes on from episode to episode, whether or not it is good enough yet to take the policy's place.
+    The copy goes on from episode to episode, whether or not it is good enough yet to take the policy's place. It plans
+    for a process that goes on, without the plant's terminal cost.
 
     Args:
         twin: twin on which the windows are flown.

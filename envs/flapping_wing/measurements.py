@@ -1,0 +1,82 @@
+"""The signals of the drone, and what its sensors give."""
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rt_torchrl.plants.measurement import Component, Measurement
+from rt_torchrl.plants.signal import Signal
+
+if TYPE_CHECKING:
+    from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+
+STATES = (
+    Signal(symbol="x", name="forward_position", unit="m"),
+    Signal(symbol="z", name="height", unit="m"),
+    Signal(symbol=r"\dot x", name="forward_speed", unit="m/s"),
+    Signal(symbol=r"\dot z", name="climb_speed", unit="m/s"),
+)
+ACTIONS = (
+    Signal(symbol=r"A_\phi", name="flapping_amplitude", unit="deg", low=50.0, high=88.0),
+    Signal(symbol=r"\beta_w", name="stroke_plane_angle", unit="deg", low=-30.0, high=30.0),
+)
+INPUTS = (Signal(symbol=r"u_\infty", name="headwind", unit="m/s"),)
+
+
+def error_x(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The way forwards to the target [m]."""
+    return plant.target[0] - state[..., 0]
+
+
+def error_z(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The way upwards to the target [m]."""
+    return plant.target[1] - state[..., 1]
+
+
+def error_rate_x(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The rate of the way forwards [m/s]."""
+    return -state[..., 2]
+
+
+def error_rate_z(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The rate of the way upwards [m/s]."""
+    return -state[..., 3]
+
+
+def phase_cosine(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The cosine of the phase of the wing beat, 1 where the wings are furthest forwards."""
+    return torch.cos(2.0 * math.pi * plant.frequency * t)
+
+
+def phase_sine(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The sine of the phase of the wing beat, as which the wings pitch."""
+    return torch.sin(2.0 * math.pi * plant.frequency * t)
+
+
+STROKE_PLANE = Measurement.of(ACTIONS[1], Component("state", 4), scale=30.0)
+"""The stroke plane angle that was applied last, of a drone that remembers it."""
+# ℓ = 2 m and v = 1 m/s: with these, good policies have weights of 1 to 2, which suit one learning rate.
+MEASUREMENTS = (
+    Measurement(symbol="e_x", name="error_x", unit="m", read=error_x, scale=2.0),
+    Measurement(symbol="e_z", name="error_z", unit="m", read=error_z, scale=2.0),
+    Measurement(symbol=r"\dot e_x", name="error_rate_x", unit="m/s", read=error_rate_x),
+    Measurement(symbol=r"\dot e_z", name="error_rate_z", unit="m/s", read=error_rate_z),
+    Measurement.of(INPUTS[0], Component("exogenous", 0), offset=1.0),
+    Measurement(symbol=r"\cos 2\pi ft", name="phase_cosine", unit="-", low=-1.0, high=1.0, read=phase_cosine),
+    Measurement(symbol=r"\sin 2\pi ft", name="phase_sine", unit="-", low=-1.0, high=1.0, read=phase_sine),
+    STROKE_PLANE,
+)
+ERRORS = tuple(measurement.name for measurement in MEASUREMENTS[:4])
+PHASE = ("phase_cosine", "phase_sine")
+OBSERVATION_SETS = {
+    "paper": ERRORS,
+    "errors": ERRORS,
+    "wind": (*ERRORS, "headwind"),
+    "phase": (*ERRORS, *PHASE),
+    "measured": (*ERRORS, *PHASE),
+    "measured+wind": (*ERRORS, *PHASE, "headwind"),
+}
+"""Names of measurements: the paper's errors of position and speed; these with the wind; with the phase of the wing
+beat; and with both."""

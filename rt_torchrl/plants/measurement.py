@@ -1,0 +1,158 @@
+r"""Measurements: what the sensors of a plant give, of which a policy observes some.
+
+An observation is a measurement y from an offset, in units of a scale, so that it is of order one: :math:`(y - o)/c`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.plants.signal import Signal
+
+if TYPE_CHECKING:
+    from rt_torchrl.plants.plant import Plant
+
+
+@runtime_checkable
+class Read(Protocol):
+    """Computes a measurement of a plant from the time, the state and the exogenous input."""
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Component:
+    """Reads one component of the state or of the exogenous input.
+
+    Args:
+        of: vector of the component.
+        index: place in it.
+    """
+
+    of: Literal["state", "exogenous"]
+    index: int
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        return (state if self.of == "state" else exogenous)[..., self.index]
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Reads an exogenous input that is to come, such as the wind that a lidar measures ahead of the rotor.
+
+    A plant that is asked for a preview has one more exogenous input for it, which :meth:`Plant.with_previews` computes
+    of the whole series.
+
+    Args:
+        index: place of the input among the inputs that act on the plant.
+        lead: time ahead [s].
+    """
+
+    index: int
+    lead: float
+
+    def __call__(self, plant: "Plant", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        return exogenous[..., len(plant.acting_inputs) + plant.previews.index(self)]
+
+    def shifted(self, exogenous: Float[Tensor, "*batch n n_b"], dt: float) -> Float[Tensor, "*batch n"]:
+        """The input ``lead`` later; beyond the end of the series, its last value.
+
+        Raises:
+            ValueError: if the time ahead is no whole number of control intervals ``dt`` [s].
+        """
+        steps = round(self.lead / dt)
+        if steps < 1 or not math.isclose(steps * dt, self.lead, rel_tol=1e-9):
+            raise ValueError(
+                f"a preview of {self.lead} s needs a control interval that divides it; dt={dt} s does not."
+            )
+        series = exogenous[..., self.index]
+        held = series[..., -1:].expand(*series.shape[:-1], min(steps, series.shape[-1]))
+        return torch.cat([series[..., steps:], held], -1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement(Signal):
+    """A signal that the sensors of a plant give.
+
+    Args:
+        read: function that computes the value, in ``unit``.
+        offset: value that a policy observes as zero, in ``unit``.
+        scale: change that a policy observes as one, in ``unit``.
+
+    Raises:
+        ValueError: if the scale is not positive, or the offset not finite.
+    """
+
+    read: Read
+    offset: float = 0.0
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.scale > 0.0 and math.isfinite(self.scale) and math.isfinite(self.offset)):
+            raise ValueError(
+                f"Measurement {self.name!r} has offset={self.offset} and scale={self.scale} {self.unit}; the scale "
+                "must be positive, and both finite."
+            )
+
+    @classmethod
+    def of(cls, signal: Signal, read: Read, *, offset: float = 0.0, scale: float = 1.0) -> "Measurement":
+        """The measurement of a state or an exogenous input."""
+        return cls(**dataclasses.asdict(signal), read=read, offset=offset, scale=scale)
+
+    @property
+    def signal(self) -> Signal:
+        """The signal alone."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(Signal)}
+        return Signal(**fields)
+
+    @property
+    def observation(self) -> Signal:
+        """What a policy observes of it."""
+        low, high = ((bound - self.offset) / self.scale for bound in (self.low, self.high))
+        return Signal(symbol=self.symbol, name=self.name, unit="-", low=low, high=high)
+
+    @property
+    def scaling(self) -> str:
+        """The observation in words; empty if the measurement is observed as it is."""
+        if (self.offset, self.scale) == (0.0, 1.0):
+            return ""
+        return f"({self.name} - {self.offset:.9g} {self.unit}) / {self.scale:.9g} {self.unit}"
+
+    def observed(self, plant: "Plant", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        """The observation (y − offset)/scale."""
+        return (self.read(plant, t, state, exogenous) - self.offset) / self.scale
+
+
+def chosen(
+    plant: str, wanted: Sequence[str], measurements: Sequence[Measurement], sets: Mapping[str, Sequence[str]]
+) -> tuple[Measurement, ...]:
+    """The measurements that a policy observes, each once and in the order in which they are asked for.
+
+    Args:
+        plant: name of the plant, for the message.
+        wanted: names of measurements and of sets of them; nothing means the first set.
+        measurements: all measurements of the plant.
+        sets: names of measurements, by the name of the set.
+
+    Raises:
+        ValueError: if there is no such measurement or set.
+    """
+    if isinstance(wanted, str):
+        raise ValueError(f"observe={wanted!r} of plant {plant!r} must be a sequence of names, such as ({wanted!r},).")
+    known = {measurement.name: measurement for measurement in measurements}
+    wanted = wanted or tuple(sets)[:1] or tuple(known)
+    unknown = [name for name in wanted if name not in known and name not in sets]
+    if unknown:
+        raise ValueError(
+            f"observe={tuple(wanted)} of plant {plant!r}: {', '.join(unknown)} does not exist; choose among the sets "
+            f"{', '.join(sets) or '(none)'} and the measurements {', '.join(known) or '(none)'}."
+        )
+    names = dict.fromkeys(name for word in wanted for name in sets.get(word, (word,)))
+    return tuple(known[name] for name in names)

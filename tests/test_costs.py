@@ -1,0 +1,199 @@
+"""Costs as arguments against figures by hand, and terminal costs wherever J_a is computed."""
+
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from rt_torchrl import PlantEnv, Rollout, SaturatedAffine, check_plant, control_cost
+from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
+from rt_torchrl.envs.flapping_wing.costs import TrackingCost
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.costs import EngineeringCost, PaperCost
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.systems.collectors import collector_of
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+
+TIME_ZERO = torch.zeros((), dtype=torch.float64)
+RATED = 122.9096
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def double(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def turbine_cost(speed, torque, pitch, last, **weights):
+    """The engineering cost at a generator speed [rad/s], an action and the action before it; all other weights zero."""
+    zero = dict.fromkeys(("energy", "excess", "overspeed", "overshoot", "pitch_rate", "torque_rate"), 0.0)
+    plant = WindTurbine(cost=EngineeringCost(**zero | weights))
+    state = double(speed / 97.0, speed, 11.0, 0.0, *last)
+    return plant.running_cost(TIME_ZERO, state, double(torque, pitch), double(11.0)).item()
+
+
+def test_the_engineering_cost_term_by_term():
+    full = 43_093.55
+    still = (full, 5.0)
+    assert turbine_cost(RATED, full, 5.0, still, energy=2.0) == pytest.approx(0.0, abs=1e-12)
+    assert turbine_cost(RATED, 0.25 * full, 5.0, still, energy=2.0) == pytest.approx(1.5, rel=1e-12)
+    # Power above rated earns nothing, and costs the square of its share.
+    assert turbine_cost(1.1 * RATED, full, 5.0, still, energy=2.0) == pytest.approx(0.0, abs=1e-12)
+    assert turbine_cost(1.1 * RATED, full, 5.0, still, excess=3.0) == pytest.approx(3.0 * 0.1**2, rel=1e-9)
+    assert turbine_cost(RATED + 10.0, full, 5.0, still, overspeed=4.0) == pytest.approx(4.0 * 0.25, rel=1e-9)
+    assert turbine_cost(RATED - 10.0, full, 5.0, still, overspeed=4.0, overshoot=4.0) == 0.0
+    assert turbine_cost(1.1 * RATED + 2.0, full, 5.0, still, overshoot=5.0) == pytest.approx(5.0 * 0.01, rel=1e-9)
+    # 1 deg and 15 kN m within 0.5 s.
+    assert turbine_cost(RATED, full, 6.0, still, pitch_rate=1.0) == pytest.approx(4.0, rel=1e-12)
+    assert turbine_cost(RATED, full - 15e3, 5.0, still, torque_rate=1.0) == pytest.approx(4.0, rel=1e-12)
+
+
+def test_the_drone_pays_for_power_and_for_a_stroke_plane_that_turns():
+    plant = FlappingWing(cost=TrackingCost(velocity=0.0, energy=0.5, rate=0.1))
+    assert [state.name for state in plant.states][4:] == ["stroke_plane_angle"]
+    state = double(5.0, 5.0, 0.0, 0.0, 10.0)
+    cost = plant.running_cost(TIME_ZERO, state, double(88.0, 10.5), double(1.0)).item()
+    assert cost == pytest.approx(0.5 * (88.0 / 77.2) ** 3 + 0.1 * 1.0**2, rel=1e-12)  # 0.5 deg in 0.5 ms
+
+
+def test_the_stroke_plane_turns_at_its_greatest_rate():
+    plant, free = (FlappingWing(horizon=0.01, stroke_plane_rate=rate) for rate in (400.0, None))
+    assert len(free.states) == 4 and plant.controller_states == ("stroke_plane_angle",)
+    command = double(70.0, -30.0).expand(1, plant.n_steps, 2)
+    wind = torch.ones(1, plant.n_steps, 1, dtype=torch.float64)
+    flown = Rollout(plant, plant.closure)(plant.draw_initial_state(1, seeded()), wind, command)
+    expected = -0.2 * torch.arange(1, plant.n_steps + 1, dtype=torch.float64)
+    torch.testing.assert_close(flown.actions[0, :, 1], expected)
+    torch.testing.assert_close(flown.states[0, 1:, 4], expected)
+    check_plant(plant, episodes=2, steps=10, traced=False)
+    # Without a limit that is met, the drone is that of the paper.
+    fast = FlappingWing(horizon=0.01, stroke_plane_rate=1e6)
+    same = Rollout(fast, fast.closure)(fast.draw_initial_state(1, seeded()), wind, command)
+    plain = Rollout(free, free.closure)(free.draw_initial_state(1, seeded()), wind, command)
+    torch.testing.assert_close(same.states[..., :4], plain.states, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", [PaperCost, EngineeringCost, TrackingCost, PressureCost])
+def test_negative_weights_are_refused(kind):
+    for name, value in vars(kind()).items():
+        for wrong in (-1.0, math.nan) if isinstance(value, float) else ():
+            with pytest.raises(ValueError, match=name):
+                kind(**{name: wrong})
+
+
+# The duty cycle
+
+
+def test_an_open_or_shut_valve_is_the_same_for_both_commands():
+    drop, duty = (CryogenicTank(horizon=3000.0, command=command) for command in ("drop", "duty"))
+    state, load = drop.draw_initial_state(2, seeded()), drop.draw_exogenous(2, seeded())
+    for share in (0.0, 1.0):
+        ends = []
+        for plant in (drop, duty):
+            command = torch.full((2, plant.n_steps, 1), share * plant.actions[0].high, dtype=torch.float64)
+            flown = Rollout(plant, plant.closure)(state, load, command)
+            ends.append((flown.states, control_cost(plant, flown), plant.merit(flown.states, flown.actions, load)))
+        torch.testing.assert_close(ends[0], ends[1], rtol=1e-12, atol=1e-12)
+
+
+def test_a_duty_cycle_takes_more_heat_per_mass_than_a_half_open_valve():
+    plant = CryogenicTank(command="duty")
+    state = plant.state_at(double(500e3))
+    half = plant.vent(state, double([0.5]), plant.closure)
+    whole = plant.vent(state, double([1.0]), plant.closure)
+    assert half.flow.item() == pytest.approx(0.5 * whole.flow.item(), rel=1e-12)
+    assert half.heat.item() == pytest.approx(0.5 * whole.heat.item(), rel=1e-12)
+    throttled = CryogenicTank().vent(state, double([50e3]), plant.closure)  # half the flow, which is a root of the drop
+    assert throttled.flow.item() == pytest.approx(half.flow.item(), rel=1e-3)
+    assert throttled.heat.item() < 0.97 * half.heat.item()
+
+
+def test_the_classical_valves_command_a_duty_cycle():
+    flights = []
+    for command in ("drop", "duty"):
+        plant = CryogenicTank(horizon=60_000.0, command=command)
+        state, load = plant.draw_initial_state(2, seeded(1)), plant.draw_exogenous(2, seeded(1))
+        flights.append(OnOffValve(plant).fly(state, load).states)
+    torch.testing.assert_close(*flights, rtol=1e-10, atol=1e-10)
+
+
+# Terminal costs
+
+
+@pytest.fixture
+def tank():
+    return CryogenicTank(horizon=900.0, cost=PressureCost(end=7200.0))
+
+
+def test_the_terminal_cost_is_a_part_of_every_cost(tank):
+    plain = CryogenicTank(horizon=900.0)
+    state, load = tank.draw_initial_state(3, seeded()), tank.draw_exogenous(3, seeded())
+    policy = tank.make_policy(seeded(1))
+    rollout = Rollout(tank, tank.closure, policy)
+    flown = rollout(state, load)
+    e = (flown.states[:, -1, 2] - 500e3) / 10e3
+    expected = control_cost(plain, flown) + 7200.0 * e**2 / 900.0
+    torch.testing.assert_close(control_cost(tank, flown), expected, rtol=1e-12, atol=0.0)
+    for engine in ("native", "parallel", "autograd"):
+        costs = Rollout(tank, tank.closure, policy, engine=engine).costs(state, load)
+        torch.testing.assert_close(costs, expected, rtol=1e-11, atol=0.0)
+
+
+def test_gradients_of_the_terminal_cost_by_policy_and_initial_state(tank):
+    state, load = tank.draw_initial_state(3, seeded()), tank.draw_exogenous(3, seeded())
+    policy, found = tank.make_policy(seeded(1)), {}
+    for engine in ("native", "autograd"):
+        first = state.clone().requires_grad_()
+        cost = Rollout(tank, tank.closure, policy, engine=engine).costs(first, load).sum()
+        found[engine] = torch.autograd.grad(cost, [first, *policy.parameters()])
+    for native, exact in zip(*found.values(), strict=True):
+        torch.testing.assert_close(native, exact, rtol=1e-9, atol=1e-9 * exact.abs().max().item())
+
+
+def test_rewards_sum_to_the_cost_by_steps_and_by_machine_code(tank):
+    env, policy = PlantEnv(tank, seed=3), tank.make_policy(seeded(1))
+    with torch.no_grad():
+        stepped = env.rollout(tank.n_steps, TensorDictModule(policy, in_keys=["observation"], out_keys=["action"]))
+        flown = Rollout(tank, tank.closure, policy)(stepped["state"][:, 0], stepped["exogenous"])
+        cost = control_cost(tank, flown)
+    torch.testing.assert_close(-stepped["next", "reward"][..., 0].mean(-1), cost, rtol=1e-9, atol=0.0)
+    last, before = stepped["next", "reward"][0, -1, 0], stepped["next", "reward"][0, -2, 0]
+    e = (stepped["next", "state"][0, -1, 2] - 500e3) / 10e3
+    assert (before - last).item() == pytest.approx(7200.0 / 30.0 * e.item() ** 2, rel=1e-2)
+    actor = LivePolicy(tank, policy, ExplorationConfig(), generator=seeded(5))
+    episode = collector_of(PlantEnv(tank, seed=3), actor, tank).rollout()
+    states = torch.cat([episode["state"], episode["next", "state"][:, -1:]], 1)
+    found = control_cost(tank, type(flown)(states, episode["next", "applied"], episode["exogenous"]))
+    torch.testing.assert_close(-episode["next", "reward"][..., 0].mean(-1), found, rtol=1e-9, atol=0.0)
+
+
+def test_a_terminal_cost_must_fulfil_the_contract(tank):
+    class Negative(CryogenicTank):
+        def terminal_cost(self, state):
+            return -(state[..., 2] ** 2)
+
+    check_plant(tank, episodes=2, steps=10, traced=False)
+    with pytest.raises(ValueError, match="terminal_cost: is -"):
+        check_plant(Negative(horizon=900.0), episodes=2, steps=10, traced=False)
+
+
+def test_an_optimal_vent_goes_on_until_the_end_where_the_end_has_a_price():
+    """Of constant openings in the last hours, the cheapest is shut where nobody pays for the end, else open."""
+    ends = []
+    for weight in (0.0, 43_200.0):
+        plant = CryogenicTank(horizon=21_600.0, cost=PressureCost(end=weight))
+        state = plant.state_at(double(510e3)).expand(3, 3)
+        load = torch.full((3, plant.n_steps, 1), 130.0, dtype=torch.float64)
+        share = double(0.0, 0.5, 1.0).view(3, 1, 1).expand(3, plant.n_steps, 1)
+        ends.append(Rollout(plant, plant.closure).costs(state, load, 200e3 * share).argmin().item())
+    assert ends == [0, 2]
+
+
+def test_a_policy_of_other_signals_is_affine():
+    plant = CryogenicTank(observe=("clock",))
+    assert isinstance(plant.make_policy(seeded()), SaturatedAffine)

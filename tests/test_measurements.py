@@ -1,0 +1,180 @@
+"""What a policy observes: any choice of a plant's measurements, each scaled to order one; and previews of the wind."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from rt_torchrl import Rollout, SaturatedAffine, SaturatedMLP, check_plant, control_cost, shipped_plants
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.rosco import rosco_turbine
+from rt_torchrl.plants.measurement import Component, Measurement, Preview
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.exogenous import ExogenousConfig
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+
+TIME_ZERO = torch.zeros((), dtype=torch.float64)
+CHOICES = [(name, kind, which) for name, kind in shipped_plants().items() for which in kind.observation_sets]
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def double(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def short(kind, **options):
+    plant = kind(**options)
+    return kind(dt=plant.dt, horizon=50 * plant.dt, **options)
+
+
+def names(plant):
+    return [signal.name for signal in plant.observations]
+
+
+@pytest.mark.parametrize(("name", "kind", "which"), CHOICES, ids=[f"{name}-{which}" for name, _, which in CHOICES])
+def test_a_plant_fulfils_its_contract_with_every_set(name, kind, which):
+    plant = short(kind, observe=(which,))
+    check_plant(plant, episodes=2, steps=10, traced=False)
+    assert names(plant) == list(kind.observation_sets[which])
+
+
+@pytest.mark.parametrize(("name", "kind", "which"), CHOICES, ids=[f"{name}-{which}" for name, _, which in CHOICES])
+def test_observations_are_of_order_one(name, kind, which):
+    plant = kind(observe=(which,))
+    state, exogenous = plant.draw_initial_state(3, seeded()), plant.draw_exogenous(3, seeded())
+    low, high = plant.actions[0].low, plant.actions[0].high
+    policy = SaturatedAffine(len(plant.observations), plant.actions, weight_scale=0.0, generator=seeded())
+    assert low < high
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure, policy)(state, exogenous)
+    t = plant.dt * torch.arange(plant.n_steps, dtype=torch.float64)
+    seen = plant.observe(t, flown.states[:, :-1], exogenous)
+    # Half-open actuators leave the target by far; that is an order of magnitude, not two.
+    assert seen.abs().mean((0, 1)).max() < 15.0 and (seen.std((0, 1)) + seen.abs().mean((0, 1)) > 1e-3).all()
+
+
+def test_the_turbine_observes_by_hand():
+    plant = WindTurbine(observe=("rotor_speed", "blade_pitch", "wind_speed", "speed_error"))
+    state = double(1.16711, 110.0, 9.0, 0.2, 3e4, 6.0)
+    reference = 97.0 * plant.best_tip_speed_ratio * 9.0 / 63.0
+    expected = double(-0.5, 0.2, 1.5, (110.0 - reference) / 20.0)
+    torch.testing.assert_close(plant.observe(TIME_ZERO, state, double(15.5)), expected)
+
+
+def test_names_and_sets_are_chosen_together_and_once():
+    plant = WindTurbine(observe=("wind_speed", "errors", "wind_speed", "speed_error"))
+    assert names(plant) == ["wind_speed", "speed_error", "speed_error_integral", "rotor_speed"]
+    assert names(WindTurbine()) == names(WindTurbine(observe=("paper",))) == ["speed_error", "speed_error_integral"]
+
+
+@pytest.mark.parametrize("observe", [("lidar",), ("paper", "lidar"), "paper"])
+def test_what_is_not_measured_is_refused(observe):
+    with pytest.raises(ValueError, match="observe="):
+        WindTurbine.chosen(observe)
+
+
+def test_a_measurement_without_a_scale_is_refused():
+    for scale in (0.0, -1.0, math.inf):
+        with pytest.raises(ValueError, match="scale"):
+            Measurement(symbol="y", name="y", unit="m", read=Component("state", 0), scale=scale)
+
+
+def test_the_phase_of_the_wing_beat():
+    plant = FlappingWing(observe=("phase_cosine", "phase_sine"))
+    t = double(0.0, 0.0125, 0.025)  # a beat lasts 0.05 s
+    seen = plant.observe(t, torch.zeros(3, 4, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64))
+    torch.testing.assert_close(seen, double(1.0, 0.0, 0.0, 1.0, -1.0, 0.0).view(3, 2), atol=1e-12, rtol=0.0)
+
+
+# Previews
+
+
+def test_a_preview_is_the_wind_to_come_in_every_episode():
+    plant, plain = (WindTurbine(horizon=60.0, observe=(which,)) for which in ("preview", "measured+wind"))
+    wind, base = plant.draw_exogenous(3, seeded(1)), plain.draw_exogenous(3, seeded(1))
+    assert [signal.name for signal in plant.inputs[1:]] == [f"wind_speed_in_{lead}_s" for lead in (2, 4, 8)]
+    assert torch.equal(wind[..., :1], base)
+    for column, steps in ((1, 4), (2, 8), (3, 16)):
+        assert torch.equal(wind[:, :-steps, column], base[:, steps:, 0])
+        assert torch.equal(wind[:, -steps:, column], base[:, -1:, 0].expand(-1, steps))
+
+
+def test_a_preview_needs_whole_intervals():
+    with pytest.raises(ValueError, match=r"preview of 2\.0 s"):
+        WindTurbine(dt=0.3, horizon=30.0, observe=("preview",)).draw_exogenous(2, seeded())
+    assert Preview(0, 4.0).shifted(torch.zeros(2, 3, 1), 0.5).shape == (2, 3)  # the lead is longer than the series
+
+
+def test_a_preview_changes_nothing_of_the_turbine():
+    plant, plain = (WindTurbine(horizon=60.0, observe=(which,)) for which in ("preview", "paper"))
+    state, wind = plain.draw_initial_state(2, seeded()), plant.draw_exogenous(2, seeded())
+    command = double(3e4, 2.0).expand(2, plant.n_steps, 2)
+    found = Rollout(plant, plant.closure)(state, wind, command).states
+    torch.testing.assert_close(found, Rollout(plain, plain.closure)(state, wind[..., :1], command).states)
+
+
+def test_virtual_episodes_preview_their_own_wind():
+    """The process is fitted to the wind alone; the preview of a realisation is its own future."""
+    plant = WindTurbine(horizon=60.0, observe=("preview",))
+    state, wind = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())
+    flown = Rollout(plant, plant.closure)(state, wind, double(3e4, 2.0).expand(1, plant.n_steps, 2))
+    virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), ExogenousConfig(), 1, generator=seeded())
+    virtual.learn(Trajectory(flown.states[0], flown.actions[0], wind[0]))
+    assert virtual.processes[0].mean.shape == (plant.n_steps, 1)
+    drawn = virtual.draw(4).exogenous
+    assert torch.equal(drawn[:, :-8, 2], drawn[:, 8:, 0]) and not torch.equal(drawn[0], drawn[1])
+    saved = virtual.state_dict()
+    virtual.load_state_dict(saved)
+    assert virtual.draw(2).exogenous.shape == (2, plant.n_steps, 4)
+
+
+def test_rosco_has_no_lidar():
+    with pytest.raises(ValueError, match="lidar"):
+        rosco_turbine(WindTurbine(observe=("preview",)))
+
+
+@pytest.mark.parametrize("which", ["measured+wind", "preview"])
+def test_exact_gradients_of_policies_that_see_more(which):
+    plant = WindTurbine(horizon=30.0, observe=(which,))
+    state, wind = plant.draw_initial_state(2, seeded(2)), plant.draw_exogenous(2, seeded(2))
+    policy = SaturatedMLP(len(plant.observations), plant.actions, hidden=(4,), generator=seeded(3))
+    weight = next(policy.parameters())
+
+    def cost():
+        return Rollout(plant, plant.closure, policy).costs(state, wind).mean()
+
+    (gradient,) = torch.autograd.grad(cost(), weight)
+    for k in (0, weight.shape[1] - 1):
+        ends = []
+        for step in (1e-5, -1e-5):
+            with torch.no_grad():
+                weight[0, k] += step
+                ends.append(cost().item())
+                weight[0, k] -= step
+        assert gradient[0, k].item() == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-9)
+
+
+def test_a_state_for_the_fast_filter_only_where_it_is_seen():
+    counts = {which: len(WindTurbine(observe=(which,)).states) for which in WindTurbine.observation_sets}
+    assert counts.pop("scheduled") == 7 and set(counts.values()) == {6}
+
+
+def test_measurements_keep_all_of_their_signal():
+    signal = WindTurbine.states[4]
+    found = Measurement.of(signal, Component("state", 4), scale=2.0).signal
+    assert dataclasses.asdict(found) == dataclasses.asdict(signal)
+
+
+def test_costs_do_not_depend_on_what_is_seen():
+    plant, plain = (WindTurbine(horizon=60.0, observe=(which,)) for which in ("preview", "paper"))
+    state, wind = plain.draw_initial_state(2, seeded()), plant.draw_exogenous(2, seeded())
+    command = double(3e4, 2.0).expand(2, plant.n_steps, 2)
+    flown = Rollout(plant, plant.closure)(state, wind, command)
+    same = Trajectory(flown.states, flown.actions, wind[..., :1])
+    torch.testing.assert_close(control_cost(plant, flown), control_cost(plain, same))
