@@ -27,7 +27,7 @@ from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
 from .optimal_control.clairvoyant import Clairvoyant, clairvoyant
-from .optimal_control.forecasts import Decaying, Forecast, Held, Preview
+from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen
 from .optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from .identification.identification import Identification, IdentificationConfig
 from .identification.sensor_log import read_log
@@ -81,6 +81,7 @@ __all__ = [
     "ExogenousConfig",
     "ExplorationConfig",
     "Forecast",
+    "Foreseen",
     "Held",
     "Identification",
     "IdentificationConfig",

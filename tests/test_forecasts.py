@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held, Preview
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
 
 NOW = torch.tensor([[3.0, -1.0], [5.0, 2.0]], dtype=torch.float64)
 
@@ -55,19 +55,19 @@ def test_the_fitted_decay_has_the_least_error_of_all_on_the_records():
 
 def test_a_preview_knows_the_record_as_far_as_it_reaches():
     record = torch.arange(20.0).double().reshape(1, 20, 1)
-    every, near = Preview(record, dt=0.5), Preview(record, dt=0.5, reach=1.0)
+    every, near = Foreseen(record, dt=0.5), Foreseen(record, dt=0.5, reach=1.0)
     assert every(2.0, record[:, 4], 5).flatten().tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
     assert every(9.0, record[:, 18], 4).flatten().tolist() == [18.0, 19.0, 19.0, 19.0]
     assert near(2.0, record[:, 4], 5).flatten().tolist() == [4.0, 5.0, 6.0, 6.0, 6.0]
     to_zero = Decaying(torch.zeros(1).double(), torch.tensor([0.5]).double(), dt=0.5)
-    beyond = Preview(record, dt=0.5, reach=0.5, beyond=to_zero)(2.0, record[:, 4], 4)
+    beyond = Foreseen(record, dt=0.5, reach=0.5, beyond=to_zero)(2.0, record[:, 4], 4)
     torch.testing.assert_close(beyond.flatten(), torch.tensor([4.0, 5.0, 5.0 / math.e, 5.0 / math.e**2]).double())
 
 
 def test_impossible_forecasts_are_refused():
     record = torch.zeros(1, 20, 1).double()
     with pytest.raises(ValueError, match="reach=-1"):
-        Preview(record, dt=0.5, reach=-1.0)
+        Foreseen(record, dt=0.5, reach=-1.0)
     with pytest.raises(ValueError, match="must be positive"):
         Decaying(torch.zeros(1).double(), torch.zeros(1).double(), dt=0.5)
     with pytest.raises(ValueError, match="horizon=10"):

@@ -11,7 +11,7 @@ from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import clairvoyant, constant_starts, random_starts
-from rt_torchrl.optimal_control.forecasts import Preview
+from rt_torchrl.optimal_control.forecasts import Foreseen
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
@@ -130,7 +130,7 @@ def test_a_preview_until_the_end_is_the_clairvoyant_optimum():
     plant = LinearQuadratic(horizon=3.0, noise=0.5)
     state, exogenous = episodes(plant, 2)
     config = RecedingHorizonConfig(horizon=3.0, period=0.5, ends=True, tolerance=0.0, iterations=300)
-    controller = RecedingHorizon(plant, plant.closure, config, forecast=Preview(exogenous, dt=plant.dt))
+    controller = RecedingHorizon(plant, plant.closure, config, forecast=Foreseen(exogenous, dt=plant.dt))
     costs = control_cost(plant, controller.fly(state, exogenous))
     for episode, cost in enumerate(costs.tolist()):
         wanted = quadratic_program(plant, state[episode].numpy(), exogenous[episode, :, 0].numpy())[1]

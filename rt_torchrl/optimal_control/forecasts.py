@@ -75,7 +75,7 @@ class Decaying:
         return self.mean + (exogenous - self.mean).unsqueeze(1) * share
 
 
-class Preview:
+class Foreseen:
     """The inputs themselves for a time ahead, as a lidar measures them, and another forecast from there on.
 
     Args:

@@ -14,7 +14,7 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
-from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held, Preview
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
@@ -140,7 +140,7 @@ def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: fl
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
     longest = min(horizon, 0.5 * plant.horizon)
     decaying = Decaying.fitted(records, dt=plant.dt, horizon=longest)
-    return {"held": Held(), "decaying": decaying, "preview": Preview(exogenous, dt=plant.dt)}
+    return {"held": Held(), "decaying": decaying, "preview": Foreseen(exogenous, dt=plant.dt)}
 
 
 def in_milliseconds(seconds: list[float]) -> dict[str, float]:
