@@ -31,6 +31,15 @@ def matrices(plant):
     return A, total @ np.array(plant.B), total @ np.array(plant.D), np.array(plant.Q), np.array(plant.R)
 
 
+class PricedEnd(LinearQuadratic):
+    """The problem with a cost of its end state."""
+
+    price = 8.0
+
+    def terminal_cost(self, state):
+        return self.price * state.square().sum(-1)
+
+
 def quadratic_program(plant, s_0, z):
     """The optimal actions of an episode as a bounded least-squares problem, and their J_a."""
     A, B, D, Q, R = matrices(plant)
@@ -42,6 +51,8 @@ def quadratic_program(plant, s_0, z):
         rest += [root @ free, np.zeros(1)]
         gain, free = A @ gain, A @ free + D[:, 0] * z[k]
         gain[:, k] += B[:, 0]
+    weight = np.sqrt(getattr(plant, "price", 0.0) / plant.dt)
+    rows, rest = [*rows, weight * gain], [*rest, weight * free]
     found = lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=(-2.0, 2.0), tol=1e-14)
     return found.x, 2.0 * found.cost / n
 
@@ -51,8 +62,9 @@ def episodes(plant, batch, seed=0):
     return 2.0 * plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator)
 
 
-def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program():
-    plant = LinearQuadratic(horizon=4.0, noise=0.5)
+@pytest.mark.parametrize("kind", [LinearQuadratic, PricedEnd])
+def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program(kind):
+    plant = kind(horizon=4.0, noise=0.5)
     state, exogenous = episodes(plant, 3)
     starts = constant_starts(plant, 3, plant.n_steps)
     starts |= random_starts(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1), count=2)

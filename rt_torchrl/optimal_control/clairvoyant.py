@@ -77,7 +77,7 @@ def clairvoyant(
     if not starts:
         raise ValueError("starts is empty; name at least one, such as the commands of a classical controller.")
     closure = constant(plant.closure if closure is None else closure)
-    cost = CommandCost(plant, closure, hold=hold, penalty=penalty)
+    cost = CommandCost(plant, closure, hold=hold, penalty=penalty, terminal=plant.terminal_cost)
     cost.begin(initial_state, exogenous)
     system, n, gradients = Rollout(plant, closure), exogenous.shape[1], 0
     points: dict[str, np.ndarray] = {}

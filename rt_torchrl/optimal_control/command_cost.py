@@ -209,7 +209,8 @@ class CommandCost:
         with torch.enable_grad():
             end = torch.from_numpy(ends[:, :live].T.copy()).requires_grad_()
             value = self.terminal(end) / self.plant.dt
-            (slope,) = torch.autograd.grad(value.sum(), end)
+            # The terminal cost of most plants is a constant.
+            slope = torch.autograd.grad(value.sum(), end)[0] if value.requires_grad else torch.zeros_like(end)
         self._costate[:-1, :live] = slope.numpy().T
         return value.detach().numpy()
 

@@ -157,7 +157,7 @@ class RecedingHorizon:
         k = round(t / self.plant.dt)
         n = min(self.horizon, self.plant.n_steps - k) if self.config.ends else self.horizon
         ends = self.config.ends and k + n == self.plant.n_steps
-        self.cost.terminal = None if ends else self._terminal
+        self.cost.terminal = self.plant.terminal_cost if ends else self._terminal
         inputs = self.forecast(t, exogenous, n)
         first = not self._plans
         found = []
