@@ -30,18 +30,20 @@ class TangentInterval(nn.Module):
 
     Args:
         interval: the interval of the states s, with the closure whose trained weights come first among the columns.
+        names: names of these weights in the closure. While the interval is traced, other tensors stand for them, which
+            ask for no gradients.
     """
 
-    def __init__(self, interval: Interval):
+    def __init__(self, interval: Interval, names: tuple[str, ...]):
         super().__init__()
-        self.interval = interval
+        self.interval, self.names = interval, names
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """States and sensitivities, (s, S), at the end of the interval."""
         n_s = len(self.interval.plant.states)
         s, S = state[..., :n_s], state[..., n_s:].unflatten(-1, (n_s, -1))
-        named = self.interval.closure.named_parameters()
-        weights = {f"closure.{name}": w for name, w in named if w.requires_grad}
+        held = dict(self.interval.closure.named_parameters())
+        weights = {f"closure.{name}": held[name] for name in self.names}
         t = drive.t.expand(s.shape[:1])
 
         def end(values: dict[str, Tensor], s: Tensor, *drive: Tensor) -> Tensor:
@@ -66,7 +68,7 @@ class Sensitivities:
 
     def __init__(self, plant: Plant, closure: nn.Module):
         self.interval = Interval(plant, closure, None)
-        self._tangent = TangentInterval(self.interval)
+        self._tangent = TangentInterval(self.interval, self._trained())
         self._engine = Native(compiled=False)
 
     @torch.no_grad()
@@ -90,6 +92,8 @@ class Sensitivities:
         """
         drive = drive_of(self.interval.plant, exogenous, actions, start=start)
         batch, n_s = initial_state.shape
+        if self._tangent.names != self._trained():  # a weight was frozen or freed since
+            self._tangent = TangentInterval(self.interval, self._trained())
         count = sum(w.numel() for w in self.interval.closure.parameters() if w.requires_grad)
         S = initial_state.new_zeros(batch, n_s, count)
         if initial:
@@ -105,10 +109,13 @@ class Sensitivities:
             S_ends = self._propagated(S, torch.cat([initial_state.unsqueeze(0), ends[:-1]]), drive)
         return ends.transpose(0, 1), S_ends.transpose(0, 1)
 
+    def _trained(self) -> tuple[str, ...]:
+        """Names of the closure's trained weights."""
+        return tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
+
     def _propagated(self, S: Tensor, starts: Tensor, drive: Drive) -> Tensor:
         """The sensitivities S_1 ... S_n, ``n batch n_s n_w``, from the Jacobians of all intervals at once."""
-        names = tuple(name for name, w in self.interval.closure.named_parameters() if w.requires_grad)
-        jacobians = over_all(partial(linearise_by_rows, self.interval, names), starts, drive)
+        jacobians = over_all(partial(linearise_by_rows, self.interval, self._trained()), starts, drive)
         A, B = jacobians.tensor_split([starts.shape[-1]], -1)
         unused, found = S.shape[-1] - B.shape[-1], []
         for transition, source in zip(A, B, strict=True):
