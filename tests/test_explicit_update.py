@@ -5,22 +5,15 @@ import itertools
 import time
 import warnings
 
-import numpy as np
 import pytest
 import torch
-from hidden_force import Answer, HiddenForce
 from linear_quadratic import LinearGain, LinearQuadratic
-from scipy.stats import ks_2samp
 from test_ddpg import explored, seeded
 from torch import nn
 from torch.utils._pytree import tree_flatten_with_path
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, mlp
 from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
 from rt_torchrl.twinning.learners.explicit import choice, row_function
 from rt_torchrl.twinning.learners.explicit.adam import AdamSteps
@@ -30,7 +23,6 @@ from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
 
 PLANT = LinearQuadratic()
 N_O, ACTIONS = len(PLANT.observations), PLANT.actions
-EPISODES = 3
 
 
 class Odd(nn.Module):
@@ -250,44 +242,6 @@ def test_what_the_formulas_do_not_hold_for_goes_torchrls_way_and_says_so_once(mo
     one, other = (leaves(state) for state in states)
     for name, value in one.items():
         torch.testing.assert_close(other[name], value, rtol=0, atol=0)
-
-
-def learning_curves(seeds, update, **options):
-    """J/J* of trainings of the model-free half from half the optimal gain, after each episode."""
-    config = LearnerConfig(return_steps=10, critic_iterations=300, actor_iterations=300, update=update, **options)
-    answer, curves = Answer(HiddenForce()), []
-    for seed in seeds:
-        plant = HiddenForce()
-        training = ReinforcementTwinning(
-            PlantEnv(plant, seed=1000 + seed),
-            DigitalTwin(plant, plant.closure),
-            model_free=LinearGain(0.5 * answer.gain),
-            model_based=LinearGain(0.5 * answer.gain),
-            config=TwinningConfig(arm="model_free", learner=config),
-            generator=torch.Generator().manual_seed(seed),
-        )
-        gains = []
-        for _ in range(EPISODES):
-            training.episode()
-            gains.append(training.policies["model_free"].gain.detach().numpy().copy())
-        curves.append([1.0 + answer.excess(gain) for gain in gains])
-    return np.array(curves)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
-def test_learning_curves_of_ten_seeds_are_those_of_torchrl(algorithm, unchecked):
-    expected, same, others = (
-        learning_curves(seeds, update, algorithm=algorithm)
-        for seeds, update in ((range(10), "torchrl"), (range(10), "explicit"), (range(10, 20), "explicit"))
-    )
-    for name, curves in {"torchrl": expected, "explicit": same, "explicit, other seeds": others}.items():
-        print(f"{algorithm}, {name}: J/J* of ten seeds: medians {np.median(curves, 0)}, last {np.sort(curves[:, -1])}")
-    # The same seeds give the same curves: what differs by rounding stays close over a thousand iterations.
-    np.testing.assert_allclose(same, expected, rtol=1e-3)
-    p = ks_2samp(expected[:, -1], others[:, -1]).pvalue
-    print(f"{algorithm}: two-sample Kolmogorov-Smirnov test of the last costs with other seeds: p = {p:.3f}")
-    assert p > 0.05
 
 
 def cpu_seconds(found):

@@ -11,7 +11,6 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL, small_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl import PlantContractError
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
@@ -88,20 +87,6 @@ def test_a_run_without_random_starts_has_the_same_results(tmp_path, capsys):
     del compared["unseen"]["J_a_untrained"], compared["seconds"], bare["seconds"]
     left = {key: value for key, value in compared.items() if "untrained" not in key}
     assert left == bare and len(left) == len(compared) - 2
-
-
-def test_policies_of_equal_weights_are_flown_once(tmp_path, monkeypatch):
-    """An unseen episode of a real system may take hours."""
-    run, flown = small_run(tmp_path, episodes=1, untrained=0), []
-    for name in ("fly", "control_costs"):
-        call = getattr(run.unseen, name)
-        monkeypatch.setattr(run.unseen, name, lambda policy, call=call: flown.append(policy) or call(policy))
-    run.train()
-    policies = [*run.initial_policies.values(), *run.algorithm.policies.values()]
-    # The model-free policy starts as a clone of the model-based one.
-    distinct = {tuple(parameters_to_vector(policy.parameters()).tolist()) for policy in policies}
-    assert len(distinct) == 3
-    assert sorted(tuple(parameters_to_vector(policy.parameters()).tolist()) for policy in flown) == sorted(distinct)
 
 
 def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):

@@ -126,12 +126,12 @@ def test_what_cannot_be_resumed_is_refused(tmp_path):
         RunFolder(RunConfig(log_dir=tmp_path, resume=True), "p")
 
 
+class Killed(BaseException):
+    """What stops a process."""
+
+
 def test_an_overwrite_that_is_killed_leaves_no_results_beside_other_options(tmp_path, monkeypatch):
     """Killed before every removal in turn, and before the new options are written."""
-
-    class Killed(BaseException):
-        pass
-
     unlink, moments = Path.unlink, 0
 
     def until(moment):

@@ -3,7 +3,9 @@
 No controller costs less: it is the limit that all others are compared with.
 """
 
+import contextlib
 from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -81,17 +83,13 @@ def clairvoyant(
     cost.begin(initial_state, exogenous)
     system, n, gradients = Rollout(plant, closure), exogenous.shape[1], 0
     points: dict[str, np.ndarray] = {}
-    costs: dict[str, Tensor] = {}
+    costs = {name: torch.full((len(initial_state),), torch.inf, dtype=torch.float64) for name in starts}
     for name, commands in starts.items():
-        try:
-            found = descend(
-                lambda point: _together(cost, point), cost.units(commands), config or BoundedDescentConfig()
-            )
-        except FloatingPointError:
-            costs[name] = torch.full((len(initial_state),), torch.inf, dtype=torch.float64)
-            continue
-        points[name], gradients = found.point, gradients + found.evaluations
-        costs[name] = system.costs(initial_state, exogenous, cost.commands(found.point, n))
+        # A start from which the plant diverges keeps its infinite cost.
+        with contextlib.suppress(FloatingPointError):
+            found = descend(partial(_together, cost), cost.units(commands), config or BoundedDescentConfig())
+            points[name], gradients = found.point, gradients + found.evaluations
+            costs[name] = system.costs(initial_state, exogenous, cost.commands(found.point, n))
     if not points:
         raise DivergenceError(f"plant {plant.name!r} diverges from every start: {', '.join(starts)}.")
     best = _best_of_each(costs, points)
