@@ -9,24 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.envs.cryogenic_tank.vent import valve_conductance
-from rt_torchrl.options import check_options
+from rt_torchrl.plants.cost import RunningCost, require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
 
 @runtime_checkable
-class TankCost(Protocol):
+class TankCost(RunningCost, Protocol):
     """A running and a terminal cost of the tank, of any batch dimensions; neither must be negative."""
-
-    def __call__(
-        self,
-        plant: "CryogenicTank",
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 3"],
-        applied: Float[Tensor, "*batch 1"],
-        exogenous: Float[Tensor, "*#batch 1"],
-    ) -> Float[Tensor, "*batch"]: ...
 
     def terminal(self, plant: "CryogenicTank", state: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]: ...
 
@@ -56,10 +47,7 @@ class PressureCost:
     end: float = 0.0
 
     def __post_init__(self) -> None:
-        check_options(self)
-        for name, weight in vars(self).items():
-            if not 0.0 <= weight < math.inf:
-                raise ValueError(f"{name}={weight} of PressureCost must be finite and not negative.")
+        require_weights(self)
 
     def __call__(
         self,

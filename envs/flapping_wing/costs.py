@@ -2,32 +2,18 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.options import check_options
+from rt_torchrl.plants.cost import RunningCost, require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
 Peak = Literal["unit", "printed"]
-
-
-@runtime_checkable
-class FlightCost(Protocol):
-    """A running cost of the drone, of any batch dimensions; it must not be negative."""
-
-    def __call__(
-        self,
-        plant: "FlappingWing",
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch 2"],
-        exogenous: Float[Tensor, "*#batch 1"],
-    ) -> Float[Tensor, "*batch"]: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,10 +47,7 @@ class TrackingCost:
     rate: float = 0.0
 
     def __post_init__(self) -> None:
-        check_options(self)
-        for name in ("velocity", "energy", "rate"):
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"{name}={getattr(self, name)} of TrackingCost must not be negative.")
+        require_weights(self)
 
     def __call__(
         self,
@@ -93,7 +76,7 @@ STROKE_PLANE_RATE = 1000.0
 """Unit of the rate of the stroke plane [deg/s]."""
 
 
-def needs_memory(cost: FlightCost) -> bool:
+def needs_memory(cost: RunningCost) -> bool:
     """Whether a cost reads the stroke plane angle that was applied last."""
     return isinstance(cost, TrackingCost) and cost.rate > 0.0
 

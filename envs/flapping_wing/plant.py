@@ -9,11 +9,12 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.flapping_wing import measurements as sensors
 from rt_torchrl.envs.flapping_wing import merit as judgement
-from rt_torchrl.envs.flapping_wing.costs import FlightCost, TrackingCost, needs_memory, require_rate
+from rt_torchrl.envs.flapping_wing.costs import TrackingCost, needs_memory, require_rate
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
 from rt_torchrl.envs.flapping_wing.wings import Wings
+from rt_torchrl.plants.cost import RunningCost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
@@ -100,7 +101,7 @@ class FlappingWing(Plant):
         closure: nn.Module | None = None,
         wind: GustModel | None = None,
         target: tuple[float, float] = (5.0, 5.0),
-        cost: FlightCost | None = None,
+        cost: RunningCost | None = None,
         mass: float = 3e-3,
         stroke_plane_rate: float | None = None,
         observe: Sequence[str] = (),

@@ -1,13 +1,12 @@
 """What is wanted of the turbine: running costs L_a, each called with the plant, time, state, action and wind."""
 
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.options import check_options
+from rt_torchrl.plants.cost import RunningCost, require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -15,20 +14,6 @@ if TYPE_CHECKING:
 
 TORQUE_RATE = 15e3
 """Unit of the torque's rate, the greatest rate of the actuator [N m/s]."""
-
-
-@runtime_checkable
-class TurbineCost(Protocol):
-    """A running cost of the turbine, of any batch dimensions; it must not be negative."""
-
-    def __call__(
-        self,
-        plant: "WindTurbine",
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch 2"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-    ) -> Float[Tensor, "*batch"]: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +35,7 @@ class PaperCost:
     power: float = 1.0
 
     def __post_init__(self) -> None:
-        _require_weights(self)
+        require_weights(self)
 
     def __call__(
         self,
@@ -100,7 +85,7 @@ class EngineeringCost:
     torque_rate: float = 0.01
 
     def __post_init__(self) -> None:
-        _require_weights(self)
+        require_weights(self)
 
     def __call__(
         self,
@@ -124,12 +109,5 @@ class EngineeringCost:
         )
 
 
-def _require_weights(cost: PaperCost | EngineeringCost) -> None:
-    check_options(cost)
-    for name, weight in vars(cost).items():
-        if weight < 0.0 or not math.isfinite(weight):
-            raise ValueError(f"{name}={weight} of {type(cost).__name__} must not be negative.")
-
-
-TASKS: dict[str, TurbineCost] = {"paper": PaperCost(), "engineering": EngineeringCost()}
+TASKS: dict[str, RunningCost] = {"paper": PaperCost(), "engineering": EngineeringCost()}
 """The running costs by the name of their task."""

@@ -10,11 +10,12 @@ from torch import Tensor, nn
 from rt_torchrl.envs.wind_turbine import measurements as sensors
 from rt_torchrl.envs.wind_turbine import merit as judgement
 from rt_torchrl.envs.wind_turbine.completion import completed, started
-from rt_torchrl.envs.wind_turbine.costs import PaperCost, TurbineCost
+from rt_torchrl.envs.wind_turbine.costs import PaperCost
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
+from rt_torchrl.plants.cost import RunningCost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
@@ -104,7 +105,7 @@ class WindTurbine(Plant):
         wind: WindModel | None = None,
         inertia: float = DRIVETRAIN_INERTIA,
         rate_limits: tuple[float, float] | None = (15e3, 8.0),
-        cost: TurbineCost | None = None,
+        cost: RunningCost | None = None,
         observe: Sequence[str] = (),
     ):
         table = PowerCoefficientTable.nrel5mw()
