@@ -19,7 +19,7 @@ from rt_torchrl import (
     main_of,
     require_device,
 )
-from rt_torchrl.envs.wind_turbine.costs import TASKS
+from rt_torchrl.envs.wind_turbine.costs import EngineeringCost, PaperCost
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
@@ -74,6 +74,7 @@ class Config(RunConfig):
             rotor_speed; by default paper, or scheduled for the policy scheduled.
         task: what is wanted: paper (the paper's J_a), or engineering (energy up to rated power, with penalties on
             overspeed, overshoot, and the rates of pitch and torque).
+        engineering: weights of the task engineering.
         dt: control interval [s], 0.5 or 0.25.
         horizon: length of an episode T_o [s].
         mean_wind: mean wind speed U [m/s].
@@ -88,6 +89,7 @@ class Config(RunConfig):
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"
+    engineering: EngineeringCost = field(default_factory=EngineeringCost)
     dt: float = 0.5
     horizon: float = 600.0
     mean_wind: float = 11.0
@@ -103,6 +105,8 @@ class Config(RunConfig):
             raise ValueError(f"mean_wind={self.mean_wind} m/s must be positive and at most {STORM:g} m/s.")
         if not 0.0 <= self.turbulence <= 1.0:
             raise ValueError(f"turbulence={self.turbulence} must lie in [0, 1], such as 0.16 for 16 %.")
+        if self.task == "paper" and self.engineering != EngineeringCost():
+            raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
         other = self.model_free_policy
         if not self.observe and "scheduled" in (self.policy, other) and other not in ("same", self.policy, "mlp"):
@@ -120,7 +124,8 @@ class Config(RunConfig):
         if self.wind_files:
             wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
         observe = self.observe or (("scheduled",) if self.policy == "scheduled" else ())
-        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=TASKS[self.task], observe=observe)
+        cost = self.engineering if self.task == "engineering" else PaperCost()
+        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=observe)
 
     @staticmethod
     def wind_of(path: Path) -> WindRecord:

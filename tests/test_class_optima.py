@@ -8,7 +8,7 @@ import torch
 
 from rt_torchrl import SaturatedMLP
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.wind_turbine.costs import TASKS
+from rt_torchrl.envs.wind_turbine.costs import EngineeringCost
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
@@ -56,7 +56,7 @@ def test_an_affine_law_of_the_measured_states():
 @pytest.mark.parametrize("seed", range(5))
 def test_the_engineering_task_beats_jonkman_in_all_his_merits(seed):
     """On unseen episodes: his energy, at most 1.5 times his pitch travel, and a fifth less speed above rated."""
-    plant = WindTurbine(cost=TASKS["engineering"], observe=("measured+wind",))
+    plant = WindTurbine(cost=EngineeringCost(), observe=("measured+wind",))
     episodes = UnseenEpisodes(plant, EPISODES, seed=SEED)
     found = exact_optimum(
         episodes, perceptron(plant), starts=1, approach=300, iterations=200, few=EPISODES, polish=0, seed=seed

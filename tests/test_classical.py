@@ -9,7 +9,7 @@ from test_optimal_gain import optimal_gain
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
@@ -114,6 +114,22 @@ def test_the_valve_opens_above_its_band_and_shuts_below_it():
         command, is_open = valve.act(state, is_open)
         found.append(round(command.item()))
     assert found == [0, 0, 150_000, 150_000, 150_000, 0, 0]
+
+
+def test_a_valve_that_rests_at_the_end_is_near_the_limit():
+    """The clairvoyant optimum of these episodes is 2.64954; nobody pays for the pressure at the end."""
+    plant = CryogenicTank()
+    unseen = UnseenEpisodes(plant, 8, seed=12345)
+    costs = [unseen.judge(unseen.fly_baseline(kind(plant))).control_costs.mean() for kind in (OnOffValve, RestingOnOff)]
+    assert 2.64954 < costs[1] < 1.003 * 2.64954 < 1.03 * 2.64954 < costs[0]
+
+
+def test_the_resting_valve_is_the_usual_one_until_its_rest():
+    plant = CryogenicTank(horizon=6e4)
+    unseen = UnseenEpisodes(plant, 2)
+    usual, rested = (unseen.fly_baseline(kind(plant)).actions for kind in (OnOffValve, RestingOnOff))
+    end = round((6e4 - 43.2e3) / plant.dt)
+    assert torch.equal(usual[:, :end], rested[:, :end]) and usual[:, end:].any() and not rested[:, end:].any()
 
 
 def test_the_integral_of_the_valve_stops_where_the_valve_does():

@@ -19,7 +19,7 @@ class OnOffValve(ClassicalController):
 
     plant: CryogenicTank
     gain_units = {"opening": "Pa"}
-    default_gains = (200e3,)
+    default_gains: tuple[float, ...] = (200e3,)
     half_band = 1e3  # h [Pa]
     memory_size = 1
 
@@ -28,7 +28,29 @@ class OnOffValve(ClassicalController):
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
         error = state[..., 2:] - self.plant.set_point
         is_open = torch.where(error > self.half_band, 1.0, torch.where(error < -self.half_band, 0.0, memory))
-        return self.plant.command.of_drop(is_open * self.log_gains.exp()), is_open
+        return self.plant.command.of_drop(is_open * self.log_gains[0].exp()), is_open
+
+
+class RestingOnOff(OnOffValve):
+    r"""The on-off valve with a clock: it stays shut for the last part of the episode.
+
+    The paper's cost of an episode pays nothing for the pressure at its end. What the last hours of venting would save
+    therefore comes too late. The rest of 12 h is that of the clairvoyant optimum. A plant with a terminal cost has no
+    use for it.
+    """
+
+    gain_units = {"opening": "Pa", "rest": "s"}
+    default_gains = (200e3, 43.2e3)
+    memory_size = 2
+
+    def act(
+        self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 2"]
+    ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 2"]]:
+        opening, rest = self.log_gains.exp().unbind()
+        _, was_open = super().act(state, memory[..., :1])
+        t = memory[..., 1:]
+        is_open = torch.where(t < self.plant.horizon - rest, was_open, 0.0)
+        return self.plant.command.of_drop(is_open * opening), torch.cat([is_open, t + self.plant.dt], -1)
 
 
 class PIValve(ClassicalController):

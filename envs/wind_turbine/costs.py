@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.cost import RunningCost, require_weights
+from rt_torchrl.plants.cost import require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -107,7 +107,3 @@ class EngineeringCost:
             + self.pitch_rate * pitch_rate**2
             + self.torque_rate * (torque_rate / TORQUE_RATE) ** 2
         )
-
-
-TASKS: dict[str, RunningCost] = {"paper": PaperCost(), "engineering": EngineeringCost()}
-"""The running costs by the name of their task."""
