@@ -1,17 +1,14 @@
 """What one quantity costs another: the Pareto front of a plant over one weight of its cost, as table and figure."""
 
-import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from rt_torchrl import ClassicalController, check_options, main_of
-from rt_torchrl.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.figures.pareto import pareto
-from rt_torchrl.study.pareto import Effort, Point, classical_point, content, pareto_front
+from rt_torchrl.study.pareto import Effort, Point, classical_point, keep, pareto_front
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,34 +94,22 @@ def main(config: Config) -> None:
     print(f"{front.weight:<24}{'J_a':>12}" + "".join(f"  {merit}" for merit in merits))
     for name, other in others.items():
         print(row(name, other), flush=True)
+    path, title = (
+        config.log_dir / f"{config.plant}.json",
+        f"{config.plant.replace('_', ' ')}: optima along {front.weight}",
+    )
     points: list[Point] = []
     for point in found:
         print(row(f"{point.weight:g}", point), flush=True)
         points.append(point)
-        keep(config, front, points, others)
-    print(f"results in {config.log_dir / config.plant}.json and .png")
+        keep(path, points, others, weight=front.weight, merits=front.merits, effort=front.effort, title=title)
+    print(f"results in {path} and {path.with_suffix('.png')}")
 
 
 def row(name: str, point: Point) -> str:
     """A line of the table in the terminal."""
     cost = "" if point.cost is None else f"{point.cost:.5g}"
     return f"{name:<24}{cost:>12}" + "".join(f"  {value:>{len(merit)}.4g}" for merit, value in point.merit.items())
-
-
-def keep(config: Config, front: Front, points: list[Point], others: dict[str, Point]) -> None:
-    """Write the optima that are found so far, and their figure."""
-    path = config.log_dir / f"{config.plant}.json"
-    write_json(path, finite(content(front.weight, front.effort, points, others)))
-    x, y = front.merits
-    figure = pareto(
-        [(point.weight or 0.0, point.merit[x], point.merit[y]) for point in points],
-        {name: (other.merit[x], other.merit[y]) for name, other in others.items()},
-        title=f"{config.plant.replace('_', ' ')}: optima along {front.weight}",
-        axes=front.merits,
-    )
-    drawing = io.BytesIO()
-    figure.savefig(drawing, dpi=120)
-    write_atomically(path.with_suffix(".png"), drawing.getvalue())
 
 
 if __name__ == "__main__":

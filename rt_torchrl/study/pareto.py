@@ -1,16 +1,18 @@
 """What one quantity costs another: optima of a class of policies along one weight of the cost."""
 
 import copy
+import io
 import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import nn
 
+from rt_torchrl.atomic_file import finite, write_atomically, write_json
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
@@ -118,11 +120,39 @@ def point(judged: Judged, weight: float | None) -> Point:
     return Point(weight, None if weight is None else judged.control_costs.mean().item(), merit)
 
 
-def content(weight: str, effort: Effort, points: Sequence[Point], others: dict[str, Point]) -> dict[str, Any]:
-    """The front as it is kept in JSON."""
-    return {
-        "weight": weight,
-        "effort": asdict(effort),
-        "front": [found._asdict() for found in points],
-        "classical": {name: found.merit for name, found in others.items()},
-    }
+def keep(
+    path: Path,
+    points: Sequence[Point],
+    others: dict[str, Point],
+    *,
+    weight: str,
+    merits: tuple[str, str],
+    effort: Effort,
+    title: str,
+) -> None:
+    """Write the front to ``path`` as JSON, and beside it as a figure with the suffix ``.png``.
+
+    Args:
+        path: the JSON file; its folder exists.
+        points: optima along the weight.
+        others: other controllers, by name.
+        weight: name of the weight.
+        merits: the two quantities that the figure shows.
+        effort: how thoroughly the optima were sought.
+        title: title of the figure.
+    """
+    from rt_torchrl.figures.pareto import pareto  # here, because the help of a recipe need not wait for Matplotlib
+
+    front = [found._asdict() for found in points]
+    classical = {name: found.merit for name, found in others.items()}
+    write_json(path, finite({"weight": weight, "effort": asdict(effort), "front": front, "classical": classical}))
+    x, y = merits
+    figure = pareto(
+        [(found.weight or 0.0, found.merit[x], found.merit[y]) for found in points],
+        {name: (found.merit[x], found.merit[y]) for name, found in others.items()},
+        title=title,
+        axes=merits,
+    )
+    drawing = io.BytesIO()
+    figure.savefig(drawing, dpi=120)
+    write_atomically(path.with_suffix(".png"), drawing.getvalue())
