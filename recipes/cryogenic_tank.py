@@ -67,15 +67,18 @@ class Config(RunConfig):
     """Train twin and controllers on the cryogenic tank.
 
     Args:
+        paper: train as the paper does, with its command, cost and numbers of gradients, as far as other options do not
+            say otherwise.
         policy: paper (a cubic of the pressure error with 3 weights; an affine law of other observations) or mlp.
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of the pressure),
             clock (this and the time of the episode), phase (this and the phase of the orbit), measured (all states),
             measured+load (all of these and the heat load), or names such as heat_load; by default paper.
-        command: action of the policies: drop (the pressure drop of a valve that is held half open, as in the paper) or
-            duty (the share of time in which the valve is open).
+        command: action of the policies: duty (the share of time in which the valve is open), or drop (the pressure drop
+            of a valve that is held half open, as in the paper).
         vented_weight: weight in J_a of the vented mass [s/kg].
         end_weight: weight in J_a of the squared pressure error at the end of an episode, as the time [s] for which that
-            error would cost as much; 0 is the paper's J_a, whose optimum stops venting 12 h before the end.
+            error would cost as much, by default 12 h; 0 is the paper's J_a, whose optimum stops venting 12 h before the
+            end.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         fluid: name in CoolProp of the pure fluid in the tank.
@@ -86,12 +89,13 @@ class Config(RunConfig):
         model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
     """
 
+    paper: bool = False
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
     observe: tuple[str, ...] = ()
-    command: Literal["drop", "duty"] = "drop"
+    command: Literal["duty", "drop"] = "duty"
     vented_weight: float = 5000.0
-    end_weight: float = 0.0
+    end_weight: float = 43.2e3
     closure: Literal["paper", "mlp"] = "paper"
     dt: float = 30.0
     horizon: float = 4.32e5
@@ -108,12 +112,14 @@ class Config(RunConfig):
         self.cost()
 
     def defaults(self) -> "Config":
-        twinning = NEURAL if self.closure == "mlp" else CONVERGED
-        if not self.noise:
-            return Config(twinning=twinning)
-        # An error of 0.5 % in the first reading of the pressure lasts for five days, and the closure makes up for it.
-        estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
-        return Config(twinning=dataclasses.replace(twinning, assimilation=estimated))
+        twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
+        if self.noise:
+            # An error of 0.5 % in the first reading of the pressure lasts for five days: the closure makes up for it.
+            estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
+            twinning = dataclasses.replace(twinning, assimilation=estimated)
+        if self.paper:
+            return Config(paper=True, command="drop", end_weight=0.0, twinning=twinning)
+        return Config(twinning=twinning)
 
     def plant(self) -> CryogenicTank:
         return CryogenicTank(

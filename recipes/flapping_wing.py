@@ -59,6 +59,8 @@ NEURAL = dataclasses.replace(
 """Configuration of the training with ``--closure mlp``."""
 
 
+OBSERVED = {"paper": "paper", "mlp": "measured+wind"}
+"""What each kind of policy observes by default."""
 MASS, BELIEVED = 3e-3, 2.25e-3
 """Mass of the body [kg], and the mass that the twin believes with ``--model-error``."""
 STORM = 120.0
@@ -70,10 +72,12 @@ class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
     Args:
-        policy: paper (an affine law of the observation with offset: 10 weights for the errors) or mlp.
+        paper: train as the paper does, with its policy, observations and numbers of gradients, as far as other options
+            do not say otherwise.
+        policy: mlp, or paper (an affine law of the observation with offset: 10 weights for the errors).
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of position and
             speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
-            these), or names such as headwind; by default paper.
+            these), or names such as headwind; by default measured+wind for mlp, and else paper.
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         mean_wind: mean headwind [m/s].
@@ -86,7 +90,9 @@ class Config(RunConfig):
         model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
     """
 
-    policy: Literal["paper", "mlp"] = "paper"
+    paper: bool = False
+    policy: Literal["mlp", "paper"] = "mlp"
+    hidden: tuple[int, ...] = (16, 16)
     closure: Literal["paper", "mlp"] = "paper"
     dt: float = 5e-4
     horizon: float = 5.0
@@ -112,7 +118,8 @@ class Config(RunConfig):
             raise ValueError(f"wind_deviation={self.wind_deviation} m/s must lie in [0, {STORM:g}].")
 
     def defaults(self) -> "Config":
-        return Config(twinning=NEURAL if self.closure == "mlp" else CONVERGED)
+        twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
+        return Config(paper=True, policy="paper", twinning=twinning) if self.paper else Config(twinning=twinning)
 
     def plant(self, mass: float = MASS) -> FlappingWing:
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)
@@ -123,7 +130,7 @@ class Config(RunConfig):
             cost=self.cost(),
             mass=mass,
             stroke_plane_rate=self.stroke_plane_rate,
-            observe=self.observe,
+            observe=self.observe or ("paper" if self.paper else OBSERVED[self.policy],),
         )
 
     def cost(self) -> TrackingCost:

@@ -27,13 +27,20 @@ CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "flapping_wing": {"PD": TrimmedPD},
     "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
 }
+OWN_POLICY: dict[str, tuple[str, ...]] = {
+    "wind_turbine": ("--policy", "paper"),
+    "flapping_wing": ("--policy", "paper"),
+    "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
+}
+"""Options for the paper's policy and cost, which every arm has unless it says otherwise."""
+PERCEPTRON = ("--policy", "mlp", "--hidden", "32", "32", "--observe", "paper")
 POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
     "wind_turbine": {
         "twinning, gain-scheduled": ("--policy", "scheduled"),
         "twinning, with bias": ("--policy", "bias"),
-        "twinning, perceptron": ("--policy", "mlp"),
+        "twinning, perceptron": PERCEPTRON,
     },
-    "flapping_wing": {"twinning, perceptron": ("--policy", "mlp")},
+    "flapping_wing": {"twinning, perceptron": PERCEPTRON},
 }
 """Policies that twinning trains beside a plant's own policy, as options of the plant's recipe."""
 LONG_ONLY = ("twinning, with bias",)
@@ -114,7 +121,8 @@ class Config:
 
     def options_of(self, plant: str) -> tuple[str, ...]:
         """Further options of every training of a plant."""
-        return ("--quick", "--horizon", str(SHORT[plant])) if self.quick else ("--unseen", str(self.unseen))
+        size = ("--quick", "--horizon", str(SHORT[plant])) if self.quick else ("--unseen", str(self.unseen))
+        return (*OWN_POLICY[plant], *size)
 
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Trainings of a plant by variant and arm, each a list over the seeds."""
@@ -131,7 +139,9 @@ class Config:
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
         found["nominal", "twinning"][0] = replace(found["nominal", "twinning"][0], figures=True)
         for name, policy in self.policies(plant).items():
-            found["nominal", name] = every("twinning", "nominal", seeds, *policy, folder="-".join(policy).strip("-"))
+            found["nominal", name] = every(
+                "twinning", "nominal", seeds, *policy, folder="-".join(policy[:2]).strip("-")
+            )
         if not others:
             return found
         harder = QUICK_VARIANTS if self.quick else [variant for variant in VARIANTS if variant != "nominal"]

@@ -56,6 +56,8 @@ NEURAL = dataclasses.replace(
 )
 """Configuration of the training with ``--closure mlp``."""
 
+OBSERVED = {"paper": "paper", "bias": "paper", "scheduled": "scheduled", "mlp": "measured+wind"}
+"""What each kind of policy observes by default."""
 STORM = 120.0
 """Wind speed above all that has been measured at the height of a rotor [m/s]."""
 
@@ -65,13 +67,15 @@ class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
-        policy: paper (an affine law of the observation without bias: 4 weights for e1 and e2), bias (that law with
-            bias: 6 weights), mlp, or scheduled (torque by the square of the speed and gain-scheduled PI pitch, whose
-            gains start detuned).
+        paper: train as the paper does, with its policy, observations and numbers of gradients, as far as other options
+            do not say otherwise.
+        policy: mlp, paper (an affine law of the observation without bias: 4 weights for e1 and e2), bias (that law with
+            bias: 6 weights), or scheduled (torque by the square of the speed and gain-scheduled PI pitch, whose gains
+            start detuned).
         observe: what the policies observe, by names of sets and of measurements: paper (the errors e1 and e2), errors
             (these and the rotor speed), scheduled (these and what a gain-scheduled law needs), measured (all states),
             measured+wind, preview (these and the wind in 2, 4 and 8 s, as a lidar measures it), or names such as
-            rotor_speed; by default paper, or scheduled for the policy scheduled.
+            rotor_speed; by default measured+wind for mlp, scheduled for scheduled, and else paper.
         task: what is wanted: paper (the paper's J_a), or engineering (energy up to rated power, with penalties on
             overspeed, overshoot, and the rates of pitch and torque).
         engineering: weights of the task engineering.
@@ -85,7 +89,9 @@ class Config(RunConfig):
             policies are judged in that simulator and compared with ROSCO's controller; this needs the extra rosco.
     """
 
-    policy: Literal["paper", "bias", "mlp", "scheduled"] = "paper"
+    paper: bool = False
+    policy: Literal["mlp", "paper", "bias", "scheduled"] = "mlp"
+    hidden: tuple[int, ...] = (16, 16)
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"
@@ -117,15 +123,16 @@ class Config(RunConfig):
             )
 
     def defaults(self) -> "Config":
-        return Config(twinning=NEURAL if self.closure == "mlp" else CONVERGED)
+        twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
+        return Config(paper=True, policy="paper", twinning=twinning) if self.paper else Config(twinning=twinning)
 
     def plant(self) -> WindTurbine:
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
             wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
-        observe = self.observe or (("scheduled",) if self.policy == "scheduled" else ())
+        usual = "paper" if self.paper and self.policy == "mlp" else OBSERVED[self.policy]
         cost = self.engineering if self.task == "engineering" else PaperCost()
-        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=observe)
+        return WindTurbine(dt=self.dt, horizon=self.horizon, wind=wind, cost=cost, observe=self.observe or (usual,))
 
     @staticmethod
     def wind_of(path: Path) -> WindRecord:

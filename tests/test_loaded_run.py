@@ -52,7 +52,7 @@ def test_every_combination_of_policies_and_closure_is_loaded(plant, closure, pol
 
 CHOICES = {
     "wind_turbine": {"observe": ("preview", "speed_rate"), "task": "engineering", "horizon": 10.0},
-    "flapping_wing": {"observe": ("measured+wind",), "stroke_plane_rate": 3000.0, "energy": 0.1, "horizon": 0.05},
+    "flapping_wing": {"observe": ("phase",), "stroke_plane_rate": 3000.0, "energy": 0.1, "horizon": 0.05},
     "cryogenic_tank": {"observe": ("measured+load",), "command": "duty", "end_weight": 7200.0, "horizon": 3000.0},
 }
 

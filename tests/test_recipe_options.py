@@ -1,12 +1,13 @@
 """Options of the recipes that are out of range are refused by their own names."""
 
+import dataclasses
 import math
 from pathlib import Path
 
 import pytest
 from test_export_recipe import RECIPES, recipe
 
-from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 
 HEADER = "! TurbSim\n"
@@ -67,9 +68,35 @@ def test_a_device_that_is_not_there_is_refused_before_the_real_system_is_made(pl
     assert not (tmp_path / "run").exists()
 
 
-def test_the_words_of_the_paper_are_those_of_its_plants():
-    for plant in ("cryogenic_tank", "flapping_wing", "wind_turbine"):
-        kind = config_class_of(RECIPES / f"{plant}.py")
-        assert from_command_line(kind, ["--policy", "paper", "--closure", "paper"]) == from_command_line(kind, [])
+def of_command_line(plant, *words):
+    return from_command_line(config_class_of(RECIPES / f"{plant}.py"), words)
+
+
+PLANTS = {"wind_turbine": (), "flapping_wing": (), "cryogenic_tank": ("--command", "drop", "--end-weight", "0")}
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_the_paper_is_one_option(plant):
+    """Its policy, observations, cost and numbers of gradients; the other defaults are apart from them."""
+    made, paper = load_recipe(RECIPES / f"{plant}.py"), of_command_line(plant, "--paper")
+    assert paper.twinning == made.PAPER != of_command_line(plant).twinning == made.CONVERGED
+    spelled = of_command_line(plant, "--policy", "paper", "--observe", "paper", *PLANTS[plant])
+    assert dataclasses.replace(spelled, paper=True, observe=(), twinning=made.PAPER) == paper
+    assert paper.plant().observations == spelled.plant().observations and paper.plant().cost == spelled.plant().cost
+    default = of_command_line(plant).plant()
+    assert (default.observations, default.actions) != (paper.plant().observations, paper.plant().actions)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_options_that_are_given_hold_with_the_paper_too(plant):
+    found = of_command_line(
+        plant, "--paper", "--policy", "mlp", "--closure", "mlp", "--twinning.planner.iterations", "7"
+    )
+    assert found.policy == "mlp" and found.twinning.planner.iterations == 7
+    assert found.twinning.assimilation == load_recipe(RECIPES / f"{plant}.py").NEURAL.assimilation
+    assert found.plant().observations == of_command_line(plant, "--paper").plant().observations
+
+
+def test_a_plant_without_a_paper_has_no_words_of_it():
     pendulum = config_class_of(RECIPES / "pendulum.py")
     assert from_command_line(pendulum, ["--policy", "plant", "--closure", "plant"]) == from_command_line(pendulum, [])
