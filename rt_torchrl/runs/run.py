@@ -18,7 +18,7 @@ from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, exact_optimum, untrained_costs
+from rt_torchrl.evaluation.unseen import FOR_PERCEPTRONS, Judged, UnseenEpisodes, exact_optimum, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
@@ -215,7 +215,8 @@ class Run:
             self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
 
     def _results(self, gap: float, flights: dict[Role, Trajectory], judged: dict[str, Judged]) -> dict[str, Any]:
-        optimum = exact_optimum(self.unseen, self.make_policy) if self.config.reference else None
+        thorough = FOR_PERCEPTRONS if self.config.policy == "mlp" else {}
+        optimum = exact_optimum(self.unseen, self.make_policy, **thorough) if self.config.reference else None
         starts = self.config.untrained
         untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
         parts = self.initial_policies, self.initial_closure, self.episodes, untrained, optimum
