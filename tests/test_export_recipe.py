@@ -137,7 +137,7 @@ def test_bad_options_are_refused(options, message, tmp_path):
 
 
 def test_folders_that_hold_no_run_are_refused(tmp_path):
-    config, _ = leave_run(tmp_path / "run", "wind_turbine")
+    config, _ = leave_run(tmp_path / "run", "wind_turbine", policy="paper")
 
     def refusal(folder, message):
         with pytest.raises(ValueError, match=message):
@@ -154,7 +154,7 @@ def test_folders_that_hold_no_run_are_refused(tmp_path):
         "other option": "has no option colour; it is of another version",
         "other inner option": "RefereeConfig has no option colour; .*options.twinning.referee",
         "no number": "'many' is not of type int. @ options.episodes",
-        "no choice": "policy='cubic' does not exist; choose paper, bias, mlp or scheduled",
+        "no choice": "policy='cubic' does not exist; choose mlp, paper, bias or scheduled",
         "lost wind": "cannot be carried out: .*gone.hh",
     }.items():
         folder = shutil.copytree(tmp_path / "run", tmp_path / damage.replace(" ", "_"))

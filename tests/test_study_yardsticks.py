@@ -45,7 +45,7 @@ def test_a_system_with_model_error_ends_as_its_recipe_says():
 
 def test_a_plan_on_training_episodes_is_judged_on_unseen_ones(monkeypatch):
     monkeypatch.setattr(yardsticks, "missing_for_compilation", lambda: "a compiler")
-    system = RECIPES / "wind_turbine.py", ("--horizon", "5")
+    system = RECIPES / "wind_turbine.py", ("--horizon", "5", "--policy", "paper")
     planned = {n: cost_over_episodes(*system, unseen=4, counts=(2, 3), iterations=n) for n in (0, 8)}
     plant = configured(*system).plant()
     start = plant.make_policy(torch.Generator().manual_seed(UNSEEN_SEED))

@@ -5,6 +5,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ class Yardstick:
 
 
 def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iterations: int, polish: int) -> dict[str, Any]:
-    """Optimise the plant's own policy with exact gradients, on the true plant and on the unseen episodes themselves.
+    """Optimise the trainings' policy with exact gradients, on the true plant and on the unseen episodes themselves.
 
     Args:
         recipe: recipe of the plant.
@@ -74,8 +75,10 @@ def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iteratio
     Returns:
         ``J_a_of_each_start``, per-episode ``costs`` of the best policy and the statistics of :class:`Judged`.
     """
-    episodes = unseen_episodes(plant_of(configured(recipe, options)), unseen)
-    best = exact_optimum(episodes, episodes.plant.make_policy, starts=starts, iterations=iterations, polish=polish)
+    config = configured(recipe, options)
+    episodes = unseen_episodes(plant_of(config), unseen)
+    make_policy = partial(config.make_policy, episodes.plant)
+    best = exact_optimum(episodes, make_policy, starts=starts, iterations=iterations, polish=polish)
     found = episodes.judge(episodes.fly(best.policy))
     return {"costs": found.control_costs.tolist(), "J_a_of_each_start": best.costs} | found.statistics()
 
@@ -156,7 +159,7 @@ def cost_along_gain(
 def cost_over_episodes(
     recipe: Path, options: Options, *, unseen: int, counts: Sequence[int], iterations: int
 ) -> dict[str, Any]:
-    """J_a of the plant's own policy over the number of training episodes that exact gradients plan on.
+    """J_a of the trainings' policy over the number of training episodes that exact gradients plan on.
 
     A training that meets as many episodes cannot be expected to cost less.
 
@@ -170,10 +173,12 @@ def cost_over_episodes(
     Returns:
         ``name`` and ``unit`` of the abscissa, its ``values`` and mean ``costs`` on the unseen episodes.
     """
-    plant, costs = plant_of(configured(recipe, options)), []
+    config, costs = configured(recipe, options), []
+    plant = plant_of(config)
+    make_policy = partial(config.make_policy, plant)
     judged, met = unseen_episodes(plant, unseen), unseen_episodes(plant, max(counts), seed=TRAINING_SEED)
     for count in counts:
-        best = exact_optimum(met, plant.make_policy, starts=1, iterations=iterations, few=count, polish=0)
+        best = exact_optimum(met, make_policy, starts=1, iterations=iterations, few=count, polish=0)
         costs.append(judged.control_costs(best.policy).mean().item())
     return {"name": "episodes planned on", "unit": "-", "values": list(counts), "costs": costs}
 
