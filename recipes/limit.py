@@ -1,7 +1,6 @@
 """How far from the best possible is this? The clairvoyant optimum of a plant, and controllers beside it."""
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -14,6 +13,7 @@ from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.shipped_plants import plant_class
 from rt_torchrl.study.limits import Contender, classical, forecasts, general_starts, limit, receding, resting_at_the_end
 
@@ -48,7 +48,8 @@ class Config:
         horizon: length of an episode [s]; by default the plant's.
         hold: number of control intervals for which a command of the optimum is held.
         starts: all, or classical to leave out constant and random commands.
-        mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none.
+        mpc: forecasts of model predictive control: some of held, decaying, scattered (several futures about the
+            decaying mean) and preview; the tank has none.
         run: folder of a training; model predictive control then also plans on the closure that it has found.
         folder: folder of the results, which are in PLANT.json.
         descent: parameters of the descents to the optimum.
@@ -60,7 +61,7 @@ class Config:
     horizon: float | None = None
     hold: int = 1
     starts: Literal["all", "classical"] = "all"
-    mpc: tuple[Literal["held", "decaying", "preview"], ...] = ("held", "decaying", "preview")
+    mpc: tuple[Literal["held", "decaying", "scattered", "preview"], ...] = ("held", "decaying", "preview")
     run: Path | None = None
     folder: Path = Path("runs/limit")
     descent: BoundedDescentConfig = field(
@@ -76,14 +77,9 @@ class Config:
 
 def main(config: Config) -> None:
     torch.set_num_threads(1)
+    make_folder("folder", config.folder)
     found = contenders(config)
-    config.folder.mkdir(parents=True, exist_ok=True)
-    path = config.folder / f"{config.plant}.json"
-    content = {
-        "config": dataclasses.asdict(config),
-        "contenders": {name: dataclasses.asdict(contender) for name, contender in found.items()},
-    }
-    path.write_text(json.dumps(content, indent=2, default=str) + "\n")
+    path = write_results(config.folder / f"{config.plant}.json", {"config": config, "contenders": found})
     print(table(found))
     print(f"results in {path}")
 
