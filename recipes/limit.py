@@ -48,8 +48,7 @@ class Config:
         horizon: length of an episode [s]; by default the plant's.
         hold: number of control intervals for which a command of the optimum is held.
         starts: all, or classical to leave out constant and random commands.
-        mpc: forecasts of model predictive control: some of held, decaying, scattered (several futures about the
-            decaying mean) and preview; the tank has none.
+        mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none.
         run: folder of a training; model predictive control then also plans on the closure that it has found.
         folder: folder of the results, which are in PLANT.json.
         descent: parameters of the descents to the optimum.
@@ -61,7 +60,7 @@ class Config:
     horizon: float | None = None
     hold: int = 1
     starts: Literal["all", "classical"] = "all"
-    mpc: tuple[Literal["held", "decaying", "scattered", "preview"], ...] = ("held", "decaying", "preview")
+    mpc: tuple[Literal["held", "decaying", "preview"], ...] = ("held", "decaying", "preview")
     run: Path | None = None
     folder: Path = Path("runs/limit")
     descent: BoundedDescentConfig = field(

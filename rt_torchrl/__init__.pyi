@@ -28,7 +28,7 @@ from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
 from .optimal_control.clairvoyant import Clairvoyant, clairvoyant
-from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen, Scattered
+from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen
 from .optimal_control.predictive_control import PredictiveConfig, PredictiveControl
 from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
@@ -127,7 +127,6 @@ __all__ = [
     "SafetyReport",
     "SaturatedAffine",
     "SaturatedMLP",
-    "Scattered",
     "Scenario",
     "ShortHorizon",
     "ShortHorizonConfig",

@@ -134,8 +134,7 @@ class CommandCost:
         t = start + self.plant.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1)
         state = torch.nn.functional.pad(initial_state, (0, 1))
         command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
-        self._state, self.batch = state, len(state)
-        self._drive, self.n = Drive(t, exogenous.transpose(0, 1), command), n
+        self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
         if self._programs is None:
             self._programs = self._traced()
         if self._programs is not None:

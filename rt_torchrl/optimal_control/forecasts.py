@@ -7,21 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-FUTURES = 8
-"""Number of futures that takes no longer than one: machine code computes eight realisations side by side."""
-
 
 @runtime_checkable
 class Forecast(Protocol):
     """Anything that forecasts the exogenous inputs."""
 
-    def __call__(
-        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
-    ) -> Float[Tensor, "batch *futures {n} n_z"]:
-        """The inputs of the n control intervals from t [s] on, of which the first is measured.
-
-        A forecast gives one future or, in a dimension of their own, several that are equally probable.
-        """
+    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+        """The inputs of the n control intervals from t [s] on, of which the first is measured."""
 
 
 class Held:
@@ -81,97 +73,6 @@ class Decaying:
     def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
         share = torch.exp(-self.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1) / self.time)
         return self.mean + (exogenous - self.mean).unsqueeze(1) * share
-
-
-class Scattered:
-    r"""Several futures, which scatter about the decaying mean as a Gauss-Markov process does.
-
-    .. math::
-        z^{(i)}_{k+j} = \hat z_{k+j} + \sigma x^{(i)}_j, \qquad
-        x_{j+1} = qx_j + \sqrt{1 - q^2}\,w_j, \qquad x_0 = 0, \qquad q = e^{-\Delta t/\tau}
-
-    with standard normal w, so that far ahead the futures scatter as widely as the input itself. The draws w come in
-    pairs ±w and are the same at every call, so that a plan changes with the measurement alone.
-
-    Args:
-        decaying: forecast of the mean.
-        deviation: standard deviation σ of each input.
-        low: least value of each input; futures below it are moved to it.
-        high: greatest value of each input.
-        futures: even number of futures.
-
-    Raises:
-        ValueError: if the number is not even and positive, or a deviation is negative.
-
-    Source: Schildbach, Fagiano, Frei, Morari, *The scenario approach for stochastic model predictive control with
-    bounds on closed-loop constraint violations*, Automatica 50 (2014) 3009.
-    """
-
-    def __init__(
-        self,
-        decaying: Decaying,
-        deviation: Float[Tensor, " n_z"],
-        *,
-        low: Float[Tensor, " n_z"],
-        high: Float[Tensor, " n_z"],
-        futures: int = FUTURES,
-    ):
-        require_futures(futures)
-        if not (deviation >= 0.0).all():
-            raise ValueError(f"deviation={deviation.tolist()} of the inputs must not be negative.")
-        self.decaying, self.deviation, self.low, self.high, self.futures = decaying, deviation, low, high, futures
-        self._paths: tuple[tuple[int, list[float]], Tensor] | None = None
-
-    @classmethod
-    def fitted(
-        cls,
-        records: Float[Tensor, "episodes n n_z"],
-        *,
-        dt: float,
-        horizon: float,
-        low: Float[Tensor, " n_z"],
-        high: Float[Tensor, " n_z"],
-        futures: int = FUTURES,
-    ) -> "Scattered":
-        """The forecast of :meth:`Decaying.fitted`, with the standard deviation of the records."""
-        decaying = Decaying.fitted(records, dt=dt, horizon=horizon)
-        return cls(decaying, deviation_of(records), low=low, high=high, futures=futures)
-
-    def __call__(
-        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
-    ) -> Float[Tensor, "batch {self.futures} {n} n_z"]:
-        scattered = self.decaying(t, exogenous, n).unsqueeze(1) + self.deviation * self._scatter(n)
-        return scattered.clamp(self.low, self.high)
-
-    def _scatter(self, n: int) -> Float[Tensor, "{self.futures} {n} n_z"]:
-        """The deviations x of all futures."""
-        from scipy.signal import lfilter  # here, because it takes a second to load and --help need not wait for it
-
-        key = n, self.decaying.time.tolist()
-        if self._paths is None or self._paths[0] != key:
-            generator, q = torch.Generator().manual_seed(0), torch.exp(-self.decaying.dt / self.decaying.time)
-            shape = self.futures // 2, n, len(q)
-            drawn = torch.randn(shape, generator=generator, dtype=torch.float64) * (1.0 - q**2).sqrt()
-            drawn[:, 1:], drawn[:, 0] = drawn[:, :-1].clone(), 0.0  # the first input is measured
-            for i, share in enumerate(q.tolist()):
-                drawn[..., i] = torch.from_numpy(lfilter([1.0], [1.0, -share], drawn[..., i].numpy()))
-            self._paths = key, torch.cat([drawn, -drawn])
-        return self._paths[1]
-
-
-def require_futures(futures: int) -> None:
-    """Refuse a number of futures that cannot be made of pairs.
-
-    Raises:
-        ValueError: if it is not even and positive.
-    """
-    if futures < 2 or futures % 2:
-        raise ValueError(f"futures={futures} of a forecast must be even and at least 2, because they come in pairs.")
-
-
-def deviation_of(records: Float[Tensor, "episodes n n_z"]) -> Float[Tensor, " n_z"]:
-    """Standard deviation of each input about the mean of all records."""
-    return (records - records.mean((0, 1))).square().mean((0, 1)).sqrt()
 
 
 class Foreseen:

@@ -11,20 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.optimal_control.forecasts import (
-    FUTURES,
-    Decaying,
-    Forecast,
-    Held,
-    Scattered,
-    deviation_of,
-    require_futures,
-)
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, Solve
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 
@@ -34,10 +25,8 @@ class PredictiveConfig(RecedingHorizonConfig):
 
     Args:
         horizon: length of the window over which a plan is made [s]; every plant needs its own.
-        forecast: forecast of the exogenous inputs: held for the measured ones, decaying to the mean of the inputs met
-            so far with the time that fits them best, or scattered for several futures about that mean, which scatter
-            as the inputs do. Until inputs have been met, they are held.
-        futures: even number of futures of a scattered forecast.
+        forecast: forecast of the exogenous inputs: held for the measured ones, or decaying to the mean of the inputs
+            met so far with the time that fits them best; until inputs have been met, they are held.
         virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
             virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
 
@@ -46,14 +35,12 @@ class PredictiveConfig(RecedingHorizonConfig):
     """
 
     horizon: float = 1.0
-    forecast: Literal["held", "decaying", "scattered"] = "decaying"
-    futures: int = FUTURES
+    forecast: Literal["held", "decaying"] = "decaying"
     virtual_episodes: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_options(self, infinite=("deadline",))
-        require_futures(self.futures)
         if self.virtual_episodes < 1:
             raise ValueError(f"virtual_episodes={self.virtual_episodes} of the receding horizon must be at least 1.")
 
@@ -76,7 +63,6 @@ class PredictiveControl(nn.Module):
 
     mean: Tensor
     time: Tensor
-    deviation: Tensor
 
     def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig):
         super().__init__()
@@ -85,10 +71,9 @@ class PredictiveControl(nn.Module):
         if devices:
             raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
         n_z = len(plant.inputs)
-        # With an infinite time and no deviation, the inputs are held.
+        # With an infinite time, the inputs are held.
         self.register_buffer("mean", torch.zeros(n_z, dtype=torch.float64))
         self.register_buffer("time", torch.full((n_z,), math.inf, dtype=torch.float64))
-        self.register_buffer("deviation", torch.zeros(n_z, dtype=torch.float64))
         timeless = dataclasses.replace(config, deadline=math.inf)
         self._acting, self._virtual = (
             RecedingHorizon(plant, closure, chosen, forecast=self._forecast()) for chosen in (config, timeless)
@@ -98,14 +83,9 @@ class PredictiveControl(nn.Module):
 
     def _forecast(self) -> Forecast:
         """The forecast of the configuration, whose numbers are the buffers."""
-        plant, config = self._plant[0], self._config
-        if config.forecast == "held":
+        if self._config.forecast == "held":
             return Held()
-        decaying = Decaying(self.mean, self.time, dt=plant.dt)
-        if config.forecast == "decaying":
-            return decaying
-        low, high = bounds(plant.inputs)
-        return Scattered(decaying, self.deviation, low=low, high=high, futures=config.futures)
+        return Decaying(self.mean, self.time, dt=self._plant[0].dt)
 
     def learn(self, records: Float[Tensor, "episodes n n_z"]) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
@@ -120,7 +100,6 @@ class PredictiveControl(nn.Module):
         fitted = Decaying.fitted(records, dt=plant.dt, horizon=longest)
         self.mean.copy_(fitted.mean)
         self.time.copy_(fitted.time)
-        self.deviation.copy_(deviation_of(records))
 
     @property
     def solves(self) -> list[Solve]:

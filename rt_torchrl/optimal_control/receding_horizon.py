@@ -48,9 +48,7 @@ class _LateError(Exception):
 class RecedingHorizon:
     r"""Plans commands over a horizon by L-BFGS-B on exact gradients, and acts by the first ones until the next plan.
 
-    .. math:: \min_{c}\ \mathrm E\int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state}
-
-    The mean is over the futures of z that the forecast gives, which is one or more; the commands are the same in all.
+    .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state, under a forecast of z}
 
     Every plan starts from the rest of the last one, whose end is held. The first plan of an episode starts from the
     best constant command and has no deadline, because there is no plan to go on with; :meth:`prepare` makes one before
@@ -142,17 +140,16 @@ class RecedingHorizon:
         ends = self.config.ends and k + n == self.plant.n_steps
         self.cost.terminal = self.plant.terminal_cost if ends else self._terminal
         inputs = self.forecast(t, exogenous, n)
-        futures = inputs if inputs.ndim == 4 else inputs.unsqueeze(1)
         first, found = not self._plans, []
         for episode in range(len(state)):
             safe_point()
             one = slice(episode, episode + 1)
             began = time.perf_counter()
-            self.cost.begin(state[one].expand(futures.shape[1], -1), futures[episode], start=t)
+            self.cost.begin(state[one], inputs[one], start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
             starts = ([] if last is None else [last]) + (self._constants() if first else [])
             if self.guess is not None:
-                starts.append(self.cost.units(self.guess(state[one], futures[one].mean(1)))[0])
+                starts.append(self.cost.units(self.guess(state[one], inputs[one]))[0])
             start = starts[0] if len(starts) == 1 else self._cheapest(starts)
             found.append(self._solved(start, last, began))
         self._plans = found
@@ -167,7 +164,8 @@ class RecedingHorizon:
             if time.perf_counter() - began > deadline:
                 raise _LateError
             count += 1
-            return self._expected(point)
+            costs, gradient = self.cost(point)
+            return float(costs[0]), gradient
 
         late = diverged = False
         try:
@@ -182,11 +180,6 @@ class RecedingHorizon:
         self.solves.append(Solve(time.perf_counter() - began, count, late, diverged))
         return found
 
-    def _expected(self, plan: np.ndarray) -> tuple[float, np.ndarray]:
-        """Mean cost of a plan over the futures of one episode, and its gradient."""
-        costs, gradient = self.cost(np.repeat(plan, self.cost.batch, 0))
-        return float(costs.mean()), gradient.mean(0, keepdims=True)
-
     def _shifted(self, plan: np.ndarray) -> np.ndarray:
         """The rest of the last plan, whose end is held for as long as the window needs."""
         blocks, passed = self.cost.blocks(self.cost.n), self.period // self.cost.hold
@@ -199,7 +192,7 @@ class RecedingHorizon:
 
     def _cheapest(self, plans: Sequence[np.ndarray]) -> np.ndarray:
         """The plan of the least cost; one that diverges costs more than any other, and the first is taken if all do."""
-        costs = [self._expected(plan[None])[0] for plan in plans]
+        costs = [float(self.cost(plan[None])[0][0]) for plan in plans]
         return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
     def act(

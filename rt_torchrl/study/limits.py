@@ -14,7 +14,7 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
-from rt_torchrl.optimal_control.forecasts import Forecast, Foreseen, Held, Scattered
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.plants.plant import Plant
@@ -137,13 +137,11 @@ def receding(
 
 
 def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: float) -> dict[str, Forecast]:
-    """The forecasts that are compared: held, decaying to the mean or scattered as other episodes are, and known."""
+    """The forecasts that are compared: held, decaying to the mean as other episodes do, and known."""
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
     longest = min(horizon, 0.5 * plant.horizon)
-    low, high = bounds(plant.inputs)
-    scattered = Scattered.fitted(records, dt=plant.dt, horizon=longest, low=low, high=high)
-    known = Foreseen(exogenous, dt=plant.dt)
-    return {"held": Held(), "decaying": scattered.decaying, "scattered": scattered, "preview": known}
+    decaying = Decaying.fitted(records, dt=plant.dt, horizon=longest)
+    return {"held": Held(), "decaying": decaying, "preview": Foreseen(exogenous, dt=plant.dt)}
 
 
 def in_milliseconds(seconds: list[float]) -> dict[str, float]:
