@@ -14,6 +14,7 @@ from rt_torchrl import (
     ExplorationConfig,
     LearnerConfig,
     PlannerConfig,
+    PredictiveConfig,
     RefereeConfig,
     RunConfig,
     TwinningConfig,
@@ -42,7 +43,13 @@ PAPER = TwinningConfig(
     # A change of U_HX by 10 % moves the pressure by 50 Pa, another draw of the load's noise moves it by 200 Pa.
     assimilation=AssimilationConfig(iterations=30, method="levenberg_marquardt", inputs="record"),
     # Starting pressures differ by 25 kPa: a plan for one of them does not suit the others.
-    planner=PlannerConfig(iterations=5, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    planner=PlannerConfig(
+        iterations=5,
+        realisations=20,
+        descent=DescentConfig(optimiser="lbfgs", rate=1.0),
+        # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
+        receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
+    ),
     referee=RefereeConfig(patience=4, clone_patience=20),
 )
 CONVERGED = dataclasses.replace(
@@ -110,6 +117,11 @@ class Config(RunConfig):
         super().__post_init__()
         CryogenicTank.chosen(self.observe)
         self.cost()
+        if self.twinning.planner.method == "receding_horizon" and self.command != "duty":
+            raise ValueError(
+                f"command={self.command!r} does not go with method='receding_horizon': gradients find no plans of a "
+                "half-open valve, whose cost has many minima. Use command duty."
+            )
 
     def defaults(self) -> "Config":
         twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED

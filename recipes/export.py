@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from rt_torchrl import (
     LoadedRun,
+    StateFeedback,
     check_options,
     export_c,
     export_controller,
@@ -81,7 +82,13 @@ def main(config: Config) -> None:
     settings = read_settings(config.run)
     beside = None if "recipe" in settings else Path(__file__).with_name(f"{settings['plant']}.py")
     run = load_run(config.run, config.recipe or beside)
-    run.policy(config.role)
+    policy = run.policy(config.role)
+    if isinstance(policy, StateFeedback) and {"policy", "controller"} & set(config.what):
+        raise ValueError(
+            f"role={config.role!r} of this run plans its actions by model predictive control and cannot be exported. "
+            "Export the model-free policy, which has learned from its records: --role model_free; or --what twin, the "
+            "model that it plans on."
+        )
     output = config.output or config.run / "exported"
     try:
         output.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ from rt_torchrl import (
     ExplorationConfig,
     LearnerConfig,
     PlannerConfig,
+    PredictiveConfig,
     RefereeConfig,
     RunConfig,
     TwinningConfig,
@@ -21,6 +22,9 @@ from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
+# Commands of a tenth of a beat; a plan of a second is made twice a beat.
+PREDICTIVE = PredictiveConfig(horizon=1.0, hold=5e-3, period=0.025, iterations=30, tolerance=1e-5, forecast="held")
+"""Model predictive control with ``--twinning.planner.method receding_horizon``."""
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T2; N_z, T_J and T_w are the library's defaults.
     # Seconds decide a flight, and whole wing beats move it: the noise lasts a beat, returns span half a second and the
@@ -38,14 +42,21 @@ PAPER = TwinningConfig(
     # and a tube of 2e-4 the residual is 1e-4 m/s.
     exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
-    planner=PlannerConfig(iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5)),
+    planner=PlannerConfig(
+        iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
+    ),
     referee=RefereeConfig(patience=4, clone_patience=4),
 )
 CONVERGED = dataclasses.replace(
     PAPER,
     # A valley of the cost is narrow where the stroke plane tilts fast: Adam leaves 1 to 2 % there. Twenty gusts are all
     # that a training meets.
-    planner=PlannerConfig(iterations=30, realisations=20, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    planner=PlannerConfig(
+        iterations=30,
+        realisations=20,
+        descent=DescentConfig(optimiser="lbfgs", rate=1.0),
+        receding_horizon=PREDICTIVE,
+    ),
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(

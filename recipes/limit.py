@@ -1,7 +1,6 @@
 """How far from the best possible is this? The clairvoyant optimum of a plant, and controllers beside it."""
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -14,6 +13,7 @@ from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.shipped_plants import plant_class
 from rt_torchrl.study.limits import Contender, classical, forecasts, general_starts, limit, receding, resting_at_the_end
 
@@ -76,14 +76,9 @@ class Config:
 
 def main(config: Config) -> None:
     torch.set_num_threads(1)
+    make_folder("folder", config.folder)
     found = contenders(config)
-    config.folder.mkdir(parents=True, exist_ok=True)
-    path = config.folder / f"{config.plant}.json"
-    content = {
-        "config": dataclasses.asdict(config),
-        "contenders": {name: dataclasses.asdict(contender) for name, contender in found.items()},
-    }
-    path.write_text(json.dumps(content, indent=2, default=str) + "\n")
+    path = write_results(config.folder / f"{config.plant}.json", {"config": config, "contenders": found})
     print(table(found))
     print(f"results in {path}")
 

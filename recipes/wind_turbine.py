@@ -14,6 +14,7 @@ from rt_torchrl import (
     DescentConfig,
     LearnerConfig,
     PlannerConfig,
+    PredictiveConfig,
     RunConfig,
     TwinningConfig,
     main_of,
@@ -31,7 +32,11 @@ PAPER = TwinningConfig(
     # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.
     # Targets span 5 s: an action of 0.5 s moves a rotor with a time constant of 16 s by less than the critic's error.
     learner=LearnerConfig(return_steps=10),
-    planner=PlannerConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    planner=PlannerConfig(
+        iterations=10,
+        descent=DescentConfig(optimiser="lbfgs", rate=1.0),
+        receding_horizon=PredictiveConfig(horizon=20.0),
+    ),
 )
 CONVERGED = dataclasses.replace(
     PAPER,
@@ -40,7 +45,10 @@ CONVERGED = dataclasses.replace(
     # gradients may end in a minimum that later plans do not leave for ten episodes; one of 25 does not go so far.
     assimilation=AssimilationConfig(iterations=60, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
     planner=PlannerConfig(
-        iterations=25, realisations=50, descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6)
+        iterations=25,
+        realisations=50,
+        descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
+        receding_horizon=PredictiveConfig(horizon=20.0),
     ),
 )
 """Configuration of the training by default."""

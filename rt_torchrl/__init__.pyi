@@ -24,11 +24,14 @@ from .evaluation.baseline import RealController
 
 # Trajectories and the twin
 from .trajectories.rollout import DivergenceError, Engine, Rollout
+from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
 from .optimal_control.clairvoyant import Clairvoyant, clairvoyant
 from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen
-from .optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from .optimal_control.predictive_control import PredictiveConfig, PredictiveControl
+from .optimal_control.receding_horizon import RecedingHorizon
+from .optimal_control.receding_horizon_config import RecedingHorizonConfig
 from .identification.identification import Identification, IdentificationConfig
 from .identification.sensor_log import read_log
 
@@ -40,7 +43,14 @@ from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
 from .twinning.learners import DDPG, TD3, ActorCritic, Learner, LearnerConfig, LongTermMemoryConfig, TD3Config
-from .twinning.planners import Planner, PlannerConfig, ShortHorizon, ShortHorizonConfig, WholeEpisodes
+from .twinning.planners import (
+    Planner,
+    PlannerConfig,
+    RecedingHorizonPlanner,
+    ShortHorizon,
+    ShortHorizonConfig,
+    WholeEpisodes,
+)
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
 
 # Trainings from the command line, and their results
@@ -96,12 +106,15 @@ __all__ = [
     "PlantContractError",
     "PlantEnv",
     "PositiveCoefficients",
+    "PredictiveConfig",
+    "PredictiveControl",
     "Preview",
     "Reading",
     "RealController",
     "RealSystem",
     "RecedingHorizon",
     "RecedingHorizonConfig",
+    "RecedingHorizonPlanner",
     "Referee",
     "RefereeConfig",
     "ReinforcementTwinning",
@@ -120,6 +133,7 @@ __all__ = [
     "Signal",
     "SmoothClip",
     "Snapshot",
+    "StateFeedback",
     "TD3Config",
     "Trajectory",
     "Transition",

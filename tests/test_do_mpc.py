@@ -13,7 +13,8 @@ import torch
 
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
+from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 
 pytestmark = pytest.mark.slow
 HORIZON = 20.0

@@ -33,7 +33,8 @@ def leave_run(folder, name, **options):
     """Write the files of a run as Run.train writes them, with random weights."""
     config = config_class_of(RECIPES / f"{name}.py")(seed=3, log_dir=folder, **options)
     plant, generator = config.plant(), torch.Generator().manual_seed(7)
-    parts = {**config.make_policies(plant, generator), "closure": config.make_closure(plant, generator)}
+    policies, closure = config.make_policies(plant, generator), config.make_closure(plant, generator)
+    parts = {**config.acting_policies(policies, plant, closure), "closure": closure}
     with torch.no_grad():
         for weight in (weight for part in parts.values() for weight in part.parameters()):
             weight += torch.randn(weight.shape, generator=generator, dtype=weight.dtype)

@@ -12,7 +12,8 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import clairvoyant, constant_starts, random_starts
 from rt_torchrl.optimal_control.forecasts import Foreseen
-from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
+from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout

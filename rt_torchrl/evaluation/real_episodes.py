@@ -8,7 +8,9 @@ from torch import Tensor, nn
 
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 
@@ -57,15 +59,25 @@ class RealEpisodes(UnseenEpisodes):
 
     @torch.no_grad()
     def _flown(self, policy: nn.Module, count: int) -> Trajectory:
-        actor = TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
         kept = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
-            found = TensorDict.cat([self._system.rollout(self.plant.n_steps, actor) for _ in range(count)])
+            found = TensorDict.cat(
+                [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(count)]
+            )
         finally:
             self._system.load_state_dict(kept)
         states = torch.cat([found["state"], found["next", "state"][:, -1:]], 1)
         return Trajectory(states, found["next", "applied"], found["exogenous"])
+
+    def _actor(self, policy: nn.Module) -> TensorDictModule:
+        """The policy at the beginning of an episode."""
+        if not isinstance(policy, StateFeedback):
+            return TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
+        device = self.initial_state.device
+        live = LivePolicy(self.plant, policy, ExplorationConfig(), generator=torch.Generator(device=device))
+        live.begin(policy, strength=0.0)
+        return TensorDictModule(live, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
         """No categories, because the exogenous inputs need not be the same each time."""

@@ -13,6 +13,7 @@ from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 
 UNSEEN_SEED = 1_000_000
@@ -54,6 +55,8 @@ class UnseenEpisodes:
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly the episodes with a policy on the real system."""
+        if isinstance(policy, StateFeedback):
+            return policy.fly(self.initial_state, self.exogenous, self.known_closure(), plant=self.plant)
         return self._rollout(policy)(self.initial_state, self.exogenous)
 
     def _rollout(self, policy: nn.Module) -> Rollout:
@@ -88,6 +91,8 @@ class UnseenEpisodes:
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
         """J_a of each episode."""
+        if isinstance(policy, StateFeedback):
+            return control_cost(self.plant, self.fly(policy))
         return self._rollout(policy).costs(self.initial_state, self.exogenous)
 
     def validation(self) -> "UnseenEpisodes | None":

@@ -15,6 +15,7 @@ from torch import Tensor
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES, array, caption, last_episode, legend_below, limits, panels, role_name
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.twinning.referees import Role
 
 RESOLUTION = 81
@@ -28,7 +29,8 @@ def policy_contours(snapshot: Snapshot) -> Figure:
 
     Dots are observations of the last real episode; the axes span these and the declared ranges of the observations.
     With one observation the figure shows curves on both sides of zero error. With more observations it shows contours
-    over the first two; the others have their mean value in the episode.
+    over the first two; the others have their mean value in the episode. State feedback, which is no function of the
+    observation, has no curve, and a panel with the visited observations alone.
     """
     return _curves(snapshot) if len(snapshot.plant.observations) == 1 else _contours(snapshot)
 
@@ -51,7 +53,7 @@ def _curves(snapshot: Snapshot) -> Figure:
         size=(6.5, 1.2 + 2.4 * len(plant.actions)),
         sharex=True,
     )
-    for role in ROLES:
+    for role in functions_of_observation(snapshot):
         values = _evaluate(snapshot, role, axis[:, None])
         for k, ax in enumerate(axes.flat):
             ax.plot(array(axis), values[:, k], color=ROLES[role], linewidth=1.8, label=role_name(role))
@@ -109,13 +111,17 @@ def contours(
     for plane, grid in grids.items():
         points = others.expand(RESOLUTION**2, -1).clone()
         points[:, plane] = torch.cartesian_prod(*grid)
-        for role in ROLES:
+        for role in functions_of_observation(snapshot):
             fields[plane, role] = _evaluate(snapshot, role, points)[:, action].reshape(RESOLUTION, RESOLUTION)
     levels = _levels(list(fields.values()))
     for plane, pair in planes.items():
         for role, ax in zip(ROLES, pair, strict=True):
             x, y = map(array, grids[plane])
-            filled = ax.contourf(x, y, fields[plane, role].T, levels=levels, cmap="viridis")
+            if (plane, role) in fields:
+                filled = ax.contourf(x, y, fields[plane, role].T, levels=levels, cmap="viridis")
+            else:
+                place: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "va": "center", "fontsize": 9}
+                ax.text(0.5, 0.5, "plans its actions:\nno function of the observation", **place)
             _scatter(ax, array(seen[:, plane]))
             caption(ax, role_name(role), "live" if role == snapshot.live else "idle")
             ax.set_xlabel(signals[plane[0]].label)
@@ -123,6 +129,11 @@ def contours(
         pair[0].set_ylabel(signals[plane[1]].label)
     every = [ax for pair in planes.values() for ax in pair]
     every[0].figure.colorbar(filled, ax=every, label=snapshot.plant.actions[action].label, aspect=16 * len(planes))
+
+
+def functions_of_observation(snapshot: Snapshot) -> list[Role]:
+    """Roles whose policies can be drawn over observations."""
+    return [role for role in ROLES if not isinstance(snapshot.policies[role], StateFeedback)]
 
 
 def _scatter(ax: Axes, seen: Float[np.ndarray, "n 2"]) -> None:

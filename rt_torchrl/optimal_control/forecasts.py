@@ -94,7 +94,7 @@ class Foreseen:
         beyond: Forecast | None = None,
     ):
         if not reach >= 0.0:
-            raise ValueError(f"reach={reach} s of the preview must not be negative.")
+            raise ValueError(f"reach={reach} s of the inputs that are known must not be negative.")
         self.record, self.dt, self.reach, self.beyond = record, dt, reach, beyond or Held()
 
     def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:

@@ -4,7 +4,6 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
-from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig, descend
-from rt_torchrl.optimal_control.command_cost import PENALTY, CommandCost, TerminalCost
+from rt_torchrl.optimal_control.bounded_descent import descend
+from rt_torchrl.optimal_control.command_cost import CommandCost, TerminalCost
 from rt_torchrl.optimal_control.forecasts import Forecast, Held
-from rt_torchrl.options import check_options
+from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -26,58 +25,20 @@ Guess = Callable[[Tensor, Tensor], Tensor]
 """Function from states ``batch n_s`` and forecast inputs ``batch n n_z`` to commands ``batch n n_a``."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecedingHorizonConfig:
-    """Parameters of model predictive control.
+class Solve(NamedTuple):
+    """One solve of model predictive control.
 
     Args:
-        horizon: length of the window over which a plan is made [s].
-        period: time between two plans [s]; None for the time that a command is held.
-        hold: time for which a command of a plan is held [s]; None for a control interval.
-        ends: whether a window ends with the episode, whose last intervals cost nothing after it; otherwise it rolls on.
-        penalty: weight of (command − applied)² over the squared range, in units of L_a; see :class:`CommandCost`.
-        iterations: greatest number of iterations of L-BFGS-B in a solve.
-        tolerance: relative decrease of the cost in an iteration below which a solve ends.
-        memory: number of pairs that approximate the curvature.
-        deadline: longest wall-clock time of a solve [s]; after it the last plan goes on.
-
-    Raises:
-        ValueError: if a number is out of its range.
+        seconds: wall-clock time [s].
+        gradients: number of gradients.
+        late: whether the deadline passed, so that the last plan went on.
+        diverged: whether the model diverged under the last plan, so that this or a constant command went on.
     """
-
-    horizon: float
-    period: float | None = None
-    hold: float | None = None
-    ends: bool = False
-    penalty: float = PENALTY
-    iterations: int = 20
-    tolerance: float = 1e-4
-    memory: int = 10
-    deadline: float = math.inf
-
-    def __post_init__(self) -> None:
-        check_options(self, infinite=("deadline",))
-        for argument in ("horizon", "period", "hold", "deadline"):
-            value = getattr(self, argument)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"{argument}={value} s of the receding horizon must be positive.")
-        if not self.penalty >= 0.0:
-            raise ValueError(f"penalty={self.penalty} of the receding horizon must not be negative.")
-        self.descent()  # which has ranges of its own
-
-    def descent(self) -> BoundedDescentConfig:
-        """The parameters of a solve."""
-        return BoundedDescentConfig(
-            iterations=self.iterations, tolerance=self.tolerance, gradient=0.0, memory=self.memory
-        )
-
-
-class Solve(NamedTuple):
-    """Wall-clock time of a solve [s], its gradients, and whether it was late, so that the last plan went on."""
 
     seconds: float
     gradients: int
     late: bool
+    diverged: bool = False
 
 
 class _LateError(Exception):
@@ -90,7 +51,8 @@ class RecedingHorizon:
     .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state, under a forecast of z}
 
     Every plan starts from the rest of the last one, whose end is held. The first plan of an episode starts from the
-    best constant command and has no deadline, because there is no plan to go on with.
+    best constant command and has no deadline, because there is no plan to go on with; :meth:`prepare` makes one before
+    the episode begins, so that the first solve has a deadline too.
 
     Args:
         plant: the physics of the model.
@@ -98,7 +60,7 @@ class RecedingHorizon:
         config: parameters.
         forecast: forecast of the exogenous inputs; None holds what is measured.
         terminal: cost V after the horizon, of the end states ``batch n_s``, in units of L_a·s; None for none. A window
-            that ends with the episode has none.
+            that ends with the episode has the plant's ``terminal_cost`` instead.
         guess: commands that a solve starts from where they cost less than the rest of the last plan, such as those of a
             classical controller on the model; None for none.
 
@@ -125,6 +87,7 @@ class RecedingHorizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.horizon} s.")
         self.cost = CommandCost(plant, constant(closure), hold=hold, penalty=config.penalty, terminal=terminal)
         self._terminal = terminal
+        self._prepared: np.ndarray | None = None
         self.solves: list[Solve] = []
         self.begin()
 
@@ -137,9 +100,27 @@ class RecedingHorizon:
         return count * multiple
 
     def begin(self) -> None:
-        """Begin new episodes, in which there is no plan yet."""
+        """Begin new episodes; what :meth:`prepare` has planned stays."""
         self._plans: list[np.ndarray] = []
         self._commands: Tensor | None = None
+
+    def prepare(self, state: Float[Tensor, "1 n_s"], exogenous: Float[Tensor, "1 n_z"]) -> None:
+        """Plan before episodes begin, so that their first solves have a plan to go on with when they are late.
+
+        The plan is one more start of the first solves. The first call also makes the machine code, which takes seconds.
+
+        Args:
+            state: state that is typical of the beginning of an episode.
+            exogenous: typical measured inputs.
+
+        Raises:
+            DivergenceError: if the model diverges under every constant command.
+        """
+        self._prepared = None
+        self.begin()
+        self.plan(0.0, state, exogenous)
+        self._prepared = self._plans[0]
+        self.begin()
 
     def plan(
         self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
@@ -152,31 +133,31 @@ class RecedingHorizon:
             exogenous: measured inputs.
 
         Raises:
-            DivergenceError: if the model diverges under the plan that a solve starts from.
+            DivergenceError: if the model diverges under every start of a first plan.
         """
         k = round(t / self.plant.dt)
         n = min(self.horizon, self.plant.n_steps - k) if self.config.ends else self.horizon
         ends = self.config.ends and k + n == self.plant.n_steps
         self.cost.terminal = self.plant.terminal_cost if ends else self._terminal
         inputs = self.forecast(t, exogenous, n)
-        first = not self._plans
-        found = []
+        first, found = not self._plans, []
         for episode in range(len(state)):
             safe_point()
             one = slice(episode, episode + 1)
             began = time.perf_counter()
             self.cost.begin(state[one], inputs[one], start=t)
-            start = self._best_constant() if first else self._shifted(self._plans[episode])
+            last = self._prepared if first else self._shifted(self._plans[episode])
+            starts = ([] if last is None else [last]) + (self._constants() if first else [])
             if self.guess is not None:
-                guessed = self.cost.units(self.guess(state[one], inputs[one]))[0]
-                start = self._cheapest([start, guessed])
-            found.append(self._solved(start, began, math.inf if first else self.config.deadline))
+                starts.append(self.cost.units(self.guess(state[one], inputs[one]))[0])
+            start = starts[0] if len(starts) == 1 else self._cheapest(starts)
+            found.append(self._solved(start, last, began))
         self._plans = found
         return self.cost.commands(np.stack(found), n)
 
-    def _solved(self, start: np.ndarray, began: float, deadline: float) -> np.ndarray:
-        """The plan of one episode; late, it is the start."""
-        count = 0
+    def _solved(self, start: np.ndarray, last: np.ndarray | None, began: float) -> np.ndarray:
+        """The plan of one episode; if it is late or diverges, the last plan goes on, where there is one."""
+        count, deadline = 0, math.inf if last is None else self.config.deadline
 
         def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
             nonlocal count
@@ -186,15 +167,17 @@ class RecedingHorizon:
             costs, gradient = self.cost(point)
             return float(costs[0]), gradient
 
+        late = diverged = False
         try:
-            found, late = descend(evaluate, start[None], self.config.descent()).point[0], False
+            found = descend(evaluate, start[None], self.config.descent()).point[0]
         except _LateError:
             found, late = start, True
         except FloatingPointError as error:
-            raise DivergenceError(
-                f"plant {self.plant.name!r} diverges in the plan from its last one: {error}"
-            ) from error
-        self.solves.append(Solve(time.perf_counter() - began, count, late))
+            if last is None:
+                raise DivergenceError(f"plant {self.plant.name!r} diverges in every first plan: {error}") from error
+            # A constant command goes on where the model diverges under the last plan too.
+            found, diverged = self._cheapest([last, *self._constants()]), True
+        self.solves.append(Solve(time.perf_counter() - began, count, late, diverged))
         return found
 
     def _shifted(self, plan: np.ndarray) -> np.ndarray:
@@ -202,14 +185,13 @@ class RecedingHorizon:
         blocks, passed = self.cost.blocks(self.cost.n), self.period // self.cost.hold
         return plan[np.minimum(np.arange(passed, passed + blocks), len(plan) - 1)]
 
-    def _best_constant(self) -> np.ndarray:
-        """The constant commands of the least cost, of both ends and the middle of every range."""
+    def _constants(self) -> list[np.ndarray]:
+        """Constant commands at both ends and the middle of every range."""
         blocks, n_a = self.cost.blocks(self.cost.n), len(self.plant.actions)
-        tried = [np.full((blocks, n_a), levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=n_a)]
-        return self._cheapest(tried)
+        return [np.full((blocks, n_a), levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=n_a)]
 
     def _cheapest(self, plans: Sequence[np.ndarray]) -> np.ndarray:
-        """The plan of the least cost; one that diverges costs more than any other."""
+        """The plan of the least cost; one that diverges costs more than any other, and the first is taken if all do."""
         costs = [float(self.cost(plan[None])[0][0]) for plan in plans]
         return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
@@ -228,9 +210,19 @@ class RecedingHorizon:
         initial_state: Float[Tensor, "batch n_s"],
         exogenous: Float[Tensor, "batch n n_z"],
         closure: nn.Module | None = None,
+        *,
+        plant: Plant | None = None,
     ) -> Trajectory:
-        """Episodes of a system with the closure, side by side; None takes the plant's own closure."""
-        system = Rollout(self.plant, self.plant.closure if closure is None else closure)
+        """Episodes of a system, side by side.
+
+        Args:
+            initial_state: initial states of the episodes.
+            exogenous: exogenous inputs, of which each solve sees the present one.
+            closure: closure of the system; None for that of ``plant``.
+            plant: physics of the system; None for that of the model.
+        """
+        plant = self.plant if plant is None else plant
+        system = Rollout(plant, plant.closure if closure is None else closure)
         self.begin()
         state, states, actions = initial_state, [initial_state.unsqueeze(1)], []
         for k in range(0, exogenous.shape[1], self.period):

@@ -22,7 +22,8 @@ class LoadedRun:
     Args:
         config: options of the run, as they were asked for.
         plant: the real system in simulation, newly made.
-        policies: trained policies by role: ``model_based`` and ``model_free``.
+        policies: trained policies by role: ``model_based`` and ``model_free``. Model predictive control in the place of
+            ``model_based`` plans on ``closure``.
         closure: trained closure of the twin.
     """
 
@@ -112,7 +113,8 @@ def _parts(config: RunConfig, plant: Plant) -> tuple[dict[str, nn.Module], nn.Mo
     """Policies and closure of a run before their training."""
     generator = torch.Generator().manual_seed(config.seed)
     policies = config.make_policies(plant, generator)
-    return dict(policies.items()), config.make_closure(plant, generator)
+    closure = config.make_closure(plant, generator)
+    return dict(config.acting_policies(policies, config.believed() or plant, closure).items()), closure
 
 
 def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:

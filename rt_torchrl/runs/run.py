@@ -114,6 +114,7 @@ class Run:
         self.make_policy = functools.partial(config.make_policy, plant)
         policies = {role: policy.to(device) for role, policy in config.make_policies(plant, generator).items()}
         closure = config.make_closure(plant, generator).to(device)
+        policies = config.acting_policies(policies, physics, closure)
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
         self.algorithm = ReinforcementTwinning(
             env,
@@ -153,7 +154,9 @@ class Run:
         dashboard = Dashboard(self.folder)
         with Progress(self.config.episodes, len(self.episodes)) as bar:
             bar.doing("checking the gradient")
-            gap = engine_gap(self.initial_closure, self.initial_policies["model_based"], self.unseen)
+            # Model predictive control has no weights of its own whose gradient could be checked.
+            checked: Role = "model_free" if self.config.twinning.planner.method == "receding_horizon" else "model_based"
+            gap = engine_gap(self.initial_closure, self.initial_policies[checked], self.unseen)
             dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
             self._all_episodes(dashboard, bar)
             if not self.episodes:

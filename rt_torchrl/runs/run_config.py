@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from torch import nn
 
+from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
@@ -153,6 +154,28 @@ class RunConfig:
         choice: dict[str, Any] = {"policy": self.model_free_policy}  # of the recipe's own Literal
         other = dataclasses.replace(self, **choice)
         return {"model_based": model_based, "model_free": other.make_policy(plant, generator)}
+
+    def acting_policies(
+        self, policies: dict[Role, nn.Module], physics: Plant, closure: nn.Module
+    ) -> dict[Role, nn.Module]:
+        """The policies of :meth:`make_policies`, or model predictive control in the place of π_mb if it is asked for.
+
+        Args:
+            policies: policies by role.
+            physics: physics of the twin.
+            closure: closure of the twin, on which model predictive control plans.
+        """
+        planner = self.twinning.planner
+        if planner.method != "receding_horizon":
+            return policies
+        return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
+
+    def believed(self) -> Plant | None:
+        """The physics of a twin that is wrong about them; None if it has those of the real system.
+
+        Override this method for a twin that is wrong, and give :class:`Run` what it returns.
+        """
+        return None
 
     def defaults(self) -> "RunConfig":
         """The defaults of all options, given the closure and the sensors that the options ask for.

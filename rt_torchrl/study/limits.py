@@ -15,7 +15,8 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
 from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
-from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
+from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import Rollout

@@ -13,6 +13,7 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.rollout import drive_of, require_finite
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
 class ExploringInterval(Interval):
@@ -53,7 +54,7 @@ class EpisodeCollector:
 
     def __init__(self, env: EnvBase, actor: LivePolicy, plant: Plant):
         self.env, self._plant = env, plant
-        self._actor = TensorDictModule(actor, in_keys=["observation"], out_keys=["action"])
+        self._actor = TensorDictModule(actor, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
@@ -74,7 +75,8 @@ class FlightCollector:
 
     No interval takes a Python step. A step of an environment costs some 0.4 ms, and an interval of the engine
     ``native`` about a microsecond; an episode of the drone or the tank has 10 000 intervals. The collector suits
-    :class:`PlantEnv` itself and no subclass, because it never calls the step of a subclass.
+    :class:`PlantEnv` itself and no subclass, because it never calls the step of a subclass. Only :class:`StateFeedback`
+    flies by steps, because no machine code plans.
 
     Args:
         env: the real system in simulation.
@@ -84,11 +86,14 @@ class FlightCollector:
     def __init__(self, env: PlantEnv, actor: LivePolicy):
         self.env, self.actor = env, actor
         self._engine = Native(compiled=env.compiled)
+        self._by_steps = EpisodeCollector(env, actor, env.plant)
 
     @torch.no_grad()
     def rollout(self) -> TensorDict:
         """Fly one episode; its TensorDict has the batch size ``batch n``."""
         env = self.env
+        if isinstance(self.actor.policy, StateFeedback):
+            return self._by_steps.rollout()
         pass_over(env)
         env.reset()
         closure, ((initial_state, exogenous), factor) = env.begin_episode(), env.drawn

@@ -11,6 +11,7 @@ from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +52,9 @@ class ExplorationConfig:
 class LivePolicy(nn.Module):
     """The live policy as it acts on the real system: with noise added, and saturated to the ranges of the actions.
 
+    A policy takes the observation. :class:`StateFeedback` takes the time since :meth:`begin`, in calls of one control
+    interval each, the measured state and the measured inputs.
+
     Args:
         plant: plant that gives the ranges of the actions and the control interval.
         policy: the policy that is live.
@@ -66,15 +70,17 @@ class LivePolicy(nn.Module):
         low, high = bounds(plant.actions, device=generator.device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
-        self.policy, self.strength = policy, 0.0
+        self.policy, self.strength, self._dt, self._intervals = policy, 0.0, plant.dt, 0
         self._noise: Tensor | None = None
         self._scale = 0.5 * config.spread * (high - low)
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
         self._generator = generator
 
     def begin(self, policy: nn.Module, *, strength: float) -> None:
-        """Start an episode with the policy that is live now and ξ = ``strength``."""
-        self.policy, self.strength, self._noise = policy, strength, None
+        """Start an episode with the policy that is live now and ξ = ``strength``; state feedback gets ready for it."""
+        self.policy, self.strength, self._noise, self._intervals = policy, strength, None, 0
+        if isinstance(policy, StateFeedback):
+            policy.begin()
 
     def draw_noise(self, shape: torch.Size | tuple[int, ...]) -> Float[Tensor, "*batch n_a"]:
         """The noise of the next control interval; where ξ is zero, it is zero and nothing is drawn."""
@@ -88,7 +94,18 @@ class LivePolicy(nn.Module):
         return self.strength * self._scale * self._noise
 
     @torch.no_grad()
-    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+    def forward(
+        self,
+        observation: Float[Tensor, "*batch n_o"],
+        state: Float[Tensor, "*batch n_s"] | None = None,
+        exogenous: Float[Tensor, "*batch n_z"] | None = None,
+    ) -> Float[Tensor, "*batch n_a"]:
         safe_point()
-        command = self.policy(observation)
+        if isinstance(self.policy, StateFeedback):
+            if state is None or exogenous is None:
+                raise ValueError(f"{type(self.policy).__name__} acts from state and exogenous input; give both.")
+            command = self.policy.act(self._dt * self._intervals, state, exogenous)
+        else:
+            command = self.policy(observation)
+        self._intervals += 1
         return (command + self.draw_noise(command.shape)).clamp(self.low, self.high)

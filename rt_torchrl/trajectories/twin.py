@@ -10,7 +10,8 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.fingerprint import fingerprint
 from rt_torchrl.trajectories.rollout import Engine, Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 KEPT = 4
 """Number of policies whose rollouts a twin keeps, such as those that are judged in turn."""
@@ -60,13 +61,25 @@ class DigitalTwin:
         """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
 
         The trajectory is differentiable by the policy's weights and the initial state; the closure is held constant.
+        That of state feedback is not differentiable, and begins with an episode.
+
+        Raises:
+            ValueError: if state feedback is to fly a part of an episode.
         """
+        if isinstance(policy, StateFeedback):
+            if isinstance(start, Tensor) or start != 0.0:
+                raise ValueError(
+                    f"start={start} of a flight by {type(policy).__name__} must be 0, as it plans from there."
+                )
+            return policy.fly(initial_state, exogenous, self.closure, plant=self.plant)
         return self._planning(policy)(initial_state, exogenous, start=start)
 
     def cost(
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
+        if isinstance(policy, StateFeedback):
+            return control_cost(self.plant, self.control(policy, initial_state, exogenous)).mean()
         return self._planning(policy).costs(initial_state, exogenous).mean()
 
     def _planning(self, policy: nn.Module) -> Rollout:

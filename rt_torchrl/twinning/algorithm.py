@@ -19,6 +19,7 @@ from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.refusal import note_refusal
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
@@ -27,6 +28,7 @@ from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
+from rt_torchrl.twinning.planning import Judgement, Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.twinning.saved_state import load_parts, on_device
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
@@ -41,7 +43,7 @@ class ReinforcementTwinning:
         env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
         model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based``.
-        model_based: policy π_mb, trained in place.
+        model_based: policy π_mb, trained in place, or :class:`PredictiveControl` on the twin's closure.
         config: hyper-parameters of the six steps.
         generator: source of all random numbers that the real system does not draw itself.
         learner: learner of step 2, which trains ``model_free``; by default ``config.learner`` makes it.
@@ -80,11 +82,18 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
-        self.cloning = Cloning(self.virtual, config.distillation, config.virtual_episodes)
+        self.planning = Planning(self.planner, self.virtual)
+        self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = collector_of(env, self.actor, twin.plant)
         self.episodes_done = 0
         self._earlier_closure: dict[str, Any] | None = None
+
+    @property
+    def judged(self) -> int:
+        """Number N of virtual episodes on which policies are judged."""
+        planned = isinstance(self.policies["model_based"], StateFeedback)
+        return self.config.planner.receding_horizon.virtual_episodes if planned else self.config.virtual_episodes
 
     def episode(self, tell: Callable[[str], None] = lambda step: None) -> EpisodeReport:
         """Fly one real episode and learn from it: the six steps of the paper, in order.
@@ -134,6 +143,8 @@ class ReinforcementTwinning:
         self.track_record.append(record, live, -reward.item())
         report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
         report.set_non_tensor("live", live)
+        flew = self.policies[live]
+        report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
         if refused:
             report.update(findings(episodes_refused=float(len(refused)))).set_non_tensor("refusal", "; ".join(refused))
         return report
@@ -173,46 +184,28 @@ class ReinforcementTwinning:
             if self._earlier_closure is None:
                 raise
             refused = f"closure refused: {error}"
+        self.policies["model_based"].load_state_dict(policy)  # state feedback holds the refused closure too
         self.twin.closure.load_state_dict(self._earlier_closure)
         self._earlier_closure = None
         self.generator.set_state(state)
-        self.policies["model_based"].load_state_dict(policy)
         self.planner.restart()
         return merged(step(), findings(refused, closure_refused=1.0))
 
     def plan(self) -> TensorDict:
-        """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse.
-
-        Note: the paper keeps every plan. Here a plan made on N_z winds is compared with the previous policy on N other
-        winds, because the best policy for a few winds can lie just beyond a cliff of another wind.
-        """
+        """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""
         count = self.config.planner.realisations or self.config.realisations
-        planned_on, judged_on = map(self.virtual.draw, (count, self.config.virtual_episodes))
-        policy = self.policies["model_based"]
-        before = copy.deepcopy(policy.state_dict())
-        incumbent = self.virtual_costs(judged_on, ("model_based",))["model_based"]
-        try:
-            found = self.planner.plan(planned_on)
-        except DivergenceError as error:
-            self.require_sound_twin(planned_on)
-            policy.load_state_dict(before)
-            self.planner.restart()
-            return findings(f"no plan: {error}", plan_accepted=0.0)
-        accepted = not self.referee.worse(self.virtual.cost(policy, judged_on).item(), than=incumbent.item())
-        if not accepted:
-            policy.load_state_dict(before)
-            self.planner.refuse()
-        return findings(
-            J_a_plan_before=found.start,
-            J_a_plan=found.best if accepted else found.start,
-            policy_gradient=found.gradient,
-            plan_accepted=float(accepted),
+        planned_on, judged_on = map(self.virtual.draw, (count, self.judged))
+        judgement = Judgement(
+            incumbent=lambda episodes: self.virtual_costs(episodes, ("model_based",))["model_based"],
+            worse=self.referee.worse,
+            require_sound_twin=self.require_sound_twin,
         )
+        return self.planning.plan(planned_on, judged_on, judgement)
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
         """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
-        judged_on = self.virtual.draw(self.config.virtual_episodes)
+        judged_on = self.virtual.draw(self.judged)
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
         change = weight_change(self.policies[idle], self._earlier_weights[idle])
@@ -262,6 +255,7 @@ class ReinforcementTwinning:
             self.policies[live],
             self.policies[idle],
             seen=self.learner.observations,
+            record=self.short_term[-1],
             costs=(costs[live].item(), costs[idle].item()),
             judged_on=judged_on,
             worse=self.referee.worse,

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.referees import Role
@@ -37,6 +38,7 @@ class Cloning:
         idle: nn.Module,
         *,
         seen: Callable[[], Float[Tensor, "n n_o"]],
+        record: Trajectory,
         costs: tuple[float, float],
         judged_on: Scenario,
         worse: Callable[[float, float], bool],
@@ -47,19 +49,25 @@ class Cloning:
             live: the policy that is cloned; it is not changed.
             idle: the policy that becomes the clone.
             seen: function that gives observations of the real system; a copy of weights does not call it.
+            record: the real episode that ``live`` has just flown, from which a clone of state feedback learns.
             costs: mean J_a of ``live`` and of ``idle`` over the episodes of ``judged_on``.
             judged_on: virtual episodes on which the clone is judged.
             worse: function that says whether the first of two mean J_a is worse than the second one.
 
         Returns:
             A report, which is empty after a copy of weights. After a distillation it holds ``distillation_error`` and
-            ``distillation_cost_ratio``; if the clone is refused, the event is ``keep``, and ``reason`` says why.
+            ``distillation_cost_ratio``; if the clone is refused, the event is ``keep``, and ``reason`` says why. State
+            feedback has no weights that could imitate, so that a clone of it is refused.
         """
+        if isinstance(idle, StateFeedback):
+            reason = f"no clone: {type(idle).__name__} plans its actions and cannot imitate a policy"
+            return findings(reason).set_non_tensor("event", "keep")
         if same_architecture(live, idle):
             idle.load_state_dict(live.state_dict())
             return findings()
         before, (live_cost, replaced) = copy.deepcopy(idle.state_dict()), costs
-        error = self.distillation.imitate(live, idle, seen=seen(), draw=lambda: self.virtual.draw(self.count))
+        source = record if isinstance(live, StateFeedback) else seen()
+        error = self.distillation.imitate(live, idle, seen=source, draw=lambda: self.virtual.draw(self.count))
         cost = self.virtual.cost(idle, judged_on).item()
         found = {"distillation_error": error, "distillation_cost_ratio": cost / live_cost}
         if not worse(cost, replaced):

@@ -18,7 +18,8 @@ from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -61,7 +62,7 @@ class Distillation:
         live: nn.Module,
         idle: nn.Module,
         *,
-        seen: Float[Tensor, "n n_o"],
+        seen: Float[Tensor, "n n_o"] | Trajectory,
         draw: Callable[[], Scenario],
     ) -> float:
         """Train ``idle`` in place.
@@ -69,40 +70,66 @@ class Distillation:
         Args:
             live: the teacher, which is not changed.
             idle: the student, which starts from its present weights.
-            seen: observations of the real system.
+            seen: observations of the real system, or an episode that the teacher has flown there. State feedback needs
+                the episode, because its actions are no function of the observation; its actions are taken as recorded.
             draw: function that draws new initial states and disturbances of virtual episodes at each call.
 
         Returns:
             RMS difference between the two policies' actions on all observations, as a share of the actions' ranges.
         """
-        observations = [self._thinned(seen), self._thinned(self._observed(live, draw()))]
+        pairs = [self._of_record(seen) if isinstance(seen, Trajectory) else self._asked(live, seen)]
+        pairs.append(self._flown(live, live, draw()))
         for number in range(self.config.rounds):
             if number:
-                observations.append(self._thinned(self._observed(idle, draw())))
-            error = match_actions(self.twin.plant, live, idle, torch.cat(observations), self.config.iterations)
+                pairs.append(self._flown(live, idle, draw()))
+            observations, actions = (torch.cat(part) for part in zip(*pairs, strict=True))
+            error = match_actions(self.twin.plant, actions, idle, observations, self.config.iterations)
         return error
 
     @torch.no_grad()
-    def _observed(self, policy: nn.Module, episodes: Scenario) -> Float[Tensor, "n n_o"]:
-        plant, exogenous = self.twin.plant, episodes.exogenous
+    def _flown(self, teacher: nn.Module, policy: nn.Module, episodes: Scenario) -> tuple[Tensor, Tensor]:
+        """Observations of virtual episodes that a policy flies, and what the teacher does there."""
         flown = self.twin.control(policy, *episodes)
-        t = plant.dt * torch.arange(exogenous.shape[1], dtype=torch.float64, device=exogenous.device)
-        return plant.observe(t, flown.states[:, :-1], exogenous).flatten(0, 1)
+        if not isinstance(teacher, StateFeedback):
+            return self._asked(teacher, self._observed(flown))
+        if policy is teacher:
+            return self._of_record(flown)
+        return self._of_record(flown._replace(actions=commands_along(teacher, flown, self.twin.plant.dt)))
 
-    def _thinned(self, observations: Float[Tensor, "n n_o"]) -> Float[Tensor, "m n_o"]:
-        return observations[:: -(-len(observations) // self.config.samples)]
+    @torch.no_grad()
+    def _asked(self, teacher: nn.Module, observations: Float[Tensor, "n n_o"]) -> tuple[Tensor, Tensor]:
+        """Observations of a source, thinned, and the teacher's actions."""
+        thinned = self._thinned(observations)
+        return thinned, teacher(thinned)
+
+    def _of_record(self, flown: Trajectory) -> tuple[Tensor, Tensor]:
+        """Observations and actions of a record of one episode or several, thinned."""
+        return self._thinned(self._observed(flown)), self._thinned(flown.actions.reshape(-1, flown.actions.shape[-1]))
+
+    def _observed(self, flown: Trajectory) -> Float[Tensor, "n n_o"]:
+        plant, exogenous = self.twin.plant, flown.exogenous
+        t = plant.dt * torch.arange(exogenous.shape[-2], dtype=torch.float64, device=exogenous.device)
+        seen = plant.observe(t, flown.states[..., :-1, :], exogenous)
+        return seen.reshape(-1, seen.shape[-1])
+
+    def _thinned(self, values: Float[Tensor, "n width"]) -> Float[Tensor, "m width"]:
+        return values[:: -(-len(values) // self.config.samples)]
 
 
 def match_actions(
-    plant: Plant, teacher: nn.Module, student: nn.Module, observations: Float[Tensor, "n n_o"], iterations: int
+    plant: Plant,
+    wanted: Float[Tensor, "n n_a"],
+    student: nn.Module,
+    observations: Float[Tensor, "n n_o"],
+    iterations: int,
 ) -> float:
-    """Fit the student's actions to the teacher's in place, by TorchRL's behaviour-cloning loss.
+    """Fit the student's actions to a teacher's in place, by TorchRL's behaviour-cloning loss.
 
     Args:
         plant: plant that gives the ranges of the actions.
-        teacher: policy that is imitated; it is not changed.
+        wanted: the teacher's actions.
         student: policy whose weights are trained, from their present values.
-        observations: observations on which the two policies are to agree.
+        observations: observations on which the two are to agree.
         iterations: gradients of the loss on all observations.
 
     Returns:
@@ -113,10 +140,10 @@ def match_actions(
     from tensordict.nn import TensorDictModule
     from torchrl.objectives import BCLoss
 
-    with torch.no_grad():
-        wanted = ShareOfRange(plant, teacher, device=observations.device)(observations)
-    expert = TensorDict({"observation": observations, "action": wanted}, batch_size=observations.shape[:1])
     imitator = ShareOfRange(plant, student, device=observations.device)
+    expert = TensorDict(
+        {"observation": observations, "action": imitator.share(wanted)}, batch_size=observations.shape[:1]
+    )
     actor = TensorDictModule(imitator, in_keys=["observation"], out_keys=["action"])
     with warnings.catch_warnings():
         # BCLoss has no target network; TorchRL warns that its class does not declare one.
@@ -135,6 +162,9 @@ class ShareOfRange(nn.Module):
         device: device of the observations; torch's default if None.
     """
 
+    low: Tensor
+    range: Tensor
+
     def __init__(self, plant: Plant, policy: nn.Module, *, device: torch.device | None = None):
         super().__init__()
         low, high = bounds(plant.actions, device=device)
@@ -143,5 +173,8 @@ class ShareOfRange(nn.Module):
         self.register_buffer("range", high - low)
 
     def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
-        action = self.policy(observation)
+        return self.share(self.policy(observation))
+
+    def share(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
+        """Actions in physical units as shares of their ranges."""
         return (action - self.low.to(action)) / self.range.to(action)

@@ -1,10 +1,11 @@
 """The protocol of a planner, which improves π_mb in step 5, and its parameters."""
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from torch import nn
 
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -88,6 +89,10 @@ class PlannerConfig:
     """Parameters of step 5.
 
     Args:
+        method: method of the model-based policy: whole_episodes descends the cost of whole virtual episodes,
+            short_horizon that of short windows plus a learned tail cost, and receding_horizon is model predictive
+            control, which has no weights of its own and plans while it acts. By default short_horizon if its window is
+            positive, and else whole_episodes.
         iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
             episodes.
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
@@ -97,16 +102,24 @@ class PlannerConfig:
         descent: parameters of the policy's descent over whole episodes.
         short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
             use.
+        receding_horizon: parameters of model predictive control.
     """
 
+    method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
     iterations: int = 10
     realisations: int | None = None
     experience: int = 100
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
+    receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
     def __post_init__(self) -> None:
         check_options(self)
+        if self.method is not None and (self.method == "short_horizon") != (self.short_horizon.window > 0):
+            raise ValueError(
+                f"method={self.method!r} of the planning does not go with short_horizon.window="
+                f"{self.short_horizon.window}; a positive window belongs to short_horizon alone."
+            )
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
         if self.realisations is not None and self.realisations < 1:

@@ -1,0 +1,159 @@
+"""Model predictive control that acts in the place of a policy, on a model whose closure may be trained meanwhile."""
+
+import copy
+import dataclasses
+import math
+import statistics
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held
+from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, Solve
+from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.options import check_options
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictiveConfig(RecedingHorizonConfig):
+    """Parameters of model predictive control that acts in the place of a policy.
+
+    Args:
+        horizon: length of the window over which a plan is made [s]; every plant needs its own.
+        forecast: forecast of the exogenous inputs: held for the measured ones, or decaying to the mean of the inputs
+            met so far with the time that fits them best; until inputs have been met, they are held.
+        virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
+            virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    horizon: float = 1.0
+    forecast: Literal["held", "decaying"] = "decaying"
+    virtual_episodes: int = 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_options(self, infinite=("deadline",))
+        if self.virtual_episodes < 1:
+            raise ValueError(f"virtual_episodes={self.virtual_episodes} of the receding horizon must be at least 1.")
+
+
+class PredictiveControl(nn.Module):
+    """State feedback by :class:`RecedingHorizon`; see :class:`StateFeedback` for the methods.
+
+    Its weights are those of the closure that it plans on, and it has no others; its buffers are those of the forecast.
+    Before every episode it plans once from a typical state, which is a draw of the plant, so that the first solve has a
+    plan to go on with when it is late. Only :meth:`act` has the deadline: a simulated episode knows no wall clock.
+
+    Args:
+        plant: the physics of the model.
+        closure: closure of the model, such as that of a twin, which is trained in place.
+        config: parameters.
+
+    Raises:
+        ValueError: if :class:`RecedingHorizon` refuses the parameters, or the closure is not on the CPU.
+    """
+
+    mean: Tensor
+    time: Tensor
+
+    def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig):
+        super().__init__()
+        self.closure, self._plant, self._config = closure, [plant], config  # in a list, it is no submodule
+        devices = {str(weight.device) for weight in (*closure.parameters(), *closure.buffers())} - {"cpu"}
+        if devices:
+            raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
+        n_z = len(plant.inputs)
+        # With an infinite time, the inputs are held.
+        self.register_buffer("mean", torch.zeros(n_z, dtype=torch.float64))
+        self.register_buffer("time", torch.full((n_z,), math.inf, dtype=torch.float64))
+        timeless = dataclasses.replace(config, deadline=math.inf)
+        self._acting, self._virtual = (
+            RecedingHorizon(plant, closure, chosen, forecast=self._forecast()) for chosen in (config, timeless)
+        )
+        generator = torch.Generator().manual_seed(0)
+        self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
+
+    def _forecast(self) -> Forecast:
+        """The forecast of the configuration, whose numbers are the buffers."""
+        if self._config.forecast == "held":
+            return Held()
+        return Decaying(self.mean, self.time, dt=self._plant[0].dt)
+
+    def learn(self, records: Float[Tensor, "episodes n n_z"]) -> None:
+        """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
+
+        Args:
+            records: inputs of whole episodes.
+        """
+        plant = self._plant[0]
+        if self._config.forecast == "held" or not plant.inputs:
+            return
+        longest = min(self._acting.horizon, records.shape[1] - 1) * plant.dt
+        fitted = Decaying.fitted(records, dt=plant.dt, horizon=longest)
+        self.mean.copy_(fitted.mean)
+        self.time.copy_(fitted.time)
+
+    @property
+    def solves(self) -> list[Solve]:
+        """The solves of the episode in which it acted last, without the one before its beginning."""
+        return self._acting.solves
+
+    def begin(self) -> None:
+        self._acting.prepare(*self._typical)
+        self._acting.solves.clear()
+
+    @torch.no_grad()
+    def act(
+        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
+    ) -> Float[Tensor, "batch n_a"]:
+        return self._acting.act(t, state, exogenous)
+
+    @torch.no_grad()
+    def fly(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        closure: nn.Module | None = None,
+        *,
+        plant: Plant | None = None,
+    ) -> Trajectory:
+        self._virtual.prepare(*self._typical)
+        flown = self._virtual.fly(initial_state, exogenous, closure, plant=plant)
+        self._virtual.solves.clear()
+        return flown
+
+    def report(self) -> dict[str, float]:
+        """Wall-clock times of the solves [ms], and the numbers of those that were late or diverged."""
+        seconds = [solve.seconds for solve in self.solves]
+        return {
+            "solve_median": 1e3 * statistics.median(seconds),
+            "solve_max": 1e3 * max(seconds),
+            "late_solves": float(sum(solve.late for solve in self.solves)),
+            "diverged_solves": float(sum(solve.diverged for solve in self.solves)),
+        }
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Refuse to be called as a policy.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(
+            "model predictive control is no function of the observation, so that it cannot be called, traced or "
+            "exported as a policy. Take the model-free policy, which learns from its records (--role model_free)."
+        )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "PredictiveControl":
+        # The machine code of a solve cannot be copied.
+        found = PredictiveControl(self._plant[0], copy.deepcopy(self.closure, memo), self._config)
+        found.load_state_dict(self.state_dict())
+        memo[id(self)] = found
+        return found

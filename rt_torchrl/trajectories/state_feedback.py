@@ -1,0 +1,72 @@
+"""State feedback: a controller of time, state and measured inputs, which may plan and remember."""
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+
+@runtime_checkable
+class StateFeedback(Protocol):
+    """A module that acts in the place of a policy, but from more than the observation.
+
+    A policy is a function of the observation, so that one call takes many observations at once and a rollout can trace
+    it. State feedback acts interval by interval, in the order of time, and keeps what it needs from one to the next.
+    """
+
+    def begin(self) -> None:
+        """Begin an episode; everything that takes long is done here, before the first action is due."""
+
+    def act(
+        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
+    ) -> Float[Tensor, "batch n_a"]:
+        """The command of the control interval at t [s]; the intervals follow each other.
+
+        Args:
+            t: start of the interval, in the episode [s].
+            state: measured states.
+            exogenous: measured exogenous inputs of the interval.
+        """
+
+    def fly(
+        self,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        closure: nn.Module | None = None,
+        *,
+        plant: Plant | None = None,
+    ) -> Trajectory:
+        """Episodes of a simulated system, side by side, with no regard to wall-clock time.
+
+        Args:
+            initial_state: initial states of the episodes.
+            exogenous: exogenous inputs, of which each action sees the present one.
+            closure: closure of the system; None for that of ``plant``.
+            plant: physics of the system; None for that of the controller's model.
+
+        Raises:
+            DivergenceError: if the system diverges.
+        """
+
+    def report(self) -> dict[str, float]:
+        """Numbers about the episode in which it acted last, for the report of that episode."""
+
+
+@torch.no_grad()
+def commands_along(controller: StateFeedback, flown: Trajectory, dt: float) -> Float[Tensor, "batch n n_a"]:
+    """The commands of a controller in states that another one has reached.
+
+    Args:
+        controller: controller that is asked for its commands.
+        flown: episodes of the other one, from the beginning of an episode.
+        dt: control interval [s].
+    """
+    controller.begin()
+    inputs = flown.exogenous.unbind(1)
+    states = flown.states.unbind(1)[: len(inputs)]
+    asked = enumerate(zip(states, inputs, strict=True))
+    return torch.stack([controller.act(k * dt, state, exogenous) for k, (state, exogenous) in asked], 1)

@@ -1,0 +1,218 @@
+"""The whole method with model predictive control in the place of the model-based policy, on the oracle plant."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from small_runs import SMALL
+from test_export_recipe import recipe
+from torch import nn
+
+from rt_torchrl.figures.policy import policy_contours
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs.loaded_run import load_run
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
+from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig, make_planner
+
+PLANNER = PlannerConfig(method="receding_horizon", receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2))
+FIT = AssimilationConfig(iterations=10, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0))
+
+
+class Config(RunConfig):
+    """The oracle plant with model predictive control."""
+
+    def plant(self):
+        return LinearQuadratic(horizon=2.0, noise=0.5)
+
+
+def training(folder=None, episodes=3, *, twinning=None, **options):
+    chosen = dataclasses.replace(SMALL, planner=PLANNER, assimilation=FIT, **(twinning or {}))
+    options = {"figures": False, "untrained": 0, "unseen": 2, "figures_every": 0} | options
+    config = Config(episodes=episodes, log_dir=folder, compiled=False, twinning=chosen, **options)
+    return Run(config, config.plant())
+
+
+def learner(name):
+    return {"learner": dataclasses.replace(SMALL.learner, algorithm=name)}
+
+
+def referee(**options):
+    return {"referee": dataclasses.replace(SMALL.referee, **options)}
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+@pytest.mark.parametrize("rule", ["decision_tree", "trust_ratio"])
+def test_it_acts_the_twin_is_fitted_and_the_other_half_learns(tmp_path, rule, name):
+    run = training(tmp_path, 4, twinning=learner(name) | referee(rule=rule))
+    records = run.train()["episodes"]
+    acted = [record for record in records if record["live"] == "model_based"]
+    assert acted and all(record["late_solves"] == 0.0 < record["solve_median"] for record in acted)
+    for record in records:
+        assert record["J_a_plan"] == record["J_a_plan_before"] and record["plan_accepted"] == 1.0
+        assert ("solve_median" in record) == (record["live"] == "model_based") and "critic_loss" in record
+    assert len(run.algorithm.learner.memory) == 4 * 20
+    found = run.algorithm.twin.closure.matrix - run.algorithm.twin.plant.closure.matrix
+    assert found.norm() < 0.5 * (run.initial_closure.matrix - run.algorithm.twin.plant.closure.matrix).norm()
+
+
+def test_it_acts_from_the_first_episode_in_the_arm_of_the_model_and_through_noise(tmp_path):
+    run = training(tmp_path, 2, twinning={"arm": "model_based"}, noise=0.02)
+    records = run.train()["episodes"]
+    assert [record["live"] for record in records] == ["model_based"] * 2
+
+
+def test_what_it_plans_on_is_the_twins_closure():
+    run = training(episodes=1, twinning={"arm": "model_based"})
+    algorithm = run.algorithm
+    controller = algorithm.policies["model_based"]
+    before = algorithm.twin.closure.matrix.detach().clone()
+    algorithm.episode()
+    assert controller.closure is algorithm.twin.closure and not torch.equal(before, controller.closure.matrix)
+    assert controller.time.isfinite().all()
+    assert torch.equal(run.initial_policies["model_based"].closure.matrix, before)
+    run._held.release()
+
+
+@pytest.mark.parametrize("rule", ["decision_tree", "trust_ratio"])
+def test_an_interrupted_training_goes_on_to_the_bit(tmp_path, rule):
+    whole = training(tmp_path / "whole", 4, twinning=referee(rule=rule))
+    whole.train()
+    training(tmp_path / "parts", 2, twinning=referee(rule=rule)).train()
+    training(tmp_path / "parts", 4, twinning=referee(rule=rule), resume=True).train()
+    one, other = (json.loads((tmp_path / name / "metrics.json").read_text())["episodes"] for name in ("whole", "parts"))
+    timed = ("seconds", "solve_median", "solve_max")
+    for first, second in zip(one, other, strict=True):
+        assert {k: v for k, v in first.items() if k not in timed} == {k: v for k, v in second.items() if k not in timed}
+
+
+def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
+    run = training(tmp_path, 1)
+    algorithm = run.algorithm
+    algorithm.referee.live = "model_based"
+    algorithm.episode()
+    algorithm.referee.live = "model_based"
+    judged = algorithm.virtual.draw(2)
+    costs = algorithm.virtual_costs(judged)
+    found = algorithm.clone(costs, judged)
+    assert 0.0 < found["distillation_error"] < 0.3
+    algorithm.referee.live = "model_free"
+    refused = algorithm.clone(costs, judged)
+    assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
+    run._held.release()
+
+
+def test_a_clone_learns_the_actions_of_record_and_flights():
+    """The student has enough weights, the disturbance is seen by nobody, and the teacher is nearly linear."""
+    plant = LinearQuadratic(horizon=4.0, noise=0.0)
+    teacher = PredictiveControl(plant, plant.closure, PredictiveConfig(horizon=2.0, tolerance=1e-9, iterations=100))
+    generator = torch.Generator().manual_seed(0)
+    student = plant.make_policy(generator)
+    draw = lambda: Scenario(0.5 * plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator))  # noqa: E731
+    record = teacher.fly(*draw())
+    one = record._replace(**{name: getattr(record, name)[0] for name in ("states", "actions", "exogenous")})
+    distillation = Distillation(DigitalTwin(plant, plant.closure), DistillationConfig())
+    error = distillation.imitate(teacher, student, seen=one, draw=draw)
+    unseen = teacher.fly(*draw())
+    imitated = student(plant.observe(torch.zeros(()), unseen.states[:, :-1], unseen.exogenous))
+    assert error < 0.02 and ((imitated - unseen.actions) / 4.0).square().mean().sqrt() < 0.02
+
+
+class Exploding(nn.Module):
+    """A closure that diverges after its first fit."""
+
+    def __init__(self):
+        super().__init__()
+        self.matrix = nn.Parameter(torch.zeros(2, 2, dtype=torch.float64))
+
+    def forward(self, features):
+        return (features.unsqueeze(-2) * self.matrix).sum(-1)
+
+
+def test_a_closure_that_diverges_is_refused_and_stays_refused():
+    plant = LinearQuadratic(horizon=2.0, noise=0.5)
+    generator, closure = torch.Generator().manual_seed(0), Exploding()
+    algorithm = ReinforcementTwinning(
+        PlantEnv(plant),
+        DigitalTwin(plant, closure),
+        model_free=plant.make_policy(generator),
+        model_based=PredictiveControl(plant, closure, PLANNER.receding_horizon),
+        config=dataclasses.replace(SMALL, planner=PLANNER, assimilation=FIT),
+        generator=generator,
+    )
+    algorithm.episode()
+    sound = closure.matrix.detach().clone()
+    fit = algorithm.assimilation.update
+
+    def diverging(*arguments):
+        found = fit(*arguments)
+        with torch.no_grad():
+            closure.matrix.fill_(1e8)
+        return found
+
+    algorithm.assimilation.update = diverging
+    report = algorithm.episode()
+    assert report["closure_refused"] == 1.0 and torch.equal(closure.matrix, sound)
+    assert algorithm.policies["model_based"].closure is closure
+
+
+def test_a_run_is_read_back_and_says_what_can_be_exported(tmp_path):
+    run = training(tmp_path, 2)
+    run.train()
+    loaded = load_run(tmp_path, Config)
+    controller = loaded.policy("model_based")
+    assert isinstance(controller, PredictiveControl) and controller.closure is loaded.closure
+    own = run.algorithm.policies["model_based"]
+    assert controller.state_dict().keys() == own.state_dict().keys()
+    assert all(torch.equal(value, own.state_dict()[name]) for name, value in controller.state_dict().items())
+    export = recipe("export")
+    monkey = export.load_run
+    export.load_run = lambda folder, _: monkey(folder, Config)
+    for what in ("policy", "controller"):
+        with pytest.raises(ValueError, match="cannot be exported. Export the model-free policy.*--role model_free"):
+            export.main(export.Config(run=tmp_path, what=(what,), formats=("c",)))
+    export.main(export.Config(run=tmp_path, role="model_free", formats=("pt2",)))
+    assert (tmp_path / "exported" / "linear_quadratic_model_free.pt2").is_file()
+
+
+def test_its_panel_says_that_it_has_no_contours(tmp_path):
+    run = training(tmp_path, 1)
+    run.algorithm.episode()
+    figure = policy_contours(run._snapshot())
+    texts = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert texts == ["plans its actions:\nno function of the observation"]
+    run._held.release()
+
+
+def test_a_checkpoint_of_another_method_does_not_fit(tmp_path):
+    training(tmp_path, 1).train()
+    config = Config(episodes=1, log_dir=tmp_path / "other", compiled=False, twinning=SMALL)
+    other = Run(config, config.plant())
+    with pytest.raises(ValueError, match="do not fit"):
+        checkpoint.load(tmp_path / "checkpoint.pt", other.algorithm)
+    other._held.release()
+
+
+def test_methods_and_policies_that_do_not_go_together_are_refused():
+    plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
+    twin = DigitalTwin(plant, LinearClosure(torch.zeros(2, 2)))
+    policy, controller = plant.make_policy(generator), PredictiveControl(plant, twin.closure, PLANNER.receding_horizon)
+    for given, config in ((policy, PLANNER), (controller, PlannerConfig())):
+        with pytest.raises(ValueError, match="does not go with a policy of class"):
+            make_planner(twin, given, config, generator=generator)
+    other = PredictiveControl(plant, plant.closure, PLANNER.receding_horizon)
+    with pytest.raises(ValueError, match="another closure than the twin's"):
+        make_planner(twin, other, PLANNER, generator=generator)
+    for method, window in (("receding_horizon", 5), ("whole_episodes", 5), ("short_horizon", 0)):
+        with pytest.raises(ValueError, match=f"method='{method}' of the planning does not go with"):
+            PlannerConfig(method=method, short_horizon=ShortHorizonConfig(window=window))
