@@ -74,8 +74,8 @@ class Config(RunConfig):
     """Train twin and controllers on the cryogenic tank.
 
     Args:
-        paper: train as the paper does, with its command, cost and numbers of gradients, as far as other options do not
-            say otherwise.
+        paper: train as the paper does, with its random start, command, cost and numbers of gradients, as far as other
+            options do not say otherwise.
         policy: paper (a cubic of the pressure error with 3 weights; an affine law of other observations) or mlp.
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of the pressure),
             clock (this and the time of the episode), phase (this and the phase of the orbit), measured (all states),
@@ -99,6 +99,7 @@ class Config(RunConfig):
     paper: bool = False
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
+    start: Literal["random", "controller"] = "controller"
     observe: tuple[str, ...] = ()
     command: Literal["duty", "drop"] = "duty"
     vented_weight: float = 5000.0
@@ -130,7 +131,7 @@ class Config(RunConfig):
             estimated = dataclasses.replace(twinning.assimilation, initial="estimated")
             twinning = dataclasses.replace(twinning, assimilation=estimated)
         if self.paper:
-            return Config(paper=True, command="drop", end_weight=0.0, twinning=twinning)
+            return Config(paper=True, start="random", command="drop", end_weight=0.0, twinning=twinning)
         return Config(twinning=twinning)
 
     def plant(self) -> CryogenicTank:
@@ -170,7 +171,7 @@ def main(config: Config) -> None:
     from rt_torchrl.envs.cryogenic_tank import figures
 
     baselines = {"on-off": OnOffValve, "PI": PIValve}
-    Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines).train()
+    Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines, first=PIValve).train()
 
 
 if __name__ == "__main__":

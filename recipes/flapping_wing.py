@@ -83,8 +83,8 @@ class Config(RunConfig):
     """Train twin and controllers on the flapping-wing drone.
 
     Args:
-        paper: train as the paper does, with its policy, observations and numbers of gradients, as far as other options
-            do not say otherwise.
+        paper: train as the paper does, with its random start, policy, observations and numbers of gradients, as far as
+            other options do not say otherwise.
         policy: mlp, or paper (an affine law of the observation with offset: 10 weights for the errors).
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of position and
             speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
@@ -104,6 +104,7 @@ class Config(RunConfig):
     paper: bool = False
     policy: Literal["mlp", "paper"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
+    start: Literal["random", "controller"] = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     dt: float = 5e-4
     horizon: float = 5.0
@@ -130,7 +131,9 @@ class Config(RunConfig):
 
     def defaults(self) -> "Config":
         twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
-        return Config(paper=True, policy="paper", twinning=twinning) if self.paper else Config(twinning=twinning)
+        if self.paper:
+            return Config(paper=True, policy="paper", start="random", twinning=twinning)
+        return Config(twinning=twinning)
 
     def plant(self, mass: float = MASS) -> FlappingWing:
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)
@@ -165,6 +168,7 @@ def main(config: Config) -> None:
         believed=config.believed(),
         plant_figures=figures.figures_of,
         baselines={"PD": TrimmedPD},
+        first=TrimmedPD,
         animate=save_animation,
     ).train()
 

@@ -28,9 +28,9 @@ CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
 }
 OWN_POLICY: dict[str, tuple[str, ...]] = {
-    "wind_turbine": ("--policy", "paper"),
-    "flapping_wing": ("--policy", "paper"),
-    "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
+    "wind_turbine": ("--start", "random", "--policy", "paper"),
+    "flapping_wing": ("--start", "random", "--policy", "paper"),
+    "cryogenic_tank": ("--start", "random", "--command", "drop", "--end-weight", "0"),
 }
 """Options for the paper's policy and cost, which every arm has unless it says otherwise."""
 PERCEPTRON = ("--policy", "mlp", "--hidden", "32", "32", "--observe", "paper")

@@ -75,8 +75,8 @@ class Config(RunConfig):
     """Train twin and controllers on the wind turbine.
 
     Args:
-        paper: train as the paper does, with its policy, observations and numbers of gradients, as far as other options
-            do not say otherwise.
+        paper: train as the paper does, with its random start, policy, observations and numbers of gradients, as far as
+            other options do not say otherwise.
         policy: mlp, paper (an affine law of the observation without bias: 4 weights for e1 and e2), bias (that law with
             bias: 6 weights), or scheduled (torque by the square of the speed and gain-scheduled PI pitch, whose gains
             start detuned).
@@ -100,6 +100,7 @@ class Config(RunConfig):
     paper: bool = False
     policy: Literal["mlp", "paper", "bias", "scheduled"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
+    start: Literal["random", "controller"] = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"
@@ -132,7 +133,9 @@ class Config(RunConfig):
 
     def defaults(self) -> "Config":
         twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
-        return Config(paper=True, policy="paper", twinning=twinning) if self.paper else Config(twinning=twinning)
+        if self.paper:
+            return Config(paper=True, policy="paper", start="random", twinning=twinning)
+        return Config(twinning=twinning)
 
     def plant(self) -> WindTurbine:
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
@@ -178,7 +181,7 @@ def main(config: Config) -> None:
     if config.real == "rosco":
         env = rosco_turbine(plant, seed=config.seed, device=require_device(config.device))
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
-    Run(config, plant, plant_figures=figures.figures_of, **system).train()
+    Run(config, plant, plant_figures=figures.figures_of, first=JonkmanController, **system).train()
 
 
 if __name__ == "__main__":

@@ -72,7 +72,11 @@ def of_command_line(plant, *words):
     return from_command_line(config_class_of(RECIPES / f"{plant}.py"), words)
 
 
-PLANTS = {"wind_turbine": (), "flapping_wing": (), "cryogenic_tank": ("--command", "drop", "--end-weight", "0")}
+PLANTS = {
+    "wind_turbine": ("--start", "random"),
+    "flapping_wing": ("--start", "random"),
+    "cryogenic_tank": ("--start", "random", "--command", "drop", "--end-weight", "0"),
+}
 
 
 @pytest.mark.parametrize("plant", PLANTS)

@@ -70,30 +70,40 @@ class ClassicalController(nn.Module, ABC):
         initial_state: Float[Tensor, "batch n_s"],
         exogenous: Float[Tensor, "batch n n_z"],
         closure: nn.Module | None = None,
+        *,
+        plant: Plant | None = None,
     ) -> Trajectory:
-        """Episodes under this controller, of a system with the closure; None takes the plant's own closure."""
-        closure = self.plant.closure if closure is None else closure
-        loop, n_s = ControlledInterval(self, closure), len(self.plant.states)
+        """Episodes under this controller.
+
+        Args:
+            initial_state: initial states of the episodes.
+            exogenous: exogenous inputs.
+            closure: closure of the system; None for that of its plant.
+            plant: physics of the system, such as a twin's; None for the controller's own plant.
+        """
+        plant = self.plant if plant is None else plant
+        loop, n_s = ControlledInterval(self, plant.closure if closure is None else closure, plant), len(plant.states)
         start = torch.cat([initial_state, self.first_memory(initial_state)], -1)
-        drive = drive_of(self.plant, exogenous, None)
+        drive = drive_of(plant, exogenous, None)
         carries = torch.cat([start.unsqueeze(0), self._engine.end_states(loop, start, drive)])
         states = carries[..., :n_s].transpose(0, 1)
         command = loop.commanded(carries[:-1].flatten(0, 1))[0].unflatten(0, carries[:-1].shape[:2])
-        return Trajectory(states, self.plant.actuate(states[:, :-1], command.transpose(0, 1)), exogenous)
+        return Trajectory(states, plant.actuate(states[:, :-1], command.transpose(0, 1)), exogenous)
 
 
 class ControlledInterval(Interval):
     """One control interval of a system under a classical controller; its state is (s, m).
 
     Args:
-        controller: the controller, with its plant.
+        controller: the controller.
         closure: closure of the system.
+        plant: physics of the system.
     """
 
     policy: ClassicalController
 
-    def __init__(self, controller: ClassicalController, closure: nn.Module):
-        super().__init__(controller.plant, closure, controller)
+    def __init__(self, controller: ClassicalController, closure: nn.Module, plant: Plant):
+        super().__init__(plant, closure, controller)
 
     def commanded(
         self, carry: Float[Tensor, "batch n_c"]

@@ -14,6 +14,8 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_atomically, write_json
+from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap
@@ -59,6 +61,7 @@ class Run:
         plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
             unknown closure, a :class:`RealController`.
+        first: class of the controller that the real system has had so far, for ``start="controller"``.
         animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
@@ -78,6 +81,7 @@ class Run:
         believed: Plant | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
+        first: type[ClassicalController] | None = None,
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
@@ -88,6 +92,9 @@ class Run:
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
         require_simulation(config, plant, env, baselines)
+        if config.start == "controller" and first is None:
+            raise ValueError("start='controller' needs the controller: give Run(..., first=...), or start='random'.")
+        self.first = first if config.start == "controller" else None
         for physics in filter(None, (plant, believed)):
             check_plant(physics, steps=CHECKED_STEPS, traced=False)
         if config.threads:
@@ -123,6 +130,7 @@ class Run:
             model_based=policies["model_based"],
             config=config.twinning,
             generator=generator,
+            first=None if self.first is None else ActingController(self.first(plant)).to(device),
         )
 
     def train(self) -> dict[str, Any]:

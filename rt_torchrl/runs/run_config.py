@@ -47,6 +47,8 @@ class RunConfig:
             says if it cannot. Without compilation these start at once, but every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default.
+        start: random, or controller: the controller that the real system has had so far flies one episode before all
+            others, twin and policies begin with what it did, and the model-based policy goes on.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir.
         overwrite: whether to replace the files that an earlier run left in log_dir.
@@ -80,6 +82,7 @@ class RunConfig:
     compiled: bool | None = None
     device: str = "cpu"
     threads: int = 0
+    start: Literal["random", "controller"] = "random"
     log_dir: Path | None = None
     resume: bool = False
     overwrite: bool = False

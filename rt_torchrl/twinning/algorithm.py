@@ -17,15 +17,15 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.refusal import note_refusal
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
+from rt_torchrl.twinning.flight import fly
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
@@ -42,13 +42,15 @@ class ReinforcementTwinning:
     Args:
         env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
         twin: the digital twin, whose closure is trained in place.
-        model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based``.
+        model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based`` or with ``first``.
         model_based: policy π_mb, trained in place, or :class:`PredictiveControl` on the twin's closure.
         config: hyper-parameters of the six steps.
         generator: source of all random numbers that the real system does not draw itself.
         learner: learner of step 2, which trains ``model_free``; by default ``config.learner`` makes it.
         planner: planner of step 5, which trains ``model_based``; by default ``config.planner`` makes it.
         referee: referee of step 6; by default ``config.referee`` makes it.
+        first: controller that the real system has had so far, as :class:`StateFeedback`. It flies one episode before
+            all others, with which twin and policies begin; None begins with the policies as they are.
 
     Raises:
         ValueError: if the real system's batch size is not 1, or the learner or planner trains another policy.
@@ -66,13 +68,16 @@ class ReinforcementTwinning:
         learner: Learner | None = None,
         planner: Planner | None = None,
         referee: Referee | None = None,
+        first: nn.Module | None = None,
     ):
         self.env, self.twin, self.config, self.generator = env, twin, config, generator
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        first: Role = "model_based" if config.arm == "model_based" else "model_free"
+        self.first = first
+        planned = config.arm == "model_based" or (first is not None and config.arm == "twinning")
+        acting: Role = "model_based" if planned else "model_free"
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
-        self.referee = referee or make_referee(config.referee, first)
+        self.referee = referee or make_referee(config.referee, acting)
         trained: dict[Role, Learner | Planner] = {"model_free": self.learner, "model_based": self.planner}
         for role, part in trained.items():
             if part.policy is not self.policies[role]:
@@ -105,7 +110,8 @@ class ReinforcementTwinning:
             ``real_cost``, ``live``, what the steps of this arm report, and the ``seconds`` of each step.
         """
         arm, report, seconds = self.config.arm, findings(), {}
-        steps = [self.interact]
+        steps = [self.start] if self.first is not None and not self.episodes_done else []
+        steps += [self.interact]
         steps += [self.update_model_free] if arm != "model_based" else []
         steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
         steps += [self.switch_policies] if arm == "twinning" else []
@@ -118,36 +124,35 @@ class ReinforcementTwinning:
         self.episodes_done += 1
         return EpisodeReport(report.update({"seconds": findings(**seconds)}))
 
+    def start(self) -> TensorDict:
+        """Before the first episode, ``first`` flies one; twin and policies learn from it (paper: random weights)."""
+        assert self.first is not None
+        flight = fly(self.actor, self.collector.rollout, self.first, strength=0.0)
+        self.learner.store(flight.transitions)
+        self.short_term.append(flight.record)
+        if on_twin := self.config.arm != "model_free":
+            self.fit_exogenous()
+            self.assimilate()
+            self.planning.remember()
+        found = self.cloning.begin(self.first, self.policies, flight.record, on_twin=on_twin)
+        for part in (self.learner, self.planner):
+            part.restart()
+        return merged(found, findings(start_cost=flight.cost))
+
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
 
-        An episode that cannot be learned from is flown again; the report gives their number and the reasons.
-
-        Raises:
-            ValueError: if several episodes in a row cannot be learned from; no memory holds anything of them.
+        See :func:`fly` for episodes that cannot be learned from; no memory holds anything of them.
         """
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
-        refused: list[str] = []
-        while True:
-            self.actor.begin(self.policies[live], strength=strength)
-            episode = self.collector.rollout()[0]
-            if not note_refusal(refused, episode):
-                break
-        # The learner learns from the action that was applied.
-        episode["action"] = episode["next", "applied"]
-        self.learner.store(episode)
-        states = torch.cat([episode["state"], episode["next", "state"][-1:]])
-        record = Trajectory(states, episode["action"], episode["exogenous"])
-        reward = episode["next", "reward"].mean()
-        self.short_term.append(record)
-        self.track_record.append(record, live, -reward.item())
-        report = findings(real_cost=-reward, reward=reward, exploration=self.actor.strength)
+        flight = fly(self.actor, self.collector.rollout, self.policies[live], strength=strength)
+        self.learner.store(flight.transitions)
+        self.short_term.append(flight.record)
+        self.track_record.append(flight.record, live, flight.cost.item())
+        report = merged(flight.report(), findings(exploration=self.actor.strength))
         report.set_non_tensor("live", live)
         flew = self.policies[live]
-        report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
-        if refused:
-            report.update(findings(episodes_refused=float(len(refused)))).set_non_tensor("refusal", "; ".join(refused))
-        return report
+        return report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
 
     def update_model_free(self) -> TensorDict:
         """Step 2: the learner improves π_mf."""

@@ -1,6 +1,7 @@
 """The idle policy becomes a clone of the live one."""
 
 import copy
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
-from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -75,6 +76,51 @@ class Cloning:
         idle.load_state_dict(before)
         reason = f"clone refused: its J_a is {cost:.4g}, that of the policy it replaces {replaced:.4g}"
         return findings(reason, **found).set_non_tensor("event", "keep")
+
+    def begin(
+        self, controller: nn.Module, policies: Mapping[Role, nn.Module], record: Trajectory, *, on_twin: bool
+    ) -> TensorDict:
+        """Make the policies imitate a controller; one that would fare worse on the twin than before stays as it was.
+
+        Args:
+            controller: the teacher, which is :class:`StateFeedback`.
+            policies: the policies by role; state feedback among them is left alone.
+            record: real episode that the controller has flown.
+            on_twin: whether policies also learn from virtual episodes and are judged in them.
+
+        Returns:
+            ``start_error_`` of each role, the RMS difference of the actions as a share of their ranges, and on the twin
+            ``start_cost_ratio_``, J_a of the policy over the controller's.
+        """
+        pupils = {role: policy for role, policy in policies.items() if not isinstance(policy, StateFeedback)}
+        starts = {role: copy.deepcopy(policy) for role, policy in pupils.items()}
+        judged_on = self.virtual.draw(self.count) if on_twin else None
+        report = findings()
+        for role, policy in pupils.items():
+            first = next(other for other, start in starts.items() if clones(start, starts[role]))
+            if first != role:
+                policy.load_state_dict(pupils[first].state_dict())
+            elif judged_on is None:
+                report.update(findings(**{f"start_error_{role}": self.distillation.of_record(policy, record)}))
+            else:
+                report = merged(report, self._imitated(controller, role, policy, record, judged_on))
+        return report
+
+    def _imitated(
+        self, controller: nn.Module, role: Role, policy: nn.Module, record: Trajectory, judged_on: Scenario
+    ) -> TensorDict:
+        before, start = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
+        error = self.distillation.imitate(
+            controller, policy, seen=record, draw=functools.partial(self.virtual.draw, self.count)
+        )
+        cost, wanted = (self.virtual.cost(flown, judged_on).item() for flown in (policy, controller))
+        found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": cost / wanted}
+        if cost <= start:
+            return findings(**found)
+        policy.load_state_dict(before)
+        return findings(
+            f"{role} does not imitate the controller: its J_a would be {cost:.4g}, not {start:.4g}", **found
+        )
 
 
 def same_architecture(first: nn.Module, second: nn.Module) -> bool:

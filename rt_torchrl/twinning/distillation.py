@@ -86,6 +86,11 @@ class Distillation:
             error = match_actions(self.twin.plant, actions, idle, observations, self.config.iterations)
         return error
 
+    def of_record(self, idle: nn.Module, record: Trajectory) -> float:
+        """Train ``idle`` in place to act as in a record, without the twin; the error is that of :meth:`imitate`."""
+        observations, actions = self._of_record(record)
+        return match_actions(self.twin.plant, actions, idle, observations, self.config.iterations)
+
     @torch.no_grad()
     def _flown(self, teacher: nn.Module, policy: nn.Module, episodes: Scenario) -> tuple[Tensor, Tensor]:
         """Observations of virtual episodes that a policy flies, and what the teacher does there."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from tensordict import TensorDict
 from torch import Tensor
 
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -37,6 +38,9 @@ class Planning:
     winds, because the best policy for a few winds can lie just beyond a cliff of another wind. State feedback plans
     while it acts, so that there is nothing to compare.
 
+    The attribute ``others`` holds further weights, from which the next plan is made, too; the best plan stays. A
+    descent from the imitation of a controller may end in a minimum beside that controller.
+
     Args:
         planner: planner of step 5.
         virtual: virtual episodes.
@@ -44,6 +48,7 @@ class Planning:
 
     def __init__(self, planner: Planner, virtual: VirtualEpisodes):
         self.planner, self.virtual = planner, virtual
+        self.others: list[dict[str, Tensor]] = []
 
     def plan(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """Plan, and go back to the earlier weights if the plan is worse.
@@ -56,6 +61,34 @@ class Planning:
         Raises:
             DivergenceError: if the twin diverges with the weights that have just flown.
         """
+        found = self._from_the_present(planned_on, judged_on, judgement)
+        while self.others:
+            other = self._from_others(self.others.pop(), planned_on, judged_on)
+            found = found if other is None else other
+        return found
+
+    def remember(self) -> None:
+        """Plan from the present weights, too, the next time; state feedback has none."""
+        if not isinstance(self.planner.policy, StateFeedback):
+            self.others.append(copy.deepcopy(self.planner.policy.state_dict()))
+
+    def _from_others(self, weights: dict[str, Tensor], planned_on: Scenario, judged_on: Scenario) -> TensorDict | None:
+        """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
+        policy = self.planner.policy
+        best, least = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on)
+        policy.load_state_dict(weights)
+        self.planner.restart()
+        try:
+            found = self.planner.plan(planned_on)
+        except DivergenceError:
+            found = None  # the twin is sound with the present policy, so that these weights are to blame
+        if found is not None and self.virtual.cost(policy, judged_on) < least:
+            return planned(found, accepted=True)
+        policy.load_state_dict(best)
+        self.planner.restart()
+        return None
+
+    def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         judged = not isinstance(policy, StateFeedback)
@@ -71,9 +104,14 @@ class Planning:
         if not accepted:
             policy.load_state_dict(before)
             self.planner.refuse()
-        return findings(
-            J_a_plan_before=found.start,
-            J_a_plan=found.best if accepted else found.start,
-            policy_gradient=found.gradient,
-            plan_accepted=float(accepted),
-        )
+        return planned(found, accepted=accepted)
+
+
+def planned(found: Descended, *, accepted: bool) -> TensorDict:
+    """The report of a plan."""
+    return findings(
+        J_a_plan_before=found.start,
+        J_a_plan=found.best if accepted else found.start,
+        policy_gradient=found.gradient,
+        plan_accepted=float(accepted),
+    )
