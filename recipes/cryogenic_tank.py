@@ -132,7 +132,7 @@ class Config(RunConfig):
             twinning = dataclasses.replace(twinning, assimilation=estimated)
         if self.paper:
             return Config(paper=True, start="random", command="drop", end_weight=0.0, twinning=twinning)
-        return Config(twinning=twinning)
+        return Config(twinning=self.suited(twinning))
 
     def plant(self) -> CryogenicTank:
         return CryogenicTank(

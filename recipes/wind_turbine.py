@@ -135,7 +135,7 @@ class Config(RunConfig):
         twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
         if self.paper:
             return Config(paper=True, policy="paper", start="random", twinning=twinning)
-        return Config(twinning=twinning)
+        return Config(twinning=self.suited(twinning))
 
     def plant(self) -> WindTurbine:
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)

@@ -83,7 +83,10 @@ PLANTS = {
 def test_the_paper_is_one_option(plant):
     """Its policy, observations, cost and numbers of gradients; the other defaults are apart from them."""
     made, paper = load_recipe(RECIPES / f"{plant}.py"), of_command_line(plant, "--paper")
-    assert paper.twinning == made.PAPER != of_command_line(plant).twinning == made.CONVERGED
+    assert paper.twinning == made.PAPER != of_command_line(plant, "--start", "random").twinning == made.CONVERGED
+    usual = of_command_line(plant).twinning
+    quiet = dataclasses.replace(made.CONVERGED.exploration, spread=0.02)
+    assert usual == dataclasses.replace(made.CONVERGED, exploration=quiet) != made.CONVERGED
     spelled = of_command_line(plant, "--policy", "paper", "--observe", "paper", *PLANTS[plant])
     assert dataclasses.replace(spelled, paper=True, observe=(), twinning=made.PAPER) == paper
     assert paper.plant().observations == spelled.plant().observations and paper.plant().cost == spelled.plant().cost

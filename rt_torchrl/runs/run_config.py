@@ -18,6 +18,8 @@ from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.referees import Role
 
+SPREAD_OF_IMITATION = 0.02
+"""Exploration around the imitation of a controller, as a share of half the range of each action."""
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
 GREATEST_SEED = 2**63 - 2
 """Greatest seed: torch takes signed integers of 64 bits, and the sensors of a simulated system take ``seed`` + 1."""
@@ -179,6 +181,17 @@ class RunConfig:
         Override this method for a twin that is wrong, and give :class:`Run` what it returns.
         """
         return None
+
+    def suited(self, twinning: TwinningConfig) -> TwinningConfig:
+        """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
+
+        A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
+        """
+        if self.start == "random":
+            return twinning
+        return dataclasses.replace(
+            twinning, exploration=dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
+        )
 
     def defaults(self) -> "RunConfig":
         """The defaults of all options, given the closure and the sensors that the options ask for.

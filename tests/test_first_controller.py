@@ -1,0 +1,157 @@
+"""A controller that the real system has had so far flies first; twin and policies begin with what it did."""
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+from small_runs import SMALL
+from test_classical import PD, episodes
+
+from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.planners import PlannerConfig
+
+GAINS = (0.4, 0.3)
+
+
+def twinning(*, gains=GAINS, iterations=0, model_free=None, **options):
+    plant = LinearQuadratic(horizon=2.0)
+    generator = torch.Generator().manual_seed(3)
+    learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
+    planner = PlannerConfig(iterations=iterations, descent=DescentConfig(optimiser="lbfgs", rate=1.0))
+    assimilation = AssimilationConfig(iterations=3, descent=DescentConfig(rate=0.02))
+    parts = {"learner": learner, "planner": planner, "assimilation": assimilation}
+    return ReinforcementTwinning(
+        PlantEnv(plant, seed=0),
+        DigitalTwin(plant, plant.make_closure(generator)),
+        model_free=model_free or plant.make_policy(generator),
+        model_based=plant.make_policy(generator),
+        config=TwinningConfig(realisations=4, virtual_episodes=4, **parts, **options),
+        generator=generator,
+        first=ActingController(PD(plant, gains)),
+    )
+
+
+def test_it_acts_as_it_flies():
+    plant = LinearQuadratic(horizon=1.0)
+    law = PD(plant, GAINS)
+    acting, (state, exogenous) = ActingController(law), episodes(plant)
+    flown = law.fly(state, exogenous)
+    assert isinstance(acting, StateFeedback)
+    for _ in range(2):
+        acting.begin()
+        commands = [acting.act(k * plant.dt, flown.states[:, k], exogenous[:, k]) for k in range(plant.n_steps)]
+        torch.testing.assert_close(torch.stack(commands, 1), flown.actions, rtol=1e-13, atol=1e-13)
+        assert acting._memory.unique().tolist() == [plant.n_steps]
+
+
+def test_it_flies_the_physics_that_it_is_given():
+    plant, other = LinearQuadratic(horizon=1.0), LinearQuadratic(horizon=1.0)
+    other._B = 2.0 * other._B
+    acting, (state, exogenous) = ActingController(PD(plant, GAINS)), episodes(plant)
+    own, others = acting.fly(state, exogenous), acting.fly(state, exogenous, plant=other)
+    wanted = PD(other, GAINS).fly(state, exogenous)
+    assert torch.equal(others.states, wanted.states) and not torch.equal(others.states, own.states)
+
+
+def test_policies_begin_as_the_controller_and_the_twin_has_learned_from_it():
+    found = twinning()
+    closure = found.twin.closure.matrix.detach().clone()
+    report = found.start()
+    for policy in found.policies.values():
+        torch.testing.assert_close(
+            policy.gain.detach(), torch.tensor([GAINS], dtype=torch.float64), rtol=1e-3, atol=1e-3
+        )
+    assert found.referee.live == "model_based" and report["start_cost_ratio_model_based"] == pytest.approx(
+        1.0, abs=1e-3
+    )
+    (record,) = found.short_term
+    gain = torch.tensor(GAINS, dtype=torch.float64)
+    wanted = -(record.states[:-1] * gain).sum(-1, keepdim=True).clamp(-2.0, 2.0)
+    torch.testing.assert_close(record.actions, wanted, rtol=1e-12, atol=1e-12)
+    assert not torch.equal(closure, found.twin.closure.matrix) and len(found.learner.observations()) == 20
+    cost = (found.twin.plant.running_cost(0.0, record.states[:-1], record.actions, record.exogenous)).mean()
+    assert report["start_cost"].item() == pytest.approx(cost.item(), rel=0.3) and report["start_cost"] > 0.0
+
+
+def test_only_the_first_episode_begins_with_it():
+    found = twinning()
+    first, second = found.episode(), found.episode()
+    assert "start_cost" in first and "start" in first["seconds"]
+    assert "start_cost" not in second and first["live"] == "model_based"
+    assert first["real_cost"].item() != first["start_cost"].item()
+
+
+def test_both_architectures_imitate():
+    plant = LinearQuadratic(horizon=2.0)
+    other = SaturatedMLP(2, plant.actions, hidden=(8,), generator=torch.Generator().manual_seed(0))
+    report = twinning(model_free=other).start()
+    assert 0.0 < report["start_error_model_free"] < 0.05 and report["start_error_model_based"] < 1e-3
+
+
+@pytest.mark.parametrize("arm", ["model_free", "model_based"])
+def test_each_half_alone_begins_with_it(arm):
+    found = twinning(arm=arm)
+    closure = found.twin.closure.matrix.detach().clone()
+    found.episode()
+    assert torch.equal(closure, found.twin.closure.matrix) == (arm == "model_free")
+    assert found.referee.live == arm and (len(found.virtual.processes) > 0) == (arm == "model_based")
+
+
+def test_a_harmful_controller_is_not_imitated():
+    found = twinning(gains=(1e-6, 30.0))
+    before = found.policies["model_based"].gain.detach().clone()
+    assert "does not imitate the controller" in found.start()["reason"]
+    assert torch.equal(before, found.policies["model_based"].gain)
+
+
+def test_the_next_plan_is_the_best_of_both_starts():
+    """From the controller no iteration is allowed to help; the other start is the optimum already."""
+    found = twinning()
+    found.start()
+    (other,) = found.planning.others
+    best = {"gain": torch.tensor([[0.9, 1.1]], dtype=torch.float64)}
+    worst = {"gain": torch.tensor([[-0.5, -0.5]], dtype=torch.float64)}
+    judged_on, costs = found.virtual.draw(50), []
+    for weights, kept in ((worst, False), (best, True)):
+        found.planning.others = [weights]
+        before = found.policies["model_based"].gain.detach().clone()
+        found.plan()
+        now = found.policies["model_based"].gain.detach()
+        assert torch.equal(now, weights["gain"] if kept else before) and not found.planning.others
+        costs.append(found.virtual.cost(found.policies["model_based"], judged_on).item())
+    assert set(other) == {"gain"} and costs[1] < costs[0]
+
+
+def run(folder, **options):
+    config = RunConfig(
+        episodes=2, log_dir=folder, compiled=False, unseen=3, untrained=0, figures=False, twinning=SMALL, **options
+    )
+    return Run(config, LinearQuadratic(horizon=2.0), first=PD)
+
+
+def test_a_run_begins_with_the_controller_once(tmp_path):
+    metrics = run(tmp_path, start="controller").train()
+    first, second = metrics["episodes"]
+    assert first["start_cost"] > 0.0 and "start_cost" not in second
+    assert '"start": "controller"' in (tmp_path / "config.json").read_text()
+
+
+def test_a_run_begins_at_random_without_being_asked(tmp_path):
+    assert "start_cost" not in run(tmp_path).train()["episodes"][0]
+
+
+def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):
+    config = RunConfig(log_dir=tmp_path / "run", start="controller")
+    with pytest.raises(ValueError, match=r"start='controller' needs the controller: give Run\(..., first=...\)"):
+        Run(config, LinearQuadratic(horizon=2.0))
+    assert not (tmp_path / "run").exists()
