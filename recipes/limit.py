@@ -2,9 +2,13 @@
 
 import dataclasses
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 import torch
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import minimize
 from torch import Tensor
 
 from rt_torchrl.baselines.classical import ClassicalController
@@ -41,6 +40,8 @@ def tune(
     Raises:
         ValueError: if the controller has no gains, or an argument is out of its range.
     """
+    from scipy.optimize import minimize  # here, because it takes a second to load and --help need not wait for it
+
     if not len(controller.log_gains):
         raise ValueError(f"controller {type(controller).__name__} has no gains to tune.")
     if evaluations < 1 or not spread > 1.0:
