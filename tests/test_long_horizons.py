@@ -31,8 +31,8 @@ def test_a_neural_ode_of_64_states_over_100_000_steps_fits_in_4_gib():
 
 
 @pytest.mark.nightly
-def test_a_thousand_flights_of_100_000_steps_fit_in_16_gib():
-    """A day's machine has 24 GiB. The winds alone take 0.75 GiB, and the gradient by them as much."""
+def test_a_thousand_flights_of_100_000_steps_fit_in_8_gib():
+    """The winds alone take 0.75 GiB, and the gradient by them as much."""
     found = found_by("long_drone.py", 1000, 100_000)
-    assert found["peak"] < 16.0
-    assert found["slope"] == pytest.approx(found["difference"], rel=1e-4)
+    assert found["peak"] < 8.0
+    assert found["slope"] == pytest.approx(found["difference"], rel=1e-6)
