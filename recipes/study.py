@@ -1,5 +1,6 @@
 """The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
 
+import importlib
 import shutil
 import sys
 from dataclasses import dataclass, replace
@@ -289,6 +290,7 @@ def command(config: Config) -> str:
 
 
 def main(config: Config) -> None:
+    importlib.import_module("rt_torchrl.study.report")  # a package that it lacks is missed now, not after the trainings
     compute(config)
     print(f"report in {write(config)}")
 
