@@ -10,16 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+
 from benchmarking import cores, fresh_process
 from benchmarking.case import Case, ClosureKind, PlantName, PolicyKind, system_of
 from benchmarking.contenders import Contenders, Jax
-from benchmarking.figures import save_figures
 from benchmarking.sizes import Grid
 from benchmarking.summary import Summary
 from benchmarking.tables import start_table, time_table, training_table, update_table
 from benchmarking.timing import Cell, Stopwatch
 from benchmarking.trainings import seconds_of_steps
-from benchmarking.updates import milliseconds_of_update
 
 from rt_torchrl import Engine, main_of
 from rt_torchrl.trajectories.rollout import ENGINES
@@ -192,6 +193,8 @@ class Benchmark:
             self.trainings[name] = steps
 
     def _updates(self) -> None:
+        from benchmarking.updates import milliseconds_of_update  # here, because --help need not wait for TorchRL
+
         config = self.config
         for plant in config.plants:
             if not self._late("updates", f"update, {plant}"):
@@ -225,6 +228,8 @@ class Benchmark:
         result |= {"out_of_time": self.out_of_time, "summary": self.summary()}
         (self.folder / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         (self.folder / "benchmark.txt").write_text(self.report() + "\n", encoding="utf-8")
+        from benchmarking.figures import save_figures  # here, because --help need not wait for Matplotlib
+
         save_figures(self.stopwatch.cells, self.folder)
 
 

@@ -1,9 +1,13 @@
 """Reinforcement twinning of the cryogenic tank (paper, sections 5.3 and 6.4)."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 from torch import nn
 
@@ -24,6 +28,11 @@ from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rt_torchrl import Snapshot
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T3; T_J and T_w are the library's defaults.
@@ -165,13 +174,17 @@ class Config(RunConfig):
         return fouled
 
 
+def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
+    from rt_torchrl.envs.cryogenic_tank import figures  # here, because an episode need not wait for Matplotlib
+
+    return figures.figures_of(snapshot)
+
+
 def main(config: Config) -> None:
-    # Here, because --help need not wait for TorchRL and Matplotlib.
-    from rt_torchrl import Run
-    from rt_torchrl.envs.cryogenic_tank import figures
+    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
     baselines = {"on-off": OnOffValve, "PI": PIValve}
-    Run(config, config.plant(), plant_figures=figures.figures_of, baselines=baselines, first=PIValve).train()
+    Run(config, config.plant(), plant_figures=plant_figures, baselines=baselines, first=PIValve).train()
 
 
 if __name__ == "__main__":

@@ -1,9 +1,13 @@
 """Export from a run folder: a trained policy, the controller around it, or the twin."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 from tyro.conf import Positional
 

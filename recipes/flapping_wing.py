@@ -1,8 +1,13 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
 import dataclasses
+import sys
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 from rt_torchrl import (
     AssimilationConfig,
@@ -22,9 +27,15 @@ from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rt_torchrl import Snapshot
+
 # Commands of a tenth of a beat; a plan of a second is made twice a beat.
 PREDICTIVE = PredictiveConfig(horizon=1.0, hold=5e-3, period=0.025, iterations=30, tolerance=1e-5, forecast="held")
 """Model predictive control with ``--twinning.planner.method receding_horizon``."""
+
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T2; N_z, T_J and T_w are the library's defaults.
     # Seconds decide a flight, and whole wing beats move it: the noise lasts a beat, returns span half a second and the
@@ -156,20 +167,29 @@ class Config(RunConfig):
         return self.plant(BELIEVED) if self.model_error else None
 
 
-def main(config: Config) -> None:
-    # Here, because --help need not wait for TorchRL and Matplotlib.
-    from rt_torchrl import Run
-    from rt_torchrl.envs.flapping_wing import figures
+def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
+    from rt_torchrl.envs.flapping_wing import figures  # here, because an episode need not wait for Matplotlib
+
+    return figures.figures_of(snapshot)
+
+
+def animate(snapshot: "Snapshot", path: Path) -> None:
     from rt_torchrl.envs.flapping_wing.animation import save_animation
+
+    save_animation(snapshot, path)
+
+
+def main(config: Config) -> None:
+    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
     Run(
         config,
         config.plant(),
         believed=config.believed(),
-        plant_figures=figures.figures_of,
+        plant_figures=plant_figures,
         baselines={"PD": TrimmedPD},
         first=TrimmedPD,
-        animate=save_animation,
+        animate=animate,
     ).train()
 
 

@@ -1,9 +1,13 @@
 """How far from the best possible is this? The clairvoyant optimum of a plant, and controllers beside it."""
 
 import dataclasses
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 import torch
 

@@ -1,7 +1,11 @@
 """Reinforcement twinning of Gymnasium's pendulum, a real system that is not this library's own."""
 
+import sys
 from dataclasses import dataclass, field
 from typing import Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 from rt_torchrl import (
     AssimilationConfig,

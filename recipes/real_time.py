@@ -1,9 +1,13 @@
 """Rehearse model predictive control on a fitted twin in real time, behind a safety layer."""
 
 import dataclasses
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 import numpy as np
 import torch

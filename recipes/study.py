@@ -1,25 +1,31 @@
 """The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
 
+import importlib
 import shutil
+import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 from rt_torchrl import ClassicalController, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
-from rt_torchrl.study import captions, report
-from rt_torchrl.study import figures as charts
+from rt_torchrl.study import captions
 from rt_torchrl.study.names import title
-from rt_torchrl.study.report import CaptionedFigure
 from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.task import Task
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
 from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, cost_over_episodes, oracle
+
+if TYPE_CHECKING:
+    from rt_torchrl.study.report import CaptionedFigure
 
 ARMS = ("twinning", "model_free", "model_based")
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
@@ -246,8 +252,11 @@ def gather(config: Config) -> Results:
     return results
 
 
-def draw(config: Config, results: Results) -> list[CaptionedFigure]:
+def draw(config: Config, results: Results) -> list["CaptionedFigure"]:
     """Draw the figures of the study, copy those of the first twinning run of each plant, and add captions."""
+    from rt_torchrl.study import figures as charts  # here, because --help need not wait for Matplotlib
+    from rt_torchrl.study.report import CaptionedFigure
+
     place = Path("figures")
     folder = config.kept / place
     folder.mkdir(parents=True, exist_ok=True)
@@ -276,6 +285,8 @@ def draw(config: Config, results: Results) -> list[CaptionedFigure]:
 
 def write(config: Config) -> Path:
     """Write the report as Markdown, HTML, figures and ``study.json``; return the path of the page."""
+    from rt_torchrl.study import report
+
     results = gather(config)
     figures = draw(config, results)
     return report.write(config.kept, results, figures=figures, quick=config.quick, command=command(config))[1]
@@ -289,6 +300,7 @@ def command(config: Config) -> str:
 
 
 def main(config: Config) -> None:
+    importlib.import_module("rt_torchrl.study.report")  # a package that it lacks is missed now, not after the trainings
     compute(config)
     print(f"report in {write(config)}")
 

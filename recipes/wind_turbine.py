@@ -1,10 +1,14 @@
 """Reinforcement twinning of the NREL 5-MW wind turbine (paper, sections 5.1 and 6.2)."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 import torch
 from torch import nn
@@ -27,6 +31,11 @@ from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
 from rt_torchrl.envs.wind_turbine.wear import worn_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rt_torchrl import Snapshot
 
 PAPER = TwinningConfig(
     # Table 1 of the paper, row T1: N_z, n_Q, n_A, n_G, n_mb, P_pi, P_w, T_J and T_w are the library's defaults.
@@ -171,17 +180,21 @@ class Config(RunConfig):
         return lambda episode: plant.closure if episode < middle else worn
 
 
+def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
+    from rt_torchrl.envs.wind_turbine import figures  # here, because an episode need not wait for Matplotlib
+
+    return figures.figures_of(snapshot)
+
+
 def main(config: Config) -> None:
-    # Here, because --help need not wait for TorchRL and Matplotlib.
-    from rt_torchrl import Run
-    from rt_torchrl.envs.wind_turbine import figures
+    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
     from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
 
     plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
     if config.real == "rosco":
         env = rosco_turbine(plant, seed=config.seed, device=require_device(config.device))
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
-    Run(config, plant, plant_figures=figures.figures_of, first=JonkmanController, **system).train()
+    Run(config, plant, plant_figures=plant_figures, first=JonkmanController, **system).train()
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 from benchmarking.timing import Cell
-from rt_torchrl.figures.style import STEPS
 
 HEADER = (
     f"{'steps':>7} {'batch':>6} {'thr':>3} {'':<9}{'contender':<15} "
@@ -43,6 +42,8 @@ def start_table(starts: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
 
 def training_table(trainings: Mapping[str, Sequence[float]]) -> str:
     """Seconds of each step of the algorithm in an episode of a short training."""
+    from rt_torchrl.figures.style import STEPS  # here, because --help need not wait for Matplotlib
+
     short = [step.replace("_", " ") for step in STEPS]
     lines = [f"{'s per episode, steps 1 to 6':<31} " + " ".join(f"{step:>18}" for step in short)]
     lines += [f"{name:<31} " + " ".join(f"{value:18.3f}" for value in row) for name, row in trainings.items()]

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 from rt_torchrl import Engine
-from rt_torchrl.figures.style import STEPS
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 
 RECIPES = Path(__file__).resolve().parent.parent
@@ -24,6 +23,8 @@ def seconds_of_steps(plant: str, engine: Engine, folder: Path, episodes: int, *,
         episodes: number of episodes.
         compiled: whether to compile.
     """
+    from rt_torchrl.figures.style import STEPS  # here, because --help need not wait for Matplotlib
+
     recipe = load_recipe(RECIPES / f"{plant}.py")
     options = ["--quick", "--episodes", str(episodes), "--engine", engine, "--log-dir", str(folder), "--overwrite"]
     options += ["--no-figures", "--untrained", "0", "--unseen-every", "0", "--threads", "1"]

@@ -40,7 +40,7 @@ def tune(
     Raises:
         ValueError: if the controller has no gains, or an argument is out of its range.
     """
-    from scipy.optimize import minimize  # here, because the help of a recipe need not wait for it
+    from scipy.optimize import minimize  # here, because it takes a second to load and --help need not wait for it
 
     if not len(controller.log_gains):
         raise ValueError(f"controller {type(controller).__name__} has no gains to tune.")

@@ -1,7 +1,7 @@
 """The snapshot of a training after an episode, which figures are drawn from."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -9,8 +9,10 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.referees import Role
+
+if TYPE_CHECKING:
+    from rt_torchrl.twinning.algorithm import ReinforcementTwinning  # only its type: it loads TorchRL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +48,7 @@ class Snapshot:
     @classmethod
     @torch.no_grad()
     def take(
-        cls, algorithm: ReinforcementTwinning, initial_closure: nn.Module, episodes: list[dict[str, Any]]
+        cls, algorithm: "ReinforcementTwinning", initial_closure: nn.Module, episodes: list[dict[str, Any]]
     ) -> "Snapshot":
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin

@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
 
 TAGS = {
     "real_cost": "cost/real episode (live policy)",
@@ -64,7 +66,7 @@ class Dashboard:
         for name, seconds in record["seconds"].items():
             self._writer.add_scalar(f"seconds/{name}", seconds, step)
 
-    def figures(self, figures: Mapping[str, Figure], step: int) -> None:
+    def figures(self, figures: Mapping[str, "Figure"], step: int) -> None:
         """Write the figures of an episode, whose number is ``step``."""
         for name, figure in figures.items():
             self._writer.add_figure(name, figure, step, close=False)

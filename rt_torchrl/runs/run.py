@@ -6,10 +6,9 @@ import io
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from matplotlib.figure import Figure
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
@@ -41,9 +40,12 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.cloning import of_each_role
 from rt_torchrl.twinning.referees import Role
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # only its type: a run loads Matplotlib when it draws
+
 CHECKED_STEPS = 10
 """Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
-PlantFigures = Callable[[Snapshot], dict[str, Figure]]
+PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
 
 
 class Run:
@@ -245,7 +247,7 @@ class Run:
     def _snapshot(self) -> Snapshot:
         return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
 
-    def _figures(self, snapshot: Snapshot) -> dict[str, Figure]:
+    def _figures(self, snapshot: Snapshot) -> dict[str, "Figure"]:
         return figures.figures_of(snapshot) | self.plant_figures(snapshot)
 
     def _draw(self, dashboard: Dashboard, judged: dict[str, Judged]) -> None:

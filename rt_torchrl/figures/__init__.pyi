@@ -1,0 +1,21 @@
+"""The figures of a training; ``__init__.py`` imports each at its first use, from the module named here."""
+
+from .episode import actions, exogenous, states
+from .learning import closure_weights, learning_curves, seconds
+from .overview import figures_of
+from .policy import policy_contours
+from .snapshot import Snapshot
+from .unseen_episodes import unseen
+
+__all__ = [
+    "Snapshot",
+    "actions",
+    "closure_weights",
+    "exogenous",
+    "figures_of",
+    "learning_curves",
+    "policy_contours",
+    "seconds",
+    "states",
+    "unseen",
+]

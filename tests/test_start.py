@@ -1,0 +1,58 @@
+"""Between a command and its first episode, a recipe loads nothing that this episode does not use."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FIRST_EPISODE = """
+import os, runpy, sys
+from rt_torchrl import atomic_file
+
+write = atomic_file.write_atomically
+
+def until_checkpoint(path, content):
+    if path.name != "checkpoint.pt":  # which is written at the end of an episode
+        return write(path, content)
+    late = ("matplotlib", "ray._raylet", "onnx", "jax", "casadi", "gymnasium", "torch._inductor.compile_fx",
+            "torchrl.collectors")
+    print("late:", [name for name in late if name in sys.modules], flush=True)
+    os._exit(0)
+
+atomic_file.write_atomically = until_checkpoint
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        "wind_turbine",
+        pytest.param("flapping_wing", marks=pytest.mark.slow),
+        pytest.param("cryogenic_tank", marks=pytest.mark.slow),
+    ],
+)
+def test_the_first_episode_loads_neither_matplotlib_nor_ray(recipe, tmp_path):
+    code = f"import sys; sys.argv = sys.argv[1:]\n{FIRST_EPISODE}"
+    options = ["--quick", "--figures-every", "2", "--threads", "1", "--log-dir", str(tmp_path / "run")]
+    command = [sys.executable, "-c", code, str(ROOT / "recipes" / f"{recipe}.py"), *options]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["late: []"], done.stdout + done.stderr
+
+
+def test_every_recipe_says_that_it_starts_before_it_loads_pytorch():
+    """The import of PyTorch fails here; it comes after the line, or the line would be missing."""
+    code = (
+        "import contextlib, runpy, sys\n"
+        "sys.modules['torch'] = None\n"
+        "for path in sys.argv[1:]:\n"
+        "    sys.path.insert(0, 'recipes')\n"
+        "    with contextlib.suppress(ImportError):\n"
+        "        runpy.run_path(path, run_name='__main__')\n"
+        "    print('ended', file=sys.stderr)"
+    )
+    recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py"))]
+    done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr.splitlines() == ["loading PyTorch and TorchRL", "ended"] * len(recipes), done.stderr
