@@ -56,7 +56,7 @@ def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
     chosen, values = (x.movedim(dim, -1) for x in (tracer.cells(index), source))
     for at in product(*map(range, chosen.shape)):
         for j in range(found.shape[-1]):
-            hit = p.compare("oeq", int(chosen[at]), p.constant(float(j)))
+            hit = p.apply("eq", int(chosen[at]), p.constant(float(j)))
             there = (*at[:-1], j)
             found[there] = p.select(hit, int(values[at]), int(found[there]))
     return found.movedim(-1, dim)
@@ -87,7 +87,7 @@ def _added(tracer: Tracer, target: Tensor, places: Tensor, values: Tensor) -> Te
     for place, value in zip(
         places.flatten().tolist(), values[tuple(map(slice, places.shape))].flatten().tolist(), strict=True
     ):
-        found[place] = tracer.program.add(found[place], value)
+        found[place] = tracer.program.apply("add", found[place], value)
     return torch.tensor(found, dtype=torch.int64).view(target.shape)
 
 
