@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rt_torchrl.programs.lowering import Lowering
-from rt_torchrl.programs.operations import FORMS, FUNCTIONS
+from rt_torchrl.programs.operations import FORMS
 from rt_torchrl.programs.program import Program
 from rt_torchrl.programs.vector_functions import Lanes, symbol
 
@@ -55,30 +55,19 @@ class LaneWriter:
         types = {"number": self.vector, "truth": self.mask, "lanes": self.lanes.number}
         if name in FORMS:
             return self.emit(FORMS[name].llvm.format(*operands, **types))
-        arguments = ", ".join(f"{self.vector} {a}" for a in operands)
-        return self.emit(f"call {self.vector} @{self._function(name)}({arguments})")
-
-    def _function(self, name: str) -> str:
-        """The name of a mathematical function for lanes, which is declared; where there is none, one is defined."""
-        found, arguments = symbol(name, self.lanes), ", ".join([self.vector] * FUNCTIONS[name])
-        if found:
-            self.globals[found] = f"declare {self.vector} @{found}({arguments}) {PURE}"
-            return found
-        found, scalars = f"lanes.{name}", ", ".join(["double"] * FUNCTIONS[name])
-        self.globals[name] = f"declare double @{name}({scalars}) {PURE}"
-        self.globals[found] = self._lane_by_lane(name, found)
-        return found
-
-    def _lane_by_lane(self, name: str, found: str) -> str:
-        arguments, lines, result = range(FUNCTIONS[name]), [], "poison"
+        vector_function = symbol(name, self.lanes)
+        if vector_function:
+            return self._call(vector_function, self.vector, operands)
+        result = "poison"
         for lane in range(self.lanes.number):
-            lines += [f"  %x{a}.{lane} = extractelement {self.vector} %x{a}, i32 {lane}" for a in arguments]
-            given = ", ".join(f"double %x{a}.{lane}" for a in arguments)
-            lines.append(f"  %y{lane} = call double @{name}({given})")
-            lines.append(f"  %z{lane} = insertelement {self.vector} {result}, double %y{lane}, i32 {lane}")
-            result = f"%z{lane}"
-        parameters, text = ", ".join(f"{self.vector} %x{a}" for a in arguments), "\n".join(lines)
-        return f"define internal {self.vector} @{found}({parameters}) {{\n{text}\n  ret {self.vector} {result}\n}}"
+            given = [self.emit(f"extractelement {self.vector} {a}, i32 {lane}") for a in operands]
+            one = self._call(name, "double", given)
+            result = self.emit(f"insertelement {self.vector} {result}, double {one}, i32 {lane}")
+        return result
+
+    def _call(self, name: str, kind: str, operands: Sequence[str]) -> str:
+        self.globals[name] = f"declare {kind} @{name}({', '.join([kind] * len(operands))}) {PURE}"
+        return self.emit(f"call {kind} @{name}({', '.join(f'{kind} {a}' for a in operands)})")
 
     # Memory
 
