@@ -10,8 +10,6 @@ from torch import Tensor
 from rt_torchrl.programs.operations import COMPARISONS
 
 Kind = Literal["number", "truth", "array"]
-LEAST_DIVISOR = 2.0**-1022
-"""Least divisor whose reciprocal is finite."""
 HIGHEST_POWER = 8
 """Greatest integer exponent of a power that becomes a product."""
 
@@ -143,51 +141,30 @@ class Program:
             return SIMPLER[name](self, *numbers)
         return self.new(name, *numbers, kind="truth" if name in COMPARISONS else "number")
 
-    def _negated(self, a: int) -> int | None:
-        """The value that another one is the negative of."""
-        operation = self.operations[a]
-        return operation.operands[0] if operation.name == "neg" else None
-
-    def _neg(self, a: int) -> int:
-        positive = self._negated(a)
-        return self.new("neg", a) if positive is None else positive
+    def _is_nothing(self, a: int, *, subtracted: bool = False) -> bool:
+        """Whether a value is a zero that a sum does not need: 0 − 0 is 0, but −0 + 0 is not −0."""
+        x = self.number(a)
+        return x == 0.0 and (self.differentiating or (math.copysign(1.0, x) > 0.0) == subtracted)
 
     def _add(self, a: int, b: int) -> int:
-        for x, other in ((self.number(a), b), (self.number(b), a)):
-            if x == 0.0 and (self.differentiating or math.copysign(1.0, x) < 0.0):  # −0 + 0 is 0
-                return other
-        for positive, other in ((self._negated(b), a), (self._negated(a), b)):
-            if positive is not None:
-                return self.apply("sub", other, positive)
+        if self._is_nothing(a) or self._is_nothing(b):
+            return b if self._is_nothing(a) else a
         return self.new("add", *sorted((a, b)))
 
     def _sub(self, a: int, b: int) -> int:
-        x, y, positive = self.number(a), self.number(b), self._negated(b)
-        if y == 0.0 and (self.differentiating or math.copysign(1.0, y) > 0.0):
+        if self._is_nothing(b, subtracted=True):
             return a
-        if x == 0.0 and (self.differentiating or math.copysign(1.0, x) < 0.0):  # 0 − 0 is 0, and not −0
-            return self.apply("neg", b)
-        return self.new("sub", a, b) if positive is None else self.apply("add", a, positive)
+        return self.new("neg", b) if self._is_nothing(a) else self.new("sub", a, b)
 
     def _mul(self, a: int, b: int) -> int:
         a, b = sorted((a, b), key=lambda v: (self.number(v) is None, v))
         x = self.number(a)
         if x == 0.0 and self.differentiating:
             return a
-        if x is not None and abs(x) == 1.0:
-            return b if x > 0.0 else self.apply("neg", b)
-        for positive, other in ((self._negated(a), b), (self._negated(b), a)):
-            if positive is not None:
-                return self.apply("neg", self.apply("mul", positive, other))
-        return self.new("mul", a, b)
+        return b if x == 1.0 else self.new("mul", a, b)
 
     def _div(self, a: int, b: int) -> int:
-        x, y = self.number(a), self.number(b)
-        if x == 0.0 and self.differentiating:
-            return a
-        if y is not None and abs(math.frexp(y)[0]) == 0.5 and abs(y) >= LEAST_DIVISOR:
-            return self.apply("mul", a, self.constant(1.0 / y))  # the reciprocal of a power of two is exact
-        return self.new("div", a, b)
+        return a if self.number(a) == 0.0 and self.differentiating else self.new("div", a, b)
 
     def _pow(self, a: int, b: int) -> int:
         y, one = self.number(b), self.constant(1.0)
@@ -218,7 +195,6 @@ class Program:
 
 
 SIMPLER: dict[str, Callable[..., int]] = {
-    "neg": Program._neg,
     "add": Program._add,
     "sub": Program._sub,
     "mul": Program._mul,
