@@ -76,7 +76,7 @@ class CWriter:
 
     def __init__(self, tables: dict[str, str]):
         self.lines: list[str] = []
-        self._tables, self._places = tables, dict[tuple[str, int], str]()
+        self._tables = tables
         self._count, self._depth = 0, 0
 
     def _new(self, kind: str, text: str) -> str:
@@ -117,13 +117,8 @@ class CWriter:
     def store(self, array: str, index: str, operand: str) -> None:
         self._emit(f"{array}[{index}] = {operand};")
 
-    def look_up(self, table: str, size: int, place: str, offset: int) -> str:
-        """The number at a place of a table; outside of it, and for NaN, a look-up is NaN."""
-        if (place, size) not in self._places:
-            inside = f"{place} >= 0.0 && {place} < {literal(float(size))}"
-            self._places[place, size] = self._new("const int", f" = {inside} ? (int){place} : -1")
-        at = self._places[place, size]
-        return self._new("const double", f" = {at} < 0 ? NAN : {table}[{self.index(offset, [(1, at)])}]")
+    def look_up(self, table: str, place: str, offset: int) -> str:
+        return self._new("const double", f" = {table}[{self.index(offset, [(1, f'(int){place}')])}]")
 
     @contextmanager
     def loop(self, count: int) -> Iterator[str]:

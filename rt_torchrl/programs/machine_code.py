@@ -35,7 +35,6 @@ class LaneWriter:
         self.body: list[str] = []
         self.globals: dict[str, str] = {}
         self._count = self._stack = 0
-        self._places: dict[str, str] = {}
 
     def fresh(self) -> str:
         """A new name."""
@@ -112,27 +111,16 @@ class LaneWriter:
         place = self.emit(f"getelementptr {self.vector}, ptr {array}, i64 {index}")
         self.body.append(f"store {self.vector} {operand}, ptr {place}, {WIDTH}")
 
-    def look_up(self, table: str, size: int, place: str, offset: int) -> str:
-        n, (inside, index) = self.lanes.number, self._place(size, place)
+    def look_up(self, table: str, place: str, offset: int) -> str:
+        n = self.lanes.number
+        short = self.emit(f"fptosi {self.vector} {place} to <{n} x i32>")
+        index = self.emit(f"sext <{n} x i32> {short} to <{n} x i64>")
         base = f"getelementptr (double, ptr {table}, i64 {offset})"
         places = self.emit(f"getelementptr double, ptr {base}, <{n} x i64> {index}")
-        nan = self.constant(float("nan"), truth=False)
-        given = f"<{n} x ptr> {places}, i32 8, {self.mask} {inside}, {self.vector} {nan}"
+        given = f"<{n} x ptr> {places}, i32 8, {self.mask} splat (i1 true), {self.vector} poison"
         gather = f"llvm.masked.gather.v{n}f64.v{n}p0"
         self.globals[gather] = f"declare {self.vector} @{gather}(<{n} x ptr>, i32, {self.mask}, {self.vector})"
         return self.emit(f"call {self.vector} @{gather}({given})")
-
-    def _place(self, size: int, place: str) -> tuple[str, str]:
-        """Which lanes are inside a table, and their integer places; outside of it, and for NaN, a look-up is NaN."""
-        n = self.lanes.number
-        if f"{place}:{size}" not in self._places:
-            zero, end = (self.constant(float(x), truth=False) for x in (0, size))
-            inside = self.compute("and", self.compute("ge", place, zero), self.compute("lt", place, end))
-            safe = self.compute("select", inside, place, zero)
-            short = self.emit(f"fptosi {self.vector} {safe} to <{n} x i32>")
-            self._places[f"{place}:{size}"] = f"{inside} {self.emit(f'sext <{n} x i32> {short} to <{n} x i64>')}"
-        inside, index = self._places[f"{place}:{size}"].split()
-        return inside, index
 
     # Loops
 

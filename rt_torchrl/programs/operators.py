@@ -162,16 +162,17 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
     table, rest = tracer.table(numbers), math.prod(source.shape[len(given) :])
     strides = torch.empty(source.shape, device="meta").stride()
     spread = torch.broadcast_tensors(*(tracer.cells(i) for i in given))
-    found = []
+    zero, nan, found = p.constant(0.0), p.constant(math.nan), []
     for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
-        place = p.constant(0.0)
+        place, inside = zero, []
         for index, size, stride in zip(at, source.shape, strides, strict=False):
             first, end = p.constant(-float(size)), p.constant(float(size))
-            inside = p.logic("and", p.apply("ge", index, first), p.apply("lt", index, end))
-            wrapped = p.select(p.apply("lt", index, p.constant(0.0)), p.apply("add", index, end), index)
-            safe = p.select(inside, wrapped, p.constant(math.nan))
+            inside.append(p.logic("and", p.apply("ge", index, first), p.apply("lt", index, end)))
+            wrapped = p.select(p.apply("lt", index, zero), p.apply("add", index, end), index)
+            safe = p.select(inside[-1], wrapped, zero)
             place = p.apply("add", place, p.apply("mul", safe, p.constant(float(stride))))
-        found += [p.new("look_up", table, place, attributes=(r,)) for r in range(rest)]
+        numbers_there = (p.new("look_up", table, place, attributes=(r,)) for r in range(rest))
+        found += [p.select(reduce(partial(p.logic, "and"), inside), x, nan) for x in numbers_there]
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 

@@ -114,19 +114,14 @@ class Program:
         return self.new("select", condition, a, b)
 
     def logic(self, how: str, *operands: int) -> int:
-        a, *rest = (self.as_truth(x) for x in operands)
-        if how == "not":
-            known = self.number(a)
-            return self.constant(not known) if known is not None else self.new("not", a, kind="truth")
-        (b,) = rest
-        for known, other in ((self.number(a), b), (self.number(b), a)):
-            if known is None:
-                continue
-            if how == "xor":
-                return self.logic("not", other) if known else other
-            absorbs = known == (how == "or")
-            return self.constant(bool(known)) if absorbs else other
-        return a if a == b and how != "xor" else self.new(how, *sorted((a, b)), kind="truth")
+        """``and``, ``or``, ``xor`` or ``not``."""
+        truths = [self.as_truth(a) for a in operands]
+        known = [self.number(a) for a in truths]
+        if None not in known:
+            return self.constant(getattr(torch, f"logical_{how}")(*map(torch.tensor, known)).item())
+        if (how == "and" and 0.0 in known) or (how == "or" and 1.0 in known):
+            return self.constant(how == "or")
+        return self.new(how, *sorted(truths), kind="truth")
 
     # Arithmetic
 
