@@ -37,7 +37,7 @@ class ObjectCode:
 
     def __call__(self, *arguments: np.ndarray | int) -> None:
         """Run the function; of an array, whose numbers lie side by side, it gets the address."""
-        self._function(*(x if isinstance(x, int) else _memory_of(x) for x in arguments))
+        self._function(*(x if isinstance(x, int) else _memory_of(x.data) for x in arguments))
 
 
 def _compiled(text: str) -> bytes:
