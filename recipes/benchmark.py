@@ -42,7 +42,7 @@ class Config:
         at_horizon: number of control intervals with which the realisations vary.
         at_realisations: number of trajectories with which the horizons vary.
         all_pairs: whether to time all pairs of horizons and realisations instead of these two lines.
-        threads: numbers of CPU threads; on Linux JAX has as many cores.
+        threads: numbers of CPU threads, which take turns; on Linux JAX has as many cores.
         engines: gradient engines; those that cannot roll a plant out are left out. Ratios are of native, or else of the
             first one.
         jax: jax_scan for one scan that JAX differentiates, jax_sweep for a reverse sweep by hand; both need the extra
@@ -147,16 +147,15 @@ class Benchmark:
 
     def _times(self) -> None:
         shortest, timed = min(self.config.horizons), set()
-        for size in self.config.grid():
-            where = f"{size.case.name}, {size.threads} threads, {size.steps} x {size.realisations}"
-            if self._late("times", where):
+        for sizes in self.config.grid():
+            if self._late("times", f"{sizes[0].case.name}, {sizes[0].steps} x {sizes[0].realisations}"):
                 continue
-            found = self.stopwatch.time(size)
-            timed.add(size)
+            found = self.stopwatch.time(sizes)
+            timed.add(sizes[0])
             slow = list(dict.fromkeys(cell.contender for cell in found if "predicted" in cell.left_out))
-            short = dataclasses.replace(size, steps=shortest)
-            if slow and short not in timed:  # what is too slow is timed over a short horizon, and scaled per step
-                timed.add(short)
+            short = [dataclasses.replace(size, steps=shortest) for size in sizes]
+            if slow and short[0] not in timed:  # what is too slow is timed over a short horizon, and scaled per step
+                timed.add(short[0])
                 self.stopwatch.time(short, slow)
 
     def _starts(self) -> None:

@@ -3,6 +3,7 @@
 import copy
 import functools
 import threading
+import types
 
 import numpy as np
 import pytest
@@ -210,3 +211,13 @@ def test_objects_known_by_address_are_kept_alive():
         kept.append(alive)
         assert found not in seen
         seen.add(found)
+
+
+def test_functions_with_the_same_code_read_globals_of_their_own():
+    first, second = ({"LEVEL": 1.0, "__name__": name} for name in ("first", "second"))
+    code = (lambda self: LEVEL).__code__  # noqa: F821
+    methods = {name: types.FunctionType(code, held) for name, held in (("low", first), ("high", second))}
+    module = type("Levels", (Inner,), methods)()
+    before = fingerprint(module).digest
+    second["LEVEL"] = 2.0
+    assert fingerprint(module).digest != before

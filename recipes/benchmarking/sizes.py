@@ -24,11 +24,11 @@ class Size:
 
 @dataclass(frozen=True)
 class Grid:
-    """Two lines of sizes for each case and number of threads: over horizons and over realisations, or all pairs.
+    """Two lines of sizes for each case: over horizons and over realisations, or all pairs.
 
     Args:
         cases: the cases; the first one matters most.
-        threads: numbers of threads; the first one matters most.
+        threads: numbers of threads, which take turns at each size.
         horizons: numbers of intervals.
         realisations: numbers of realisations.
         at_horizon: horizon of the line over realisations.
@@ -53,13 +53,8 @@ class Grid:
             pairs |= {(self.at_horizon, batch) for batch in self.realisations}
         return sorted(pairs, key=lambda pair: (pair[0] * pair[1], pair))
 
-    def __iter__(self) -> Iterator[Size]:
-        for case, threads in self._rounds():
+    def __iter__(self) -> Iterator[list[Size]]:
+        """Sizes that take turns, because they differ in the threads alone."""
+        for case in self.cases:
             for steps, realisations in self.pairs():
-                yield Size(case, threads, steps, realisations)
-
-    def _rounds(self) -> list[tuple[Case, int]]:
-        first, *others = self.threads
-        # The first case by all threads, the other cases by the first number, and then the rest.
-        rounds = [(self.cases[0], count) for count in self.threads] + [(case, first) for case in self.cases[1:]]
-        return rounds + [(case, count) for count in others for case in self.cases[1:]]
+                yield [Size(case, threads, steps, realisations) for threads in self.threads]

@@ -4,6 +4,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from benchmarking.case import System, scenario_of, system_of
 from benchmarking.contenders import QUANTITIES, Calls, Contenders, Quantity, made_once, quantities_of
 from benchmarking.sizes import Size
 from rt_torchrl import DivergenceError
+
+Runner = tuple[str, Size]
+"""A contender at a size, of which the threads are a part."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class Cell:
         contender: name of the contender.
         quantity: forward for the cost, gradient for its gradient by the policy's weights.
         wall: median wall time [s].
+        least: least wall time [s].
         cpu: median CPU time of the process [s].
         repeats: number of evaluations behind the medians.
         first: wall time of the first evaluation, which may compile [s].
@@ -35,6 +40,7 @@ class Cell:
     contender: str
     quantity: Quantity
     wall: float = float("nan")
+    least: float = float("nan")
     cpu: float = float("nan")
     repeats: int = 0
     first: float = float("nan")
@@ -49,13 +55,13 @@ class Cell:
         where |= {"contender": self.contender, "quantity": self.quantity}
         if self.left_out:
             return where | {"left_out": self.left_out}
-        names = ("wall", "cpu", "repeats", "first", "gap")
+        names = ("wall", "least", "cpu", "repeats", "first", "gap")
         return where | {name: getattr(self, name) for name in names}
 
 
 @dataclass
 class Stopwatch:
-    """Times all contenders at one size after another.
+    """Times all contenders at one size after another; numbers of threads take turns too.
 
     Args:
         contenders: the contenders.
@@ -74,20 +80,21 @@ class Stopwatch:
         self._made = made_once(self.contenders)
         self._systems: dict[Any, System] = {}
 
-    def time(self, size: Size, names: Sequence[str] = ()) -> list[Cell]:
-        """The cells at a size, which are also added to ``cells``.
+    def time(self, sizes: Sequence[Size], names: Sequence[str] = ()) -> list[Cell]:
+        """The cells at sizes that differ in the threads alone; they are also added to ``cells``.
 
         Args:
-            size: size of the problem.
+            sizes: sizes of the problem.
             names: contenders to be timed; by default all.
         """
-        system = self._systems.setdefault(size.case, system_of(size.case))
-        scenario = scenario_of(system.case, size.steps, size.realisations)
+        case, steps, realisations = sizes[0].case, sizes[0].steps, sizes[0].realisations
+        system = self._systems.setdefault(case, system_of(case))
+        scenario = scenario_of(system.case, steps, realisations)
         calls: dict[str, Calls] = {}
         found: list[Cell] = []
         for quantity in QUANTITIES:
-            able = []
-            for name in names or self.contenders.names:
+            able: dict[Runner, Callable[[], Any]] = {}
+            for name, size in product(names or self.contenders.names, sizes):
                 if quantity not in quantities_of(name):
                     continue
                 reason = self.contenders.refusal(name, system) or self._too_long(size, name, quantity)
@@ -96,8 +103,8 @@ class Stopwatch:
                     continue
                 if name not in calls:
                     calls[name] = self._made(name, system).calls(scenario)
-                able.append(name)
-            found += self._in_turn(size, quantity, {name: getattr(calls[name], quantity) for name in able})
+                able[name, size] = getattr(calls[name], quantity)
+            found += self._in_turn(quantity, able)
         self.cells += found
         return found
 
@@ -119,36 +126,39 @@ class Stopwatch:
         seconds = self.predicted(size, name, quantity)
         return f"about {seconds:.3g} s predicted, limit {self.limit:g} s" if seconds > self.limit else ""
 
-    def _in_turn(self, size: Size, quantity: Quantity, functions: dict[str, Callable[[], Any]]) -> list[Cell]:
+    def _in_turn(self, quantity: Quantity, functions: dict[Runner, Callable[[], Any]]) -> list[Cell]:
         results, first = {}, {}
-        wall: dict[str, list[float]] = {name: [] for name in functions}
-        cpu: dict[str, list[float]] = {name: [] for name in functions}
-        with cores.torch_threads(size.threads):
-            for name, function in functions.items():
-                self.tell(f"{size.case.name}: {name}, {quantity}, {size.steps} x {size.realisations}")
+        wall: dict[Runner, list[float]] = {runner: [] for runner in functions}
+        cpu: dict[Runner, list[float]] = {runner: [] for runner in functions}
+        for (name, size), function in functions.items():
+            self.tell(f"{size.case.name}: {name}, {quantity}, {size.steps} x {size.realisations}")
+            with cores.torch_threads(size.threads):
                 start = time.perf_counter()
                 found = _finite(function)
-                if found is not None:
-                    results[name], first[name] = found, time.perf_counter() - start
-            with cores.limited_to(size.threads):
-                for _ in range(self.repeats):
-                    for name in results:
-                        if sum(wall[name]) <= self.limit:
-                            _clock(functions[name], wall[name], cpu[name])
+            if found is not None:
+                results[name, size], first[name, size] = found, time.perf_counter() - start
+        for _ in range(self.repeats):
+            for runner in results:
+                if sum(wall[runner]) <= self.limit:
+                    with cores.torch_threads(runner[1].threads), cores.limited_to(runner[1].threads):
+                        _clock(functions[runner], wall[runner], cpu[runner])
         reference = next(iter(results.values()), None)
-        diverged = [Cell(size, name, quantity, left_out="diverged") for name in functions if name not in results]
+        diverged = [
+            Cell(size, name, quantity, left_out="diverged") for name, size in functions if (name, size) not in results
+        ]
         return diverged + [
             Cell(
                 size,
                 name,
                 quantity,
-                statistics.median(wall[name]),
-                statistics.median(cpu[name]),
-                len(wall[name]),
-                first[name],
-                float(np.linalg.norm(results[name] - reference) / np.linalg.norm(reference)),
+                statistics.median(wall[name, size]),
+                min(wall[name, size]),
+                statistics.median(cpu[name, size]),
+                len(wall[name, size]),
+                first[name, size],
+                float(np.linalg.norm(found - reference) / np.linalg.norm(reference)),
             )
-            for name in results
+            for (name, size), found in results.items()
         ]
 
 

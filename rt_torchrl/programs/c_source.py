@@ -7,14 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rt_torchrl.programs.lowering import Lowering
+from rt_torchrl.programs.operations import FORMS
 from rt_torchrl.programs.program import Program
 
 WIDTH = 110
-INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&&", "or": "||", "xor": "!="}
-COMPARISONS = {"ogt": ">", "olt": "<", "oge": ">=", "ole": "<=", "oeq": "==", "une": "!="}
-"""C's comparisons treat NaN as the program's do: all are false, but != is true."""
-RENAMED = {"abs": "fabs", "round": "rint"}
-"""Functions with another name in math.h; rint rounds halves to even, as torch does."""
 
 
 class CSource:
@@ -52,9 +48,7 @@ class CSource:
         writer = CWriter(self._tables)
         names = {key: f"{key[0]}_{key[1]}" for key in needed}
         writer.lines += [f"const double {name} = {inputs[key]};" for key, name in names.items()]
-        lowering = Lowering(program, writer, names, "weights")
-        lowering.write(values)
-        found = [lowering.operand(value) for value in values]
+        found = Lowering(program, writer, names, "weights").write(values)
         writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, found, strict=True)]
         self.write(head, [*writer.lines, *last])
 
@@ -82,7 +76,7 @@ class CWriter:
 
     def __init__(self, tables: dict[str, str]):
         self.lines: list[str] = []
-        self._tables, self._places = tables, dict[tuple[str, int], str]()
+        self._tables = tables
         self._count, self._depth = 0, 0
 
     def _new(self, kind: str, text: str) -> str:
@@ -93,24 +87,14 @@ class CWriter:
     def _emit(self, line: str) -> None:
         self.lines.append("    " * self._depth + line)
 
-    def constant(self, number: float, *, truth: bool, lanes: bool) -> str:
+    def constant(self, number: float, *, truth: bool) -> str:
         return str(int(number)) if truth else literal(number)
 
-    def compute(self, name: str, operands: Sequence[str], how: str, *, truth: bool, lanes: bool) -> str:
-        if name == "select":
-            text = "{} ? {} : {}".format(*operands)
-        elif len(operands) == 2 and (symbol := INFIX.get(name) or COMPARISONS.get(how)):
-            text = f"{operands[0]} {symbol} {operands[1]}"
-        elif name in ("neg", "not"):
-            text = f"{'-' if name == 'neg' else '!'}{operands[0]}"
-        else:
-            text = f"{RENAMED.get(name, name)}({', '.join(operands)})"
+    def compute(self, name: str, *operands: str, truth: bool = False) -> str:
+        text = FORMS[name].c.format(*operands) if name in FORMS else f"{name}({', '.join(operands)})"
         if self._depth:  # what a loop computes is read once
             return f"({text})"
         return self._new("const int" if truth else "const double", f" = {text}")
-
-    def spread(self, operand: str, *, truth: bool) -> str:
-        return operand
 
     def table(self, numbers: Sequence[float]) -> str:
         return self._tables.setdefault(_wrapped(numbers), f"table_{len(self._tables)}")
@@ -127,19 +111,14 @@ class CWriter:
                 found.append(i if stride == 1 else f"{stride} * {i if i.isidentifier() else f'({i})'}")
         return " + ".join([*found, *([str(base)] if base or not found else [])])
 
-    def load(self, array: str, index: str, *, lanes: bool, stored_lanes: bool) -> str:
+    def load(self, array: str, index: str, *, shared: bool = False) -> str:
         return f"{array}[{index}]"
 
     def store(self, array: str, index: str, operand: str) -> None:
         self._emit(f"{array}[{index}] = {operand};")
 
-    def look_up(self, table: str, size: int, place: str, offset: int) -> str:
-        """The number at a place of a table; outside of it, and for NaN, a look-up is NaN."""
-        if (place, size) not in self._places:
-            inside = f"{place} >= 0.0 && {place} < {literal(float(size))}"
-            self._places[place, size] = self._new("const int", f" = {inside} ? (int){place} : -1")
-        at = self._places[place, size]
-        return self._new("const double", f" = {at} < 0 ? NAN : {table}[{self.index(offset, [(1, at)])}]")
+    def look_up(self, table: str, place: str, offset: int) -> str:
+        return self._new("const double", f" = {table}[{self.index(offset, [(1, f'(int){place}')])}]")
 
     @contextmanager
     def loop(self, count: int) -> Iterator[str]:

@@ -12,37 +12,26 @@ Arguments = tuple[Any, ...]
 Options = dict[str, Any]
 
 
-def _copy_by(operator: Any) -> Rule:
+def _copy_by(name: str) -> Rule:
+    """An operator on the cells; an index, which is its third argument, must be known."""
+    operator = getattr(torch.ops.aten, name)
+
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
         def celled(x: Any) -> Any:
             if isinstance(x, Tensor):
                 return tracer.cells(x)
             return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
 
+        index = args[2:] if name in INDEXED else ()
+        tracer.require_known(f"{name} by an index that varies", index)
         kept = {key: value for key, value in options.items() if key != "memory_format"}
-        return operator(*(celled(a) for a in args), **kept)
+        return operator(*map(celled, args[: len(args) - len(index)]), *index, **kept)
 
     return rule
-
-
-def _copy(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return tracer.cells(args[0])
 
 
 def _overwrite(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     return tracer.cells(args[1])
-
-
-def _pick_by(operator: Any) -> Rule:
-    """Copies from places that are known: ``gather`` and ``index_select``."""
-
-    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-        if tracer.numbers(tracer.cells(args[2])) is None:
-            raise tracer.refuse(f"{operator} by an index that varies")
-        picked: Tensor = operator(tracer.cells(args[0]), *args[1:])
-        return picked
-
-    return rule
 
 
 def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
@@ -56,7 +45,7 @@ def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
     chosen, values = (x.movedim(dim, -1) for x in (tracer.cells(index), source))
     for at in product(*map(range, chosen.shape)):
         for j in range(found.shape[-1]):
-            hit = p.compare("oeq", int(chosen[at]), p.constant(float(j)))
+            hit = p.apply("eq", int(chosen[at]), p.constant(float(j)))
             there = (*at[:-1], j)
             found[there] = p.select(hit, int(values[at]), int(found[there]))
     return found.movedim(-1, dim)
@@ -87,7 +76,7 @@ def _added(tracer: Tracer, target: Tensor, places: Tensor, values: Tensor) -> Te
     for place, value in zip(
         places.flatten().tolist(), values[tuple(map(slice, places.shape))].flatten().tolist(), strict=True
     ):
-        found[place] = tracer.program.add(found[place], value)
+        found[place] = tracer.program.apply("add", found[place], value)
     return torch.tensor(found, dtype=torch.int64).view(target.shape)
 
 
@@ -96,15 +85,14 @@ def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
     return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
 
 
+INDEXED = ("gather", "index_select")
 PLAIN = (
     "cat stack flip roll repeat expand_copy diag_embed slice_scatter select_scatter unfold_copy view_copy permute_copy "
-    "_unsafe_view alias_copy"
+    "_unsafe_view alias_copy clone contiguous lift_fresh lift_fresh_copy"
 ).split()
 COPIES: dict[str, Rule] = {
-    **{name: _copy_by(getattr(torch.ops.aten, name)) for name in PLAIN},
-    **dict.fromkeys(("clone", "contiguous", "lift_fresh", "lift_fresh_copy"), _copy),
+    **{name: _copy_by(name) for name in (*PLAIN, *INDEXED)},
     **dict.fromkeys(("copy", "fill"), _overwrite),
-    **{name: _pick_by(getattr(torch.ops.aten, name)) for name in ("gather", "index_select")},
     "scatter": _scatter,
     "scatter_add": _scatter_add,
     **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.programs.outer_names import DATA, Name, own_classes, read_by, read_by_class
+from rt_torchrl.programs.outer_names import DATA, Name, function_of, own_classes, read_by
 from rt_torchrl.programs.watch import BY_ADDRESS, DICTIONARIES, Watch
 
 PLAIN = frozenset({str, int, float, bool, type(None), tuple, list, dict, OrderedDict, bytes, torch.Size})
@@ -58,10 +58,11 @@ class _Pickler(pickle.Pickler):
 
     def dump_classes(self) -> None:
         """Pickle what the methods of all classes read."""
-        for kind in dict.fromkeys(base for each in self._classes for base in own_classes(each)):
+        kinds = dict.fromkeys(base for each in self._classes for base in own_classes(each))
+        attributes = [attribute for kind in kinds for attribute in vars(kind).values()]
+        for kind in kinds:
             self._watch.note_class(kind)
-            read = read_by_class(kind)
-            self.dump([read.version, *self._values(read.names)])
+        self.dump([*map(self._by_address, attributes), *self._values(read_by(*map(function_of, attributes)))])
 
     def persistent_id(self, obj: Any) -> Any:
         if isinstance(obj, type):

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
 from rt_torchrl.programs.elementwise import ELEMENTWISE
-from rt_torchrl.programs.program import UNIFORM, VARYING, Access, Program
+from rt_torchrl.programs.program import Access, Program
 
 BLOCKS = (8, 6, 5, 4, 3, 2, 1)
 """Numbers of columns of a product of matrices that are summed at once, so that a row is read once for all of them."""
@@ -18,18 +18,17 @@ SHORT = 16
 class Writer(Protocol):
     """A language for lowered programs. Operands, indices and arrays are texts of that language.
 
-    ``lanes`` says whether a value is computed for each lane or once for all.
+    An array that is ``shared`` holds one number for all lanes.
     """
 
-    def constant(self, number: float, *, truth: bool, lanes: bool) -> str: ...
-    def compute(self, name: str, operands: Sequence[str], how: str, *, truth: bool, lanes: bool) -> str: ...
-    def spread(self, operand: str, *, truth: bool) -> str: ...
+    def constant(self, number: float, *, truth: bool) -> str: ...
+    def compute(self, name: str, *operands: str, truth: bool = False) -> str: ...
     def table(self, numbers: Sequence[float]) -> str: ...
     def local(self, size: int) -> str: ...
     def index(self, base: int, terms: Sequence[tuple[int, str]]) -> str: ...
-    def load(self, array: str, index: str, *, lanes: bool, stored_lanes: bool) -> str: ...
+    def load(self, array: str, index: str, *, shared: bool = False) -> str: ...
     def store(self, array: str, index: str, operand: str) -> None: ...
-    def look_up(self, table: str, size: int, place: str, offset: int) -> str: ...
+    def look_up(self, table: str, place: str, offset: int) -> str: ...
     def loop(self, count: int) -> AbstractContextManager[str]: ...
     def variable(self, start: str) -> str: ...
     def get(self, variable: str) -> str: ...
@@ -48,57 +47,52 @@ class Lowering:
 
     def __init__(self, program: Program, writer: Writer, inputs: dict[tuple[str, int], str], weights: str):
         self.program, self.writer, self._inputs, self._weights = program, writer, inputs, weights
-        self._operands: dict[tuple[int, bool], str] = {}
-        self._arrays: dict[int, tuple[str, int, bool]] = {}  # name, offset, whether it holds lanes
+        self._operands: dict[int, str] = {}
+        self._arrays: dict[int, tuple[str, int, bool]] = {}  # name, offset, whether it is shared
 
-    def write(self, outputs: Sequence[int]) -> None:
-        """Write everything that the outputs need."""
+    def write(self, outputs: Sequence[int]) -> list[str]:
+        """Write everything that the outputs need, and give their operands."""
         for value in self.program.needed(outputs):
             if self.program.kinds[value] == "array":
                 self._array(value)
             else:
                 self._scalar(value)
+        return [self.operand(value) for value in outputs]
 
-    def operand(self, value: int, *, lanes: bool = True) -> str:
+    def operand(self, value: int) -> str:
         """The operand of a scalar value that has been written."""
-        key, truth = (value, lanes), self.program.kinds[value] == "truth"
-        if key not in self._operands:
-            number = self.program.number(value)
-            if number is not None:
-                self._operands[key] = self.writer.constant(number, truth=truth, lanes=lanes)
-            else:  # computed once, wanted in every lane
-                self._operands[key] = self.writer.spread(self._operands[value, False], truth=truth)
-        return self._operands[key]
+        number = self.program.number(value)
+        if number is not None:
+            return self.writer.constant(number, truth=self.program.kinds[value] == "truth")
+        return self._operands[value]
 
     def _scalar(self, value: int) -> None:
-        p, (name, operands, attributes) = self.program, self.program.operations[value]
-        lanes = p.levels[value] > UNIFORM
+        p, writer, (name, operands, attributes) = self.program, self.writer, self.program.operations[value]
         if name == "constant":
             return
         if name == "input":
-            self._operands[value, lanes] = self._inputs[attributes]
+            found = self._inputs[attributes]
         elif name == "element":
-            array, offset, stored = self._arrays[operands[0]]
-            index = self.writer.index(offset + attributes[0], ())
-            self._operands[value, lanes] = self.writer.load(array, index, lanes=lanes, stored_lanes=stored)
+            found = self._load(operands[0], attributes[0])
         elif name == "look_up":
-            size = len(p.operations[operands[0]].attributes)
-            place = self.operand(operands[1])
-            table = self._arrays[operands[0]][0]
-            self._operands[value, True] = self.writer.look_up(table, size, place, attributes[0])
+            found = writer.look_up(self._arrays[operands[0]][0], self.operand(operands[1]), attributes[0])
         else:
-            found = [self.operand(a, lanes=lanes) for a in operands]
-            how, truth = str(attributes[0]) if attributes else "", p.kinds[value] == "truth"
-            self._operands[value, lanes] = self.writer.compute(name, found, how, truth=truth, lanes=lanes)
+            found = writer.compute(name, *map(self.operand, operands), truth=p.kinds[value] == "truth")
+        self._operands[value] = found
+
+    def _load(self, value: int, place: int, terms: Sequence[tuple[int, str]] = ()) -> str:
+        """An element of an array that has been written."""
+        array, offset, shared = self._arrays[value]
+        return self.writer.load(array, self.writer.index(offset + place, terms), shared=shared)
 
     # Arrays
 
     def _array(self, value: int) -> None:
         name, operands, attributes = self.program.operations[value]
         if name == "weights":
-            self._arrays[value] = (self._weights, attributes[0], False)
+            self._arrays[value] = (self._weights, attributes[0], True)
         elif name == "table":
-            self._arrays[value] = (self.writer.table([float.fromhex(x) for x in attributes]), 0, False)
+            self._arrays[value] = (self.writer.table([float.fromhex(x) for x in attributes]), 0, True)
         else:
             shapes: dict[str, Callable[..., int]] = {
                 "row": lambda *_: len(operands),
@@ -106,7 +100,7 @@ class Lowering:
                 "product": lambda m, k, n, accesses: m * n,
             }
             array = self.writer.local(shapes[name](*attributes))
-            self._arrays[value] = (array, 0, True)
+            self._arrays[value] = (array, 0, False)
             getattr(self, f"_{name}")(array, operands, *attributes)
 
     def _row(self, array: str, operands: Sequence[int]) -> None:
@@ -131,11 +125,9 @@ class Lowering:
     def _elementwise(self, name: str, operands: Sequence[str]) -> str:
         """An elementwise operator on operands within a loop: a program of its own."""
         body = Program()
-        inputs = [body.new("input", attributes=("x", k), level=VARYING) for k in range(len(operands))]
-        found = ELEMENTWISE[name](body, *inputs)
+        inputs = [body.new("input", attributes=("x", k)) for k in range(len(operands))]
         lowering = Lowering(body, self.writer, {("x", k): operand for k, operand in enumerate(operands)}, "")
-        lowering.write([found])
-        return lowering.operand(found)
+        return lowering.write([ELEMENTWISE[name](body, *inputs)])[0]
 
     def _product(
         self, array: str, operands: Sequence[int], m: int, k: int, n: int, accesses: Sequence[Access | None]
@@ -153,9 +145,7 @@ class Lowering:
                 x = self._read(*a, [i, at])
                 for total, column in zip(totals, columns, strict=True):
                     y = self._read(*b, [at, column])
-                    product = writer.compute("mul", [x, y], "", truth=False, lanes=True)
-                    sum_ = writer.compute("add", [writer.get(total), product], "", truth=False, lanes=True)
-                    writer.put(total, sum_)
+                    writer.put(total, writer.compute("add", writer.get(total), writer.compute("mul", x, y)))
 
             self._loops([k], step)
             for total, column in zip(totals, columns, strict=True):
@@ -166,10 +156,8 @@ class Lowering:
     def _read(self, value: int, access: Access | None, indices: Sequence[str]) -> str:
         if access is None:
             return self.operand(value)
-        array, offset, stored = self._arrays[value]
         terms = [(stride, i) for stride, i in zip(access.strides, indices, strict=True) if stride]
-        at = self.writer.index(offset + access.base, terms)
-        return self.writer.load(array, at, lanes=True, stored_lanes=stored)
+        return self._load(value, access.base, terms)
 
     def _loops(self, counts: Sequence[int], inner: Callable[[list[str]], None]) -> None:
         """Nested loops around ``inner``, which takes their indices."""
@@ -206,5 +194,4 @@ class Lowering:
             first = last + 1
 
     def _add(self, array: str, index: str, operand: str) -> None:
-        held = self.writer.load(array, index, lanes=True, stored_lanes=True)
-        self.writer.store(array, index, self.writer.compute("add", [held, operand], "", truth=False, lanes=True))
+        self.writer.store(array, index, self.writer.compute("add", self.writer.load(array, index), operand))

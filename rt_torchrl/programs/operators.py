@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from itertools import accumulate
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from rt_torchrl.programs.copies import COPIES, Arguments, Options
-from rt_torchrl.programs.program import VARYING, Program
 from rt_torchrl.programs.tracer import STRAIGHT, Rule, Tracer
 
 STRAIGHT_PRODUCT = 200
@@ -26,7 +27,7 @@ def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
     elif out.is_complex():
         raise tracer.refuse("complex numbers")
     elif args[0].is_floating_point() and not out.is_floating_point():
-        convert = lambda i: p.unary("trunc", i)  # noqa: E731
+        convert = partial(p.apply, "trunc")
     else:
         convert = p.as_number
     return torch.tensor([convert(i) for i in source.flatten().tolist()], dtype=torch.int64).view(source.shape)
@@ -54,7 +55,7 @@ def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
     if m * n > 4 * STRAIGHT:
         ones = torch.full((n, 1), p.constant(1.0))
         return matrix_product(tracer, rows, ones).view(out.shape)
-    found = [_folded(p.add, rest, first) for first, *rest in rows.tolist()] if n else [p.constant(0.0)] * m
+    found = [reduce(partial(p.apply, "add"), row) for row in rows.tolist()] if n else [p.constant(0.0)] * m
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
@@ -63,10 +64,10 @@ def _mean(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Ten
     return tracer.pointwise("div", [_sum(tracer, args, options, out), count], out.shape)
 
 
-def _fold(step: Callable[[Program, int, int], int]) -> Rule:
+def _fold(name: str) -> Rule:
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
         rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
-        found = [_folded(lambda a, b: step(tracer.program, a, b), rest, first) for first, *rest in rows]
+        found = [reduce(partial(tracer.program.apply, name), row) for row in rows]
         return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
     return rule
@@ -77,16 +78,16 @@ def _with_place(how: str) -> Rule:
 
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
         p, found = tracer.program, []
-        name = "maximum" if how == "ogt" else "minimum"
+        name = "maximum" if how == "gt" else "minimum"
         if isinstance(out, Tensor) and len(args) == 1:
-            return _fold(lambda p, a, b: p.extreme(name, a, b))(tracer, args, options, out)
+            return _fold(name)(tracer, args, options, out)
         if isinstance(out, Tensor):
             return tracer.pointwise(name, [tracer.cells(a) for a in args], out.shape)
         for first, *rest in _rows(tracer.cells(args[0]), args[1]).tolist():
             value, place = first, p.constant(0.0)
             for k, x in enumerate(rest, 1):
-                news = p.logic("and", p.compare("une", x, x), p.compare("oeq", value, value))
-                better = p.logic("or", p.compare(how, x, value), news)
+                news = p.logic("and", p.apply("ne", x, x), p.apply("eq", value, value))
+                better = p.logic("or", p.apply(how, x, value), news)
                 value, place = p.select(better, x, value), p.select(better, p.constant(float(k)), place)
             found.append((value, place))
         return [torch.tensor(cells, dtype=torch.int64).view(out[0].shape) for cells in zip(*found, strict=True)]
@@ -94,13 +95,11 @@ def _with_place(how: str) -> Rule:
     return rule
 
 
-def _cumulate(step: Callable[[Program, int, int], int]) -> Rule:
+def _cumulate(name: str) -> Rule:
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
         cells = tracer.cells(args[0]).movedim(args[1], -1)
-        rows = cells.reshape(-1, cells.shape[-1]).tolist()
-        for row in rows:
-            for k in range(1, len(row)):
-                row[k] = step(tracer.program, row[k - 1], row[k])
+        step = partial(tracer.program.apply, name)
+        rows = [list(accumulate(row, step)) for row in cells.reshape(-1, cells.shape[-1]).tolist()]
         return torch.tensor(rows, dtype=torch.int64).view(cells.shape).movedim(-1, args[1])
 
     return rule
@@ -114,12 +113,6 @@ def _rows(cells: Tensor, dims: int | Sequence[int] | None) -> Tensor:
     return cells.permute(*kept, *chosen).reshape(math.prod(cells.shape[d] for d in kept), -1)
 
 
-def _folded(step: Callable[[int, int], int], row: Sequence[int], first: int) -> int:
-    for value in row:
-        first = step(first, value)
-    return first
-
-
 def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = None) -> Tensor:
     """The cells of ``start`` + a b: straight-line code, or one loop for large matrices."""
     p, (m, k), n = tracer.program, a.shape, b.shape[1]
@@ -129,14 +122,14 @@ def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = 
         for row, starts in zip(a.tolist(), first.tolist(), strict=True):
             for column, total in zip(b.t().tolist(), starts, strict=True):
                 for x, y in zip(row, column, strict=True):
-                    total = p.add(total, p.mul(x, y))
+                    total = p.apply("add", total, p.apply("mul", x, y))
                 found.append(total)
         return torch.tensor(found, dtype=torch.int64).view(m, n)
     if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
         return first
     accesses = [tracer.access(x) for x in (a, b, first)]
     shape = (m, k, n, tuple(x for _, x in accesses))
-    array = p.new("product", *(i for i, _ in accesses), attributes=shape, kind="array", level=VARYING)
+    array = p.new("product", *(i for i, _ in accesses), attributes=shape, kind="array")
     return tracer.elements(array, m * n).view(m, n)
 
 
@@ -169,29 +162,27 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
     table, rest = tracer.table(numbers), math.prod(source.shape[len(given) :])
     strides = torch.empty(source.shape, device="meta").stride()
     spread = torch.broadcast_tensors(*(tracer.cells(i) for i in given))
-    found = []
+    zero, nan, found = p.constant(0.0), p.constant(math.nan), []
     for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
-        place = p.constant(0.0)
+        place, inside = zero, []
         for index, size, stride in zip(at, source.shape, strides, strict=False):
-            inside = p.logic(
-                "and",
-                p.compare("oge", index, p.constant(-float(size))),
-                p.compare("olt", index, p.constant(float(size))),
-            )
-            wrapped = p.select(p.compare("olt", index, p.constant(0.0)), p.add(index, p.constant(float(size))), index)
-            safe = p.select(inside, wrapped, p.constant(math.nan))
-            place = p.add(place, p.mul(safe, p.constant(float(stride))))
-        found += [p.new("look_up", table, place, attributes=(r,), level=VARYING) for r in range(rest)]
+            first, end = p.constant(-float(size)), p.constant(float(size))
+            inside.append(p.logic("and", p.apply("ge", index, first), p.apply("lt", index, end)))
+            wrapped = p.select(p.apply("lt", index, zero), p.apply("add", index, end), index)
+            safe = p.select(inside[-1], wrapped, zero)
+            place = p.apply("add", place, p.apply("mul", safe, p.constant(float(stride))))
+        numbers_there = (p.new("look_up", table, place, attributes=(r,)) for r in range(rest))
+        found += [p.select(reduce(partial(p.logic, "and"), inside), x, nan) for x in numbers_there]
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
 def _bucketize(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    p, how = tracer.program, "ogt" if options.get("right", False) else "oge"
+    p, how = tracer.program, "gt" if options.get("right", False) else "ge"
     knots = tracer.cells(args[1]).tolist()
     found = []
     for x in tracer.cells(args[0]).flatten().tolist():
-        passed = [p.as_number(p.logic("not", p.compare(how, knot, x))) for knot in knots]  # NaN passes all
-        found.append(_folded(p.add, passed, p.constant(0.0)))
+        passed = [p.as_number(p.logic("not", p.apply(how, knot, x))) for knot in knots]  # NaN passes all
+        found.append(reduce(partial(p.apply, "add"), passed, p.constant(0.0)))
     return torch.tensor(found, dtype=torch.int64).view(out.shape)
 
 
@@ -201,13 +192,13 @@ RULES: dict[str, Rule] = {
     "_to_copy": _convert,
     "sum": _sum,
     "mean": _mean,
-    "amax": _fold(lambda p, a, b: p.extreme("maximum", a, b)),
-    "amin": _fold(lambda p, a, b: p.extreme("minimum", a, b)),
-    "max": _with_place("ogt"),
-    "min": _with_place("olt"),
-    "prod": _fold(Program.mul),
-    "cumsum": _cumulate(Program.add),
-    "cumprod": _cumulate(Program.mul),
+    "amax": _fold("maximum"),
+    "amin": _fold("minimum"),
+    "max": _with_place("gt"),
+    "min": _with_place("lt"),
+    "prod": _fold("mul"),
+    "cumsum": _cumulate("add"),
+    "cumprod": _cumulate("mul"),
     "mm": _mm,
     "addmm": _addmm,
     "index": _index,

@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from rt_torchrl.programs.decompositions import SIMPLER, known_to_torch
 from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
 from rt_torchrl.programs.places import Places
-from rt_torchrl.programs.program import CONSTANT, UNIFORM, VARYING, Access, Program, UntraceableError
+from rt_torchrl.programs.program import Access, Program, UntraceableError
 
 STRAIGHT = 24
 """Greatest number of elements of a row that becomes straight-line code; a longer one becomes a loop."""
@@ -77,14 +77,14 @@ class Tracer(TorchDispatchMode):
     def input(self, x: Tensor, name: str) -> None:
         """Let a tensor be the next part of an input, which varies over lanes and steps."""
         places = range(self._sizes[name], self._sizes[name] + x.numel())
-        found = [self.program.new("input", attributes=(name, i), level=VARYING) for i in places]
+        found = [self.program.new("input", attributes=(name, i)) for i in places]
         self._sizes[name] = places.stop
         self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
 
     def weight(self, x: Tensor) -> None:
         """Let a tensor be the next part of the weights, which are the same for all lanes and steps."""
         attributes = self._sizes["weights"], x.numel()
-        array = self.program.new("weights", attributes=attributes, kind="array", level=UNIFORM)
+        array = self.program.new("weights", attributes=attributes, kind="array")
         self._sizes["weights"] += x.numel()
         self.assign(x, self.elements(array, x.numel()).view(x.shape))
 
@@ -231,7 +231,7 @@ class Tracer(TorchDispatchMode):
         spread = [o.expand(shape) for o in operands]
         values = {i for o in spread for i in o.flatten().tolist()}
         long = math.prod(shape) > STRAIGHT and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
-        if not long or all(p.levels[i] == CONSTANT for i in values):
+        if not long or all(p.number(i) is not None for i in values):
             rows = zip(*(o.flatten().tolist() for o in spread), strict=True)
             found = [ELEMENTWISE[name](p, *row) for row in rows]
             return torch.tensor(found, dtype=torch.int64).view(shape)
@@ -241,7 +241,7 @@ class Tracer(TorchDispatchMode):
         dims = tuple(n for n in shape if n != 1)
         accesses = [self.access(o.reshape(dims)) for o in spread]
         attributes = name, dims, tuple(x for _, x in accesses)
-        array = p.new("map", *(a for a, _ in accesses), attributes=attributes, kind="array", level=VARYING)
+        array = p.new("map", *(a for a, _ in accesses), attributes=attributes, kind="array")
         return self.elements(array, math.prod(shape)).view(shape)
 
     def _shortcut(self, name: str, operands: list[Tensor]) -> Tensor | None:
@@ -273,7 +273,7 @@ class Tracer(TorchDispatchMode):
         if numbers is not None:
             array = self.table(numbers)
         else:
-            array = p.new("row", *(p.as_number(i) for i in flat), kind="array", level=VARYING)
+            array = p.new("row", *(p.as_number(i) for i in flat), kind="array")
         return array, Access(0, torch.empty(cells.shape).stride())
 
     def table(self, numbers: list[float]) -> int:

@@ -9,14 +9,7 @@ from typing import NamedTuple
 
 import llvmlite.binding as llvm
 
-INTRINSICS = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc", "round": "rint", "abs": "fabs"}
-"""Functions that are instructions of most processors, by their names in LLVM."""
-FUNCTIONS = {
-    **dict.fromkeys("exp exp2 expm1 log log1p log2 log10 sin cos tan tanh sinh cosh asin acos atan".split(), 1),
-    **dict.fromkeys("asinh acosh atanh erf erfc".split(), 1),
-    **dict.fromkeys("pow atan2 hypot fmod".split(), 2),
-}
-"""Functions of the C library and the numbers of their arguments."""
+from rt_torchrl.programs.operations import FUNCTIONS, ROUNDED
 
 
 class Lanes(NamedTuple):
@@ -59,7 +52,7 @@ def symbol(name: str, lanes: Lanes) -> str | None:
 def publish_scalar_functions() -> None:
     """Make the C library's functions of one number, and those of memory, known to LLVM."""
     library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
-    for name in (*FUNCTIONS, *(n for n in INTRINSICS.values() if n != "fabs"), "malloc", "free"):
+    for name in (*FUNCTIONS, *(n for n in ROUNDED.values() if n != "fabs"), "malloc", "free"):
         _publish(library, name)
 
 

@@ -4,10 +4,10 @@ import copyreg
 import random
 import types
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from itertools import chain
-from operator import attrgetter, is_, methodcaller
+from operator import attrgetter, is_
 from pickle import PickleBuffer
 from typing import Any
 
@@ -29,7 +29,6 @@ USUAL = ("__reduce_ex__", "__reduce__", "__getstate__")
 Readers = dict[str, Callable[[list[Any]], Iterable[object]]]
 IDENTITIES: Readers = {
     "filled": chain.from_iterable,
-    "mappings": lambda held: chain.from_iterable(map(methodcaller("values"), held)),
     "functions": lambda held: chain.from_iterable(map(attrgetter("__code__", "__defaults__", "__kwdefaults__"), held)),
     "cells": partial(map, attrgetter("cell_contents")),
     "classes": partial(map, attrgetter("__mro__")),
@@ -120,10 +119,11 @@ class Watch:
         """Remember everything as it is now."""
         collections = self._noted.pop("collections")
         self._empty = [held for held in collections if not held]  # such as those for hooks
-        self._noted["filled"] = [held for held in collections if held]
-        self._noted["mappings"] = [held for held in collections if held and not isinstance(held, (list, set))]
+        filled = [held for held in collections if held]
+        self._noted["filled"] = [*filled, *(held.values() for held in filled if not isinstance(held, (list, set)))]
         try:
-            self._then = self._read(IDENTITIES), self._read(CONTENTS)
+            self._objects = np.fromiter(self._read(IDENTITIES), object)  # which keeps their addresses for them
+            self._then = self._objects.tobytes(), [*self._read(CONTENTS)]
         except ValueError:  # a variable of a function has no value yet
             self._complete = False
 
@@ -131,14 +131,15 @@ class Watch:
         """Whether everything is as it was."""
         if not self._complete or any(self._empty) or not same((type(root), vars(root)), self._own):
             return False
-        identities, contents = self._then
+        addresses, contents = self._then
         try:
-            return same(self._read(IDENTITIES), identities) and self._read(CONTENTS) == contents
+            found = np.fromiter(self._read(IDENTITIES), object)
+            return found.tobytes() == addresses and [*self._read(CONTENTS)] == contents
         except ValueError:  # a variable of a function has lost its value
             return False
 
-    def _read(self, readers: Readers) -> list[object]:
-        return [*chain.from_iterable(read(self._noted[kind]) for kind, read in readers.items())]
+    def _read(self, readers: Readers) -> Iterator[object]:
+        return chain.from_iterable(read(self._noted[kind]) for kind, read in readers.items())
 
 
 def same(objects: Collection[object], others: Collection[object]) -> bool:

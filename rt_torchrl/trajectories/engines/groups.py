@@ -38,20 +38,23 @@ class Group(NamedTuple):
 
 
 def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> None:
-    """Do the work of every group, on as many threads as torch may use."""
-    groups = [Group(first, min(first + lanes, batch), lanes) for first in range(0, batch, lanes)]
-    threads = min(torch.get_num_threads(), len(groups))
-    if threads == 1:
+    """Do the work of every group, on as many threads as torch may use; whoever is free takes the next group."""
+    starts = range(0, batch, lanes)
+    groups = iter([Group(first, min(first + lanes, batch), lanes) for first in starts])
+
+    def share() -> None:
         for group in groups:
             work(group)
-        return
 
-    def share(thread: int) -> None:
-        for group in groups[thread::threads]:
-            work(group)
-
-    for _ in _pool(threads).map(share, range(threads)):
-        pass
+    others = min(torch.get_num_threads(), len(starts)) - 1
+    helping = [_pool(others).submit(share) for _ in range(others)]
+    try:
+        share()
+    finally:  # nobody may still write into the arrays of a call that has ended
+        failures = [thread.exception() for thread in helping]
+    for failure in failures:
+        if failure is not None:
+            raise failure
 
 
 @cache

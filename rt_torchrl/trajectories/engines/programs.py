@@ -57,18 +57,10 @@ class _Known(NamedTuple):
     weights: Weights
 
 
-class _Entry(NamedTuple):
-    """What is kept of one kind of interval: its programs or why there are none, for any of its sweeps.
-
-    ``alive`` holds the objects that its fingerprint knows by their address.
-    """
-
-    programs: Programs | UntraceableError
-    alive: tuple[object, ...]
-
-
 _known: "WeakKeyDictionary[nn.Module, _Known]" = WeakKeyDictionary()
-_kept: "OrderedDict[tuple[object, ...], _Entry]" = OrderedDict()
+_kept: "OrderedDict[tuple[object, ...], tuple[Programs | UntraceableError, tuple[object, ...]]]" = OrderedDict()
+"""The programs of each kind of interval, or why there are none for one of its sweeps, with the objects that its
+fingerprint knows by their address."""
 _lock = threading.RLock()
 
 
@@ -84,7 +76,7 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
         known, lanes = _known_as(interval), lanes_of_this_machine()
         widths = initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (known.fingerprint.digest, lanes, *widths)
-        found = _kept[key].programs if key in _kept else None
+        found, alive = _kept.get(key, (None, known.fingerprint.alive))
         if not isinstance(found, UntraceableError):
             try:
                 found = found or Programs(interval, point_of(initial_state, drive, lanes.number), lanes)
@@ -94,7 +86,7 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
             except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
                 found = _reason(error)
                 warnings.warn(f"engine 'parallel' takes the place of 'native': {found}.", stacklevel=2)
-            _kept[key] = _Entry(found, _kept[key].alive if key in _kept else known.fingerprint.alive)
+            _kept[key] = found, alive
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)

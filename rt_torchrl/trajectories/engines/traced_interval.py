@@ -1,7 +1,6 @@
 """Machine code of the recurrence of an interval and of its reverse sweep, traced and compared with torch."""
 
 import ctypes
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -102,13 +101,13 @@ class Sweep:
                 found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
         zero = tracer.program.constant(0.0)
         pairs = zip(found or [None] * len(leaves), leaves, strict=True)
-        cells = [[zero] * leaf.numel() if g is None else tracer.outputs(g) for g, leaf in pairs]
-        by_state, by_drive, by_weights = cells[0], sum(cells[1:4], []) if driven else [], cells[4 if driven else 1 :]
+        by_state, *others = ([zero] * leaf.numel() if g is None else tracer.outputs(g) for g, leaf in pairs)
+        by_drive, by_weights = (sum(part, []) for part in (others[: 3 * driven], others[3 * driven :]))
         self.lanes, self.driven, self.names = lanes, driven, list(learned)
         self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
         self.sizes["w"] = sum(w.numel() for w in learned.values())
-        write = partial(sweep_text, tracer.program, sizes=self.sizes, lanes=lanes)
-        self._code = ObjectCode(write(by_state, sum(by_weights, []), by_drive), "sweep", SWEEP)
+        text = sweep_text(tracer.program, by_state, by_weights, by_drive, self.sizes, lanes)
+        self._code = ObjectCode(text, "sweep", SWEEP)
         self._compare(interval, point)
 
     def __call__(
@@ -143,13 +142,12 @@ class Sweep:
         source, (x, states) = np.zeros((1, self.sizes["s"], n_lanes)), point.in_lanes()
         found = costate.copy(), np.zeros((1, self.sizes["x"], n_lanes)), np.zeros((self.sizes["w"], n_lanes))
         self(x, states, source, found[0], Weights(interval).row(), *found[1:], 1)
-        weights = {name: w.detach().clone().requires_grad_(name in names) for name, w in interval.named_parameters()}
-        leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
+        state, *drive = (x.clone().requires_grad_() for x in (point.state, *point.drive))
+        weights = dict(interval.named_parameters())
+        leaves = [state, *drive, *(weights[name] for name in names)]
         with torch.enable_grad():
-            end = with_weights(interval, weights, leaves[0], Drive(*leaves[1:]))
-            given = [*leaves, *(weights[name] for name in names)]
-            exact = torch.autograd.grad(end, given, torch.from_numpy(costate.T), allow_unused=True)
-        wanted = [torch.zeros_like(x) if g is None else g for g, x in zip(exact, given, strict=True)]
+            end, by_end = interval(state, Drive(*drive)), torch.from_numpy(costate.T)
+            wanted = torch.autograd.grad(end, leaves, by_end, allow_unused=True, materialize_grads=True)
         by_state, by_drive = wanted[0].numpy(), torch.cat([wanted[1].unsqueeze(-1), *wanted[2:4]], -1).numpy()
         require_equal("the co-state", found[0].T, by_state, by_state)
         if self.driven:

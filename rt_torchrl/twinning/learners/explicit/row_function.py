@@ -94,14 +94,7 @@ def text_of(formula: Formula, n_w: int, lanes: Lanes) -> str:
     outputs = [i for part in found for i in tracer.cells(part).flatten().tolist()]
     writer = LaneWriter(lanes, "rows")
     places = [writer.index(0, [(j, "%n"), (1, "%k")]) for j in range(max(formula.n_in, len(outputs)))]
-    inputs = {("x", j): writer.load("%x", places[j], lanes=True, stored_lanes=True) for j in range(formula.n_in)}
-    lowering = Lowering(tracer.program, writer, inputs, "%w")
-    lowering.write(outputs)
-    for place, output in zip(places, outputs, strict=False):
-        writer.store("%y", place, lowering.operand(output))
-    head = ["br label %top", "top:", "%k = phi i64 [ 0, %entry ], [ %next, %bottom ]"]
-    tail = ["br label %bottom", "bottom:", "%next = add nsw i64 %k, 1", "%more = icmp slt i64 %next, %n"]
-    tail += ["br i1 %more, label %top, label %done", "done:", *writer.exit, "ret void"]
-    lines = [*writer.globals.values(), *writer.declarations.values()]
-    lines += ["define void @rows(ptr noalias %x, ptr noalias %y, ptr noalias %w, i64 %n) {", "entry:"]
-    return "\n".join([*lines, *writer.entry, *writer.prologue, *head, *writer.body, *tail, "}"])
+    inputs = {("x", j): writer.load("%x", places[j]) for j in range(formula.n_in)}
+    for place, output in zip(places, Lowering(tracer.program, writer, inputs, "%w").write(outputs), strict=False):
+        writer.store("%y", place, output)
+    return writer.function("rows", "ptr noalias %x, ptr noalias %y, ptr noalias %w")
