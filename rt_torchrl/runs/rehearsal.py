@@ -1,6 +1,7 @@
 """A rehearsal of model predictive control in real time, on the closure that a training has found."""
 
 import dataclasses
+import gc
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +64,13 @@ def rehearsed(policy: PredictiveControl, run: LoadedRun, plant: Plant, *, seed: 
     )
     actor = LivePolicy(plant, policy, ExplorationConfig(), generator=torch.Generator())
     actor.begin(policy, strength=0.0)
-    episode = EpisodeCollector(system, actor, plant).rollout()
-    system.close()
+    gc.collect()
+    gc.freeze()  # a collection of all objects that the libraries have made would stop an action
+    try:
+        episode = EpisodeCollector(system, actor, plant).rollout()
+    finally:
+        gc.unfreeze()
+        system.close()
     found = {
         "J_a": -episode["next", "reward"].mean().item(),
         "intervals": float(plant.n_steps),
