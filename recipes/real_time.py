@@ -4,38 +4,17 @@ import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 if __name__ == "__main__":
     print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
-import numpy as np
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
 from tyro.conf import Positional
 
-from rt_torchrl import (
-    ExplorationConfig,
-    LoadedRun,
-    Plant,
-    PredictiveControl,
-    Reading,
-    RealSystem,
-    SafetyConfig,
-    SafetyLayer,
-    check_options,
-    load_run,
-    main_of,
-)
+from rt_torchrl import check_options, load_run, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.run_config import plant_of
-from rt_torchrl.systems.collectors import EpisodeCollector
-from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.wall_clock import WallClock
-
-SHARE = 0.8
-"""Share of the time between two plans that a solve may take by default; the rest is for what comes around it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,73 +51,19 @@ class Config:
 
 
 def main(config: Config) -> None:
+    # Here, because --help need not wait for TorchRL.
+    from rt_torchrl.runs.rehearsal import controller, rehearsed
+
     torch.set_num_threads(1)
     make_folder("folder", config.folder)
     run = load_run(config.run)
     plant = plant_of(run.config if config.seconds is None else dataclasses.replace(run.config, horizon=config.seconds))
-    found = rehearsed(plant, controller(run, plant, config.deadline), run, config)
+    policy = controller(run, plant, config.deadline)
+    found = rehearsed(policy, run, plant, seed=config.seed, log=config.folder / "safety.jsonl")
     path = write_results(config.folder / "real_time.json", {"config": config, **found})
     for name, value in found.items():
-        print(f"{name.replace('_', ' '):<32}{value:.6g}")
+        print(f"{name.replace('_', ' '):<24}{value:.6g}")
     print(f"results in {path}")
-
-
-def controller(run: LoadedRun, plant: Plant, deadline: float | None) -> PredictiveControl:
-    """Model predictive control with a deadline, on the closure of a training."""
-    options = run.config.twinning.planner.receding_horizon
-    period = options.period or options.hold or plant.dt
-    options = dataclasses.replace(options, deadline=SHARE * period if deadline is None else deadline)
-    found, acted = PredictiveControl(run.config.believed() or plant, run.closure, options), run.policy("model_based")
-    if isinstance(acted, PredictiveControl):
-        found.load_state_dict(acted.state_dict())
-    return found
-
-
-def rehearsed(plant: Plant, policy: PredictiveControl, run: LoadedRun, config: Config) -> dict[str, float]:
-    """Fly an episode in real time, and say what was late."""
-    clock, log = WallClock(plant), config.folder / "safety.jsonl"
-    log.unlink(missing_ok=True)
-    # An observation comes at the end of its interval; half an interval later the machine has stopped to answer.
-    limits = SafetyConfig(interval=plant.dt, deadline=1.5 * plant.dt, log=log)
-    guarded = SafetyLayer(clock.environment(seed=config.seed), limits, fallback=Fallback(plant, run))
-    readings = {name: Reading(keys=(name,)) for name in ("state", "exogenous", "applied")}
-    system = RealSystem(guarded, plant, **readings, closure=plant.closure, seed=config.seed)
-    actor = LivePolicy(plant, policy, ExplorationConfig(), generator=torch.Generator())
-    actor.begin(policy, strength=0.0)
-    episode = EpisodeCollector(system, actor, plant).rollout()
-    solves = 1e3 * np.array([solve.seconds for solve in policy.solves])
-    found = {
-        "J_a": -episode["next", "reward"].mean().item(),
-        "intervals": float(plant.n_steps),
-        "solves": float(len(solves)),
-        "late_solves": float(sum(solve.late for solve in policy.solves)),
-        "late_actions": float(clock.late),
-        "safety_events": float(len(guarded.report.events)),
-    }
-    system.close()
-    return found | times("solve", solves) | times("answer", 1e3 * np.array(clock.answers))
-
-
-def times(name: str, milliseconds: np.ndarray) -> dict[str, float]:
-    """Median, 99th percentile and greatest of some times [ms]."""
-    numbers: dict[str, Any] = {"median": np.median(milliseconds), "p99": np.percentile(milliseconds, 99)}
-    return {f"{name}_{key}_ms": float(value) for key, value in (numbers | {"max": milliseconds.max()}).items()}
-
-
-class Fallback:
-    """The model-free policy of a training, in the place of a controller whose observation is faulty.
-
-    Args:
-        plant: the plant.
-        run: the training.
-    """
-
-    def __init__(self, plant: Plant, run: LoadedRun):
-        self.plant, self.policy = plant, run.policy("model_free")
-
-    def __call__(self, reported: TensorDictBase) -> Tensor:
-        seen = self.plant.observe(reported["time"][0], reported["state"], reported["exogenous"])
-        return self.policy(seen)
 
 
 if __name__ == "__main__":

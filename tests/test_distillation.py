@@ -71,7 +71,7 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
     with torch.no_grad():
         live.network[-1].weight.mul_(20.0)
     points = torch.randn(400, 2, generator=seeded(8), dtype=torch.float64)
-    error = match_actions(PLANT, live, idle, points, 200)
+    error = match_actions(PLANT, live(points).detach(), idle, points, 200)
     teacher = ShareOfRange(PLANT, live)(points)
 
     def loss():
@@ -91,8 +91,8 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
 def test_what_the_clone_shows_itself_is_added_from_the_second_round_on():
     distillation = Distillation(DigitalTwin(PLANT, PLANT.closure), DistillationConfig(iterations=1, rounds=3))
     live, idle, flown = affine([-0.8, -1.1]), perceptron(), []
-    observed = distillation._observed
-    distillation._observed = lambda policy, episodes: flown.append(policy) or observed(policy, episodes)
+    fly = distillation._flown
+    distillation._flown = lambda teacher, policy, episodes: flown.append(policy) or fly(teacher, policy, episodes)
     seen = torch.zeros(1, 2, dtype=torch.float64)
     distillation.imitate(live, idle, seen=seen, draw=draw)
     assert flown == [live, idle, idle]

@@ -37,7 +37,7 @@ class Config(RunConfig):
 
 
 def training(folder=None, episodes=3, *, twinning=None, **options):
-    chosen = dataclasses.replace(SMALL, planner=PLANNER, assimilation=FIT, **(twinning or {}))
+    chosen = dataclasses.replace(SMALL, **({"planner": PLANNER, "assimilation": FIT} | (twinning or {})))
     options = {"figures": False, "untrained": 0, "unseen": 2, "figures_every": 0} | options
     config = Config(episodes=episodes, log_dir=folder, compiled=False, twinning=chosen, **options)
     return Run(config, config.plant())
@@ -216,3 +216,37 @@ def test_methods_and_policies_that_do_not_go_together_are_refused():
     for method, window in (("receding_horizon", 5), ("whole_episodes", 5), ("short_horizon", 0)):
         with pytest.raises(ValueError, match=f"method='{method}' of the planning does not go with"):
             PlannerConfig(method=method, short_horizon=ShortHorizonConfig(window=window))
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_a_critic_prices_the_end_of_a_window(name):
+    """Its cost-to-go is the critics' own number, by hand; the plans change with it, and without it there are none."""
+    planner = dataclasses.replace(PLANNER, receding_horizon=PredictiveConfig(horizon=0.3, terminal="critic"))
+    run = training(episodes=1, twinning=learner(name) | {"planner": planner, "arm": "twinning"})
+    algorithm, plant = run.algorithm, run.algorithm.twin.plant
+    algorithm.episode()
+    seen = algorithm.learner.observations()[:5].clone()
+    actions = algorithm.policies["model_free"](seen)
+    weights = {k: v for k, v in algorithm.learner.loss.state_dict().items() if "target" not in k}
+    prefix = next(k for k, v in weights.items() if k.endswith("0.weight") and v.shape[-1] == 3)
+    found = []
+    for number in range(len(algorithm.learner.critics)):
+        x = torch.cat([seen, actions / 2.0], -1)  # the range of the action is ±2 N
+        for layer in (0, 2):
+            weight, bias = (weights[prefix.replace("0.weight", f"{layer}.{part}")] for part in ("weight", "bias"))
+            weight, bias = (weight[number], bias[number]) if weight.ndim == 3 else (weight, bias)
+            x = x @ weight.T + bias
+            x = x * torch.sigmoid(x) if layer == 0 else x
+        found.append(-x[:, 0])
+    expected = torch.stack(found).amax(0)
+    torch.testing.assert_close(algorithm.learner.cost_to_go(seen), expected)
+    controller, state = algorithm.policies["model_based"], plant.draw_initial_state(1, torch.Generator().manual_seed(1))
+    controller.begin()
+    priced = controller.act(0.0, state, torch.zeros(1, 1).double())
+    controller.value = lambda observation: 100.0 * observation.square().sum(-1)
+    controller.begin()
+    assert not torch.allclose(controller.act(0.0, state, torch.zeros(1, 1).double()), priced, atol=1e-3)
+    controller.value = None
+    with pytest.raises(ValueError, match="which no run folder holds; set value, or use terminal plant"):
+        controller.begin()
+    run._held.release()

@@ -26,7 +26,7 @@ ROOMS_OF = {
     "identify.py": {"identification", "figures", "runs"},
     "limit.py": {"evaluation", "optimal_control", "runs", "study"},
     "pareto.py": {"study"},
-    "real_time.py": {"runs", "systems"},
+    "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
     "study.py": {"study", "runs"},
 }

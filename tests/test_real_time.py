@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from tensordict import TensorDict
 from test_export_recipe import leave_run, recipe
 
 from rt_torchrl.runs.loaded_run import load_run
+from rt_torchrl.runs.rehearsal import Fallback, controller
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.systems.wall_clock import WallClock
 from rt_torchrl.trajectories.rollout import Rollout
@@ -78,7 +80,7 @@ def test_model_predictive_control_is_in_time(tmp_path, capsys):
     run = load_run(tmp_path / "run")
     generator = torch.Generator().manual_seed(episode_seed(0, 0))
     start, inputs = (draw(1, generator) for draw in (run.plant.draw_initial_state, run.plant.draw_exogenous))
-    flown = module.controller(run, run.plant, None).fly(start, inputs, run.plant.closure)
+    flown = controller(run, run.plant, None).fly(start, inputs, run.plant.closure)
     assert found["J_a"] == pytest.approx(control_cost(run.plant, flown).item(), rel=1e-6)
     assert 0.0 < found["solve_median_ms"] <= found["solve_p99_ms"] <= found["solve_max_ms"] < 200.0
     assert "late actions" in capsys.readouterr().out
@@ -91,6 +93,16 @@ def test_solves_that_are_late_leave_the_plan_and_the_plant_in_time(tmp_path):
     module.main(module.Config(run=tmp_path / "run", folder=tmp_path / "found", deadline=1e-6))
     found = json.loads((tmp_path / "found" / "real_time.json").read_text())
     assert found["late_solves"] == found["solves"] == 8.0 and found["late_actions"] == 0.0
+
+
+def test_the_fallback_is_the_model_free_policy(tmp_path):
+    config, parts = leave_run(tmp_path / "run", "wind_turbine", horizon=3.0)
+    run = load_run(tmp_path / "run")
+    generator = torch.Generator().manual_seed(0)
+    state, wind = run.plant.draw_initial_state(1, generator)[0], torch.tensor([11.0]).double()
+    reported = TensorDict({"time": torch.zeros(1).double(), "state": state, "exogenous": wind})
+    expected = parts["model_free"](run.plant.observe(torch.zeros(()).double(), state, wind))
+    torch.testing.assert_close(Fallback(run.plant, run)(reported), expected)
 
 
 @pytest.mark.parametrize("option", [{"seconds": 0.0}, {"deadline": -1.0}, {"seed": -1}])

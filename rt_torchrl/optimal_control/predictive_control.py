@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 import statistics
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,6 +19,9 @@ from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory
 
+CostToGo = Callable[[Tensor], Tensor]
+"""Function from observations ``batch n_o`` to what comes after them ``batch``, in units of L_a."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PredictiveConfig(RecedingHorizonConfig):
@@ -27,6 +31,8 @@ class PredictiveConfig(RecedingHorizonConfig):
         horizon: length of the window over which a plan is made [s]; every plant needs its own.
         forecast: forecast of the exogenous inputs: held for the measured ones, or decaying to the mean of the inputs
             met so far with the time that fits them best; until inputs have been met, they are held.
+        terminal: cost of the state at the end of a window: plant for the plant's own where the window ends with the
+            episode, or critic for the value that the model-free half has learned of what comes after the window.
         virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
             virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
 
@@ -36,6 +42,7 @@ class PredictiveConfig(RecedingHorizonConfig):
 
     horizon: float = 1.0
     forecast: Literal["held", "decaying"] = "decaying"
+    terminal: Literal["plant", "critic"] = "plant"
     virtual_episodes: int = 3
 
     def __post_init__(self) -> None:
@@ -57,6 +64,9 @@ class PredictiveControl(nn.Module):
         closure: closure of the model, such as that of a twin, which is trained in place.
         config: parameters.
 
+    The attribute ``value`` is the cost-to-go for ``terminal="critic"``, a function of the observation in units of L_a;
+    the algorithm sets it to that of its learner.
+
     Raises:
         ValueError: if :class:`RecedingHorizon` refuses the parameters, or the closure is not on the CPU.
     """
@@ -74,18 +84,35 @@ class PredictiveControl(nn.Module):
         # With an infinite time, the inputs are held.
         self.register_buffer("mean", torch.zeros(n_z, dtype=torch.float64))
         self.register_buffer("time", torch.full((n_z,), math.inf, dtype=torch.float64))
+        self.value: CostToGo | None = None
+        tail = self._tail if config.terminal == "critic" else None
         timeless = dataclasses.replace(config, deadline=math.inf)
         self._acting, self._virtual = (
-            RecedingHorizon(plant, closure, chosen, forecast=self._forecast()) for chosen in (config, timeless)
+            RecedingHorizon(plant, closure, chosen, forecast=self._forecast(), tail=tail)
+            for chosen in (config, timeless)
         )
         generator = torch.Generator().manual_seed(0)
         self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
+
+    @property
+    def terminal(self) -> str:
+        """What prices the end of a window."""
+        return self._config.terminal
 
     def _forecast(self) -> Forecast:
         """The forecast of the configuration, whose numbers are the buffers."""
         if self._config.forecast == "held":
             return Held()
         return Decaying(self.mean, self.time, dt=self._plant[0].dt)
+
+    def _tail(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        if self.value is None:
+            raise ValueError(
+                "terminal='critic' of the receding horizon needs the critic of a learner, which no run folder holds; "
+                "set value, or use terminal plant."
+            )
+        plant = self._plant[0]
+        return plant.dt * self.value(plant.observe(t, state, exogenous))
 
     def learn(self, records: Float[Tensor, "episodes n n_z"]) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
@@ -155,5 +182,6 @@ class PredictiveControl(nn.Module):
         # The machine code of a solve cannot be copied.
         found = PredictiveControl(self._plant[0], copy.deepcopy(self.closure, memo), self._config)
         found.load_state_dict(self.state_dict())
+        found.value = self.value
         memo[id(self)] = found
         return found

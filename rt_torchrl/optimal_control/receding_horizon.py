@@ -21,6 +21,8 @@ from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import constant
 
+Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Function from end times ``batch``, states ``batch n_s`` and inputs ``batch n_z`` there to a cost V ``batch``."""
 Guess = Callable[[Tensor, Tensor], Tensor]
 """Function from states ``batch n_s`` and forecast inputs ``batch n n_z`` to commands ``batch n n_a``."""
 
@@ -61,6 +63,7 @@ class RecedingHorizon:
         forecast: forecast of the exogenous inputs; None holds what is measured.
         terminal: cost V after the horizon, of the end states ``batch n_s``, in units of L_a·s; None for none. A window
             that ends with the episode has the plant's ``terminal_cost`` instead.
+        tail: the cost V where it also depends on the time and on the inputs after the window; None for none.
         guess: commands that a solve starts from where they cost less than the rest of the last plan, such as those of a
             classical controller on the model; None for none.
 
@@ -76,6 +79,7 @@ class RecedingHorizon:
         *,
         forecast: Forecast | None = None,
         terminal: TerminalCost | None = None,
+        tail: Tail | None = None,
         guess: Guess | None = None,
     ):
         self.plant, self.config, self.guess = plant, config, guess
@@ -86,7 +90,7 @@ class RecedingHorizon:
         if self.period > self.horizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.horizon} s.")
         self.cost = CommandCost(plant, constant(closure), hold=hold, penalty=config.penalty, terminal=terminal)
-        self._terminal = terminal
+        self._terminal, self._tail = terminal, tail
         self._prepared: np.ndarray | None = None
         self.solves: list[Solve] = []
         self.begin()
@@ -145,6 +149,8 @@ class RecedingHorizon:
             safe_point()
             one = slice(episode, episode + 1)
             began = time.perf_counter()
+            if self._tail is not None and not ends:
+                self.cost.terminal = self._tail_at(t + n * self.plant.dt, inputs[one, -1])
             self.cost.begin(state[one], inputs[one], start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
             starts = ([] if last is None else [last]) + (self._constants() if first else [])
@@ -154,6 +160,12 @@ class RecedingHorizon:
             found.append(self._solved(start, last, began))
         self._plans = found
         return self.cost.commands(np.stack(found), n)
+
+    def _tail_at(self, t: float, exogenous: Float[Tensor, "1 n_z"]) -> TerminalCost:
+        """The tail as a function of the end states alone."""
+        tail, end = self._tail, torch.tensor([t], dtype=torch.float64)
+        assert tail is not None
+        return lambda state: tail(end, state, exogenous)
 
     def _solved(self, start: np.ndarray, last: np.ndarray | None, began: float) -> np.ndarray:
         """The plan of one episode; if it is late or diverges, the last plan goes on, where there is one."""

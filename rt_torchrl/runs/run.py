@@ -124,7 +124,6 @@ class Run:
         policies = {role: policy.to(device) for role, policy in config.make_policies(plant, generator).items()}
         closure = config.make_closure(plant, generator).to(device)
         policies = config.acting_policies(policies, physics, closure)
-        self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
         self.algorithm = ReinforcementTwinning(
             env,
             DigitalTwin(physics, closure, engine=config.engine, compiled=compiled),
@@ -134,6 +133,8 @@ class Run:
             generator=generator,
             first=None if self.first is None else ActingController(self.first(plant)).to(device),
         )
+        # Copies made after the algorithm know its learner's critic, where model predictive control needs one.
+        self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
 
     def train(self) -> dict[str, Any]:
         """Train, evaluate and write the results.

@@ -24,6 +24,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import fly
 from rt_torchrl.twinning.learners import Learner, make_learner
@@ -82,6 +83,7 @@ class ReinforcementTwinning:
         for role, part in trained.items():
             if part.policy is not self.policies[role]:
                 raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
+        share_critic(self.learner, model_based)
         self.assimilation = Assimilation(twin, config.assimilation)
         self.short_term = ShortTermMemory(config.records)
         self.track_record = TrackRecord(self.policies)

@@ -100,6 +100,10 @@ class ActorCritic(ABC):
         """Loss of the critics and |δ| of each transition."""
 
     @abstractmethod
+    def critic_value(self, pairs: TensorDict, number: int) -> Float[Tensor, "n 1"]:
+        """The value of one of the critics, by its number, for pairs of observation and action."""
+
+    @abstractmethod
     def actor_loss(self, batch: TensorDictBase) -> Tensor:
         """Loss of the policy, −E[q(e, π(e))], with the critics' weights detached."""
 
@@ -145,6 +149,17 @@ class ActorCritic(ABC):
     def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
         """TD errors |δ| of transitions with the present critics and target critics."""
         return self.critic_loss(transitions.copy())[1]
+
+    def cost_to_go(self, observation: Float[Tensor, "n n_o"]) -> Float[Tensor, " n"]:
+        r"""What the policy costs from observations on, :math:`-q(e, \pi(e))` for the rewards without their scale.
+
+        With several critics it is that of the lowest value, as in the targets. It is differentiable by the observation.
+        """
+        pairs = TensorDict(
+            {"observation": observation, "action": self.policy(observation)}, batch_size=len(observation)
+        )
+        values = torch.stack([self.critic_value(pairs, number) for number in range(len(self.critics))])
+        return -values.amin(0).squeeze(-1) / self.config.reward_scale
 
     def observations(self) -> Float[Tensor, "n n_o"]:
         """See :meth:`Learner.observations`."""

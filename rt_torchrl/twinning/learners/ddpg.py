@@ -44,6 +44,9 @@ class DDPG(ActorCritic):
         value, metadata = self.loss.loss_value(batch)
         return value, metadata["td_error"].sqrt()  # TorchRL reports δ²
 
+    def critic_value(self, pairs: TensorDict, number: int) -> Float[Tensor, "n 1"]:
+        return self.critics[number](pairs["observation"], pairs["action"])
+
     def actor_loss(self, batch: TensorDictBase) -> Tensor:
         return self.loss.loss_actor(batch)[0]
 

@@ -60,6 +60,11 @@ class TD3(ActorCritic):
             loss, metadata = self.loss.value_loss(batch)
         return loss, metadata["td_error"].detach().max(0).values.sqrt()
 
+    def critic_value(self, pairs: TensorDict, number: int) -> Float[Tensor, "n 1"]:
+        network = self.loss.qvalue_network
+        with self.loss.qvalue_network_params[number].to_module(network):
+            return network(pairs.copy())["state_action_value"]
+
     def actor_loss(self, batch: TensorDictBase) -> Tensor:
         return self.loss.actor_loss(batch)[0]
 
