@@ -225,7 +225,7 @@ def test_the_command_line_trains_a_closure_by_its_own_defaults(monkeypatch):
     """An option that is given keeps its value: here the number of records."""
     recipe, seen = load_recipe(), []
     for options in ([], ["--closure", "mlp"], ["--closure", "mlp", "--twinning.records", "3"]):
-        monkeypatch.setattr("sys.argv", ["wind_turbine.py", *options])
+        monkeypatch.setattr("sys.argv", ["wind_turbine.py", "--start", "random", *options])
         main_of(recipe.Config, seen.append)
     default, neural, chosen = (config.twinning for config in seen)
     assert default == recipe.CONVERGED and neural == recipe.NEURAL != default

@@ -68,4 +68,4 @@ def test_the_tank_refuses_it_with_a_half_open_valve():
     planner = dataclasses.replace(module.CONVERGED.planner, method="receding_horizon")
     twinning = dataclasses.replace(module.CONVERGED, planner=planner)
     with pytest.raises(ValueError, match="command='drop' does not go with method='receding_horizon'.*Use command duty"):
-        module.Config(twinning=twinning)
+        module.Config(command="drop", twinning=twinning)

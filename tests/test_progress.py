@@ -13,7 +13,7 @@ from rt_torchrl.trajectories.engines.compilation import compiled_if, missing_for
 def test_it_names_each_step_as_it_begins():
     told = []
     twinning().episode(told.append)
-    assert told == STEPS and set(progress.WORDS) == set(STEPS)
+    assert told == STEPS and set(progress.WORDS) == {"start", *STEPS}
 
 
 def test_it_moves_while_a_step_is_under_way(monkeypatch, capsys):
