@@ -2,6 +2,7 @@
 
 import ast
 import json
+import math
 import re
 
 import pytest
@@ -11,6 +12,8 @@ from printed_commands import blocks
 from test_export_recipe import leave_run, recipe
 
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.runs.results_file import write_results
 from rt_torchrl.study.limits import resting_at_the_end
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -40,6 +43,14 @@ def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
     assert found["Jonkman"]["milliseconds"]["median"] > 0.0 and found["clairvoyant"]["milliseconds"] is None
     printed = capsys.readouterr().out
     assert f"{mean(found['Jonkman']) / best:.4f}" in printed and "mean power [MW]" in printed
+
+
+def test_results_are_standard_json(tmp_path):
+    """Numbers that are not finite are null, and paths are text."""
+    content = {"config": BoundedDescentConfig(), "costs": (1.5, math.inf, math.nan), "folder": tmp_path, "none": None}
+    found = json.loads(write_results(tmp_path / "found.json", content).read_text(), parse_constant=pytest.fail)
+    assert found["costs"] == [1.5, None, None] and found["folder"] == str(tmp_path) and found["none"] is None
+    assert found["config"]["memory"] == BoundedDescentConfig().memory
 
 
 def test_the_least_commands_last_as_long_as_costs_least():

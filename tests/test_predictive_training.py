@@ -22,6 +22,7 @@ from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig, make_planner
 
@@ -201,6 +202,16 @@ def test_a_checkpoint_of_another_method_does_not_fit(tmp_path):
     with pytest.raises(ValueError, match="do not fit"):
         checkpoint.load(tmp_path / "checkpoint.pt", other.algorithm)
     other._held.release()
+
+
+def test_a_learner_without_a_cost_to_go_cannot_price_the_end():
+    plant = LinearQuadratic()
+    config = dataclasses.replace(PLANNER.receding_horizon, terminal="critic")
+    controller = PredictiveControl(plant, plant.closure, config)
+    with pytest.raises(ValueError, match="needs a learner with a method cost_to_go.*object has none"):
+        share_critic(object(), controller)
+    share_critic(object(), PredictiveControl(plant, plant.closure, PLANNER.receding_horizon))
+    assert controller.value is None
 
 
 def test_methods_and_policies_that_do_not_go_together_are_refused():

@@ -3,10 +3,9 @@
 from torch import nn
 
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
-from rt_torchrl.twinning.learners import Learner
 
 
-def share_critic(learner: Learner, policy: nn.Module) -> None:
+def share_critic(learner: object, policy: nn.Module) -> None:
     """Give model predictive control the cost-to-go of the model-free half, if it is to price the end of its windows.
 
     Args:
@@ -17,9 +16,10 @@ def share_critic(learner: Learner, policy: nn.Module) -> None:
         ValueError: if the learner has no method ``cost_to_go``.
     """
     if isinstance(policy, PredictiveControl) and policy.terminal == "critic":
-        if not hasattr(learner, "cost_to_go"):
+        cost_to_go = getattr(learner, "cost_to_go", None)
+        if cost_to_go is None:
             raise ValueError(
                 f"terminal='critic' of the receding horizon needs a learner with a method cost_to_go(observation); "
                 f"{type(learner).__name__} has none. Use terminal plant."
             )
-        policy.value = learner.cost_to_go
+        policy.value = cost_to_go
