@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -11,20 +12,29 @@ if __name__ == "__main__":
 
 import torch
 
-from rt_torchrl import ClassicalController, RecedingHorizonConfig, check_options, load_run, main_of
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+from rt_torchrl import ClassicalController, LoadedRun, Plant, RecedingHorizonConfig, check_options, load_run, main_of
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.shipped_plants import plant_class
-from rt_torchrl.study.limits import Contender, classical, forecasts, general_starts, limit, receding, resting_at_the_end
+from rt_torchrl.study.limits import (
+    Contender,
+    classical,
+    forecasts,
+    general_starts,
+    learned,
+    limit,
+    receding,
+    resting_at_the_end,
+)
 
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "wind_turbine": {"Jonkman": JonkmanController},
     "flapping_wing": {"PD": TrimmedPD},
-    "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
+    "cryogenic_tank": {"on-off": OnOffValve, "on-off, resting": RestingOnOff, "PI": PIValve},
 }
 
 
@@ -46,19 +56,20 @@ class Config:
     """Compute the limit of a plant's cost, and compare classical controllers and model predictive control with it.
 
     Args:
-        plant: plant whose limit is computed.
+        plant: plant whose limit is computed, with the paper's cost.
         episodes: number of episodes, at least 2.
         seed: seed of the episodes; by default that of the unseen episodes of the trainings.
-        horizon: length of an episode [s]; by default the plant's.
+        horizon: length of an episode [s]; by default the plant's. A run has its own.
         hold: number of control intervals for which a command of the optimum is held.
         starts: all, or classical to leave out constant and random commands.
         mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none.
-        run: folder of a training; model predictive control then also plans on the closure that it has found.
+        run: folder of a training. Its plant takes the place of plant, with its cost, command and limits; its policies
+            are judged beside the controllers, and model predictive control plans on its closure, too.
         folder: folder of the results, which are in PLANT.json.
         descent: parameters of the descents to the optimum.
     """
 
-    plant: Literal["wind_turbine", "flapping_wing", "cryogenic_tank"] = "wind_turbine"
+    plant: Literal["wind_turbine", "flapping_wing", "cryogenic_tank"] | None = None
     episodes: int = 8
     seed: int = UNSEEN_SEED
     horizon: float | None = None
@@ -76,56 +87,75 @@ class Config:
         for argument, least in (("episodes", 2), ("seed", 0), ("hold", 1)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
+        if self.run is not None and (self.plant is not None or self.horizon is not None):
+            raise ValueError("run has a plant and a horizon of its own; leave out plant and horizon, or run.")
 
 
 def main(config: Config) -> None:
     torch.set_num_threads(1)
     make_folder("folder", config.folder)
-    found = contenders(config)
-    path = write_results(config.folder / f"{config.plant}.json", {"config": config, "contenders": found})
-    print(table(found))
+    run = None if config.run is None else load_run(config.run)
+    plant = chosen_plant(config) if run is None else run.plant
+    path, found = config.folder / f"{plant.name}.json", {}
+    print(f"seeking the clairvoyant optimum of {config.episodes} episodes", flush=True)
+    for name, contender in contenders(config, plant, run):
+        if not found:
+            print(header(contender), flush=True)
+        found[name] = contender
+        print(row(name, contender, found["clairvoyant"]), flush=True)
+        write_results(path, {"config": config, "contenders": found})
+    print(evidence_of(found["clairvoyant"]))
     print(f"results in {path}")
 
 
-def contenders(config: Config) -> dict[str, Contender]:
-    """The clairvoyant optimum and all controllers, by name."""
-    kind = plant_class(config.plant)
-    plant = kind() if config.horizon is None else kind(horizon=config.horizon)
-    episodes, controllers = UnseenEpisodes(plant, config.episodes, seed=config.seed), CONTROLLERS[config.plant]
+def chosen_plant(config: Config) -> Plant:
+    """The plant that the options name; the turbine if they name none."""
+    kind = plant_class(config.plant or "wind_turbine")
+    return kind() if config.horizon is None else kind(horizon=config.horizon)
+
+
+def contenders(config: Config, plant: Plant, run: LoadedRun | None) -> Iterator[tuple[str, Contender]]:
+    """The clairvoyant optimum and all controllers, as they are found."""
+    episodes, controllers = UnseenEpisodes(plant, config.episodes, seed=config.seed), CONTROLLERS.get(plant.name, {})
     starts = {name: episodes.fly_baseline(controller(plant)).actions for name, controller in controllers.items()}
-    if config.plant == "cryogenic_tank":
+    if plant.name == "cryogenic_tank":
         mixture = episodes.fly_baseline(NarrowBand(plant)).actions
         starts["narrow on-off, shut at the end"] = resting_at_the_end(episodes, mixture)
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts
-    found = {"clairvoyant": limit(episodes, chosen, hold=config.hold, config=config.descent)}
-    found |= {name: classical(episodes, controller) for name, controller in controllers.items()}
-    if config.plant not in HORIZONS:
-        return found
-    horizon = HORIZONS[config.plant]
+    yield "clairvoyant", limit(episodes, chosen, hold=config.hold, config=config.descent)
+    for name, controller in controllers.items():
+        yield name, classical(episodes, controller)
+    for role, policy in {} if run is None else run.policies.items():
+        yield role.replace("_", "-"), learned(episodes, policy)
+    if plant.name not in HORIZONS:
+        return
+    horizon = HORIZONS[plant.name]
     horizon = dataclasses.replace(horizon, horizon=min(horizon.horizon, plant.horizon))
-    closures = {"exact": None} | ({} if config.run is None else {"fitted": load_run(config.run).closure})
     known = forecasts(plant, episodes.exogenous, horizon.horizon)
-    for model, closure in closures.items():
+    for model, closure in {"exact": None, **({} if run is None else {"fitted": run.closure})}.items():
         for name in config.mpc:
-            found[f"MPC, {model}, {name}"] = receding(episodes, horizon, known[name], closure)
-    return found
+            yield f"MPC, {model}, {name}", receding(episodes, horizon, known[name], closure)
 
 
-def table(found: dict[str, Contender]) -> str:
-    """Costs, their ratios to the limit, merits and times, for the terminal."""
-    best, merits = found["clairvoyant"], list(found["clairvoyant"].merit)
-    lines = [
-        f"{'':<24}{'J_a':>12}{'over limit':>12}{'ms, median':>12}{'ms, max':>12}" + "".join(f"  {m}" for m in merits)
-    ]
-    for name, contender in found.items():
-        times = contender.milliseconds or {}
-        shown = [f"{times[key]:>12.3g}" if key in times else f"{'-':>12}" for key in ("median", "max")]
-        numbers = "".join(f"  {contender.merit[m]:>{len(m)}.4g}" for m in merits)
-        lines.append(f"{name:<24}{contender.mean:>12.6g}{contender.mean / best.mean:>12.4f}{''.join(shown)}{numbers}")
-    lines.append("clairvoyant optimum: projected gradient {projected_gradient:.2g}".format(**best.details))
-    starts = best.details["above_the_best"].items()
-    lines.append("starts above it: " + ", ".join(f"{name} {share:.1e}" for name, share in starts))
-    return "\n".join(lines)
+def header(best: Contender) -> str:
+    """The names of the columns, for the terminal."""
+    times = f"{'ms, median':>12}{'ms, max':>12}"
+    return f"{'':<24}{'J_a':>12}{'over limit':>12}{times}" + "".join(f"  {merit}" for merit in best.merit)
+
+
+def row(name: str, contender: Contender, best: Contender) -> str:
+    """Cost, its ratio to the limit, times and merits, for the terminal."""
+    times = contender.milliseconds or {}
+    shown = "".join(f"{times[key]:>12.3g}" if key in times else f"{'-':>12}" for key in ("median", "max"))
+    numbers = "".join(f"  {value:>{len(merit)}.4g}" for merit, value in contender.merit.items())
+    return f"{name:<24}{contender.mean:>12.6g}{contender.mean / best.mean:>12.4f}{shown}{numbers}"
+
+
+def evidence_of(best: Contender) -> str:
+    """What says that the clairvoyant optimum is one, for the terminal."""
+    starts = ", ".join(f"{name} {share:.1e}" for name, share in best.details["above_the_best"].items())
+    gradient = best.details["projected_gradient"]
+    return f"clairvoyant optimum: projected gradient {gradient:.2g}\nstarts above it: {starts}"
 
 
 if __name__ == "__main__":

@@ -11,6 +11,8 @@ from linear_quadratic import LinearQuadratic
 from printed_commands import blocks
 from test_export_recipe import leave_run, recipe
 
+from rt_torchrl import load_run
+from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.runs.results_file import write_results
@@ -31,10 +33,13 @@ def mean(contender):
 
 
 def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
-    _, parts = leave_run(tmp_path / "run", "wind_turbine", policy="paper")
-    found = run(tmp_path, plant="wind_turbine", horizon=15.0, mpc=("held", "preview"), run=tmp_path / "run")
-    controllers = ["MPC, exact, held", "MPC, exact, preview", "MPC, fitted, held", "MPC, fitted, preview"]
-    assert list(found) == ["clairvoyant", "Jonkman", *controllers]
+    config, _ = leave_run(tmp_path / "run", "wind_turbine", policy="paper", horizon=15.0)
+    found = run(tmp_path, mpc=("held", "preview"), run=tmp_path / "run")
+    episodes = UnseenEpisodes(config.plant(), 2)
+    for role, policy in load_run(tmp_path / "run").policies.items():
+        assert found[role.replace("_", "-")]["costs"] == pytest.approx(episodes.control_costs(policy).tolist())
+    planned = [f"MPC, {model}, {forecast}" for model in ("exact", "fitted") for forecast in ("held", "preview")]
+    assert list(found) == ["clairvoyant", "Jonkman", "model-based", "model-free", *planned]
     best, details = mean(found["clairvoyant"]), found["clairvoyant"]["details"]
     assert all(best < mean(contender) for name, contender in found.items() if name != "clairvoyant")
     assert mean(found["MPC, exact, preview"]) < mean(found["MPC, exact, held"])
@@ -43,6 +48,22 @@ def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
     assert found["Jonkman"]["milliseconds"]["median"] > 0.0 and found["clairvoyant"]["milliseconds"] is None
     printed = capsys.readouterr().out
     assert f"{mean(found['Jonkman']) / best:.4f}" in printed and "mean power [MW]" in printed
+
+
+def test_a_run_has_its_own_cost_and_command(tmp_path):
+    config, _ = leave_run(tmp_path / "run", "cryogenic_tank", command="duty", end_weight=7200.0, horizon=3000.0)
+    found, plant = run(tmp_path, run=tmp_path / "run"), config.plant()
+    assert list(found) == ["clairvoyant", "on-off", "on-off, resting", "PI", "model-based", "model-free"]
+    episodes = UnseenEpisodes(plant, 2)
+    judged = episodes.judge(episodes.fly_baseline(OnOffValve(plant)))
+    assert found["on-off"]["costs"] == judged.control_costs.tolist()
+    assert min(map(mean, found.values())) == mean(found["clairvoyant"])
+
+
+@pytest.mark.parametrize("option", [{"plant": "wind_turbine"}, {"horizon": 15.0}])
+def test_a_run_is_not_mixed_with_a_plant(option, tmp_path):
+    with pytest.raises(ValueError, match="run has a plant and a horizon of its own"):
+        recipe("limit").Config(run=tmp_path, **option)
 
 
 def test_results_are_standard_json(tmp_path):

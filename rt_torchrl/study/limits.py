@@ -20,6 +20,7 @@ from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonCo
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 RECORDS = 20
@@ -120,6 +121,20 @@ def classical(episodes: UnseenEpisodes, kind: type[ClassicalController], *, call
         began = time.perf_counter()
         controller.act(state, memory)
         seconds.append(time.perf_counter() - began)
+    return judged(episodes, flown, in_milliseconds(seconds))
+
+
+def learned(episodes: UnseenEpisodes, policy: nn.Module, *, calls: int = 50) -> Contender:
+    """A trained policy; ``calls`` is the number of actions that are timed, each of one observation."""
+    plant, flown = episodes.plant, episodes.fly(policy)
+    if isinstance(policy, StateFeedback):
+        return judged(episodes, flown, None)
+    start, seconds = torch.zeros(1, dtype=torch.float64), []
+    with torch.no_grad():
+        for _ in range(calls):
+            began = time.perf_counter()
+            policy(plant.observe(start, episodes.initial_state[:1], episodes.exogenous[:1, 0]))
+            seconds.append(time.perf_counter() - began)
     return judged(episodes, flown, in_milliseconds(seconds))
 
 
