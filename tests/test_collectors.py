@@ -5,6 +5,13 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
 from rt_torchrl import shipped_plants
+from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.valves import PIValve
+from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
@@ -62,6 +69,26 @@ def test_every_plant_flies_as_it_steps(name):
     dt = shipped_plants()[name]().dt
     # Rounding, amplified by the dynamics over 40 intervals.
     compare(lambda: system(shipped_plants()[name](horizon=40 * dt)), rtol=1e-9, atol=1e-9)
+
+
+CONTROLLERS = {
+    "cryogenic_tank": (CryogenicTank, PIValve),
+    "flapping_wing": (FlappingWing, TrimmedPD),
+    "wind_turbine": (WindTurbine, JonkmanController),
+}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_with_a_memory_flies_as_it_steps(name, noise):
+    kind, law = CONTROLLERS[name]
+
+    def controlled():
+        plant = kind(horizon=40 * kind().dt)
+        env, actor, _ = system(plant, noise=noise)
+        return env, actor, ActingController(law(plant))
+
+    compare(controlled, (0.3, 0.0), rtol=1e-9, atol=1e-9)
 
 
 def test_a_flight_that_diverges_says_where():

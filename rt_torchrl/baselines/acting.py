@@ -30,10 +30,21 @@ class ActingController(nn.Module):
         self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
     ) -> Float[Tensor, "batch n_a"]:
         """The command in the measured state, within the ranges of the actions; time and inputs are not used."""
+        memory = self.first_memory(state) if self._memory is None else self._memory
+        command, self._memory = self.respond(state, memory)
+        return command
+
+    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
+        """The controller's memory at the start of an episode."""
+        return self.controller.first_memory(state)
+
+    def respond(
+        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """The command, within the ranges of the actions, and the new memory."""
         law = self.controller
-        memory = law.first_memory(state) if self._memory is None else self._memory
-        command, self._memory = law.act(state, memory)
-        return command.clamp(law.low_action, law.high_action)
+        command, memory = law.act(state, memory)
+        return command.clamp(law.low_action, law.high_action), memory
 
     def fly(
         self,

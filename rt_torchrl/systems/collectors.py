@@ -1,5 +1,7 @@
 """Collectors fly whole real episodes, one at a time: by steps or, in simulation, by machine code."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict
@@ -13,7 +15,7 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.rollout import drive_of, require_finite
-from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.state_feedback import Remembering, StateFeedback
 
 
 class ExploringInterval(Interval):
@@ -41,6 +43,31 @@ class ExploringInterval(Interval):
         noise, factor = drive.command.split((len(self.plant.actions), len(self.plant.states)), -1)
         observation = self.plant.observe(drive.t, state * factor, drive.exogenous)
         return (self.policy(observation) + noise).clamp(self.low, self.high)
+
+
+class RememberingInterval(ExploringInterval):
+    """The same interval of a controller with a memory m; its state is (s, m)."""
+
+    policy: Any
+
+    def answer(self, carry: Tensor, disturbance: Tensor) -> tuple[Tensor, Tensor]:
+        """The command to the actuators and the new memory, with the noise and the factors of the sensors."""
+        n_s = len(self.plant.states)
+        noise, factor = disturbance.split((len(self.plant.actions), n_s), -1)
+        command, memory = self.policy.respond(carry[..., :n_s] * factor, carry[..., n_s:])
+        return (command + noise).clamp(self.low, self.high), memory
+
+    def command(self, state: Tensor, drive: Drive) -> Tensor:
+        """The commands in the states and memories of a whole episode, whose first dimension is the time."""
+        command, _ = self.answer(state.flatten(0, 1), drive.command.flatten(0, 1))
+        return command.unflatten(0, state.shape[:2])
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """State and memory at the end of the interval."""
+        command, memory = self.answer(state, drive.command)
+        s = state[..., : len(self.plant.states)]
+        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
+        return torch.cat([end, memory], -1)
 
 
 class EpisodeCollector:
@@ -75,8 +102,8 @@ class FlightCollector:
 
     No interval takes a Python step. A step of an environment costs some 0.4 ms, and an interval of the engine
     ``native`` about a microsecond; an episode of the drone or the tank has 10 000 intervals. The collector suits
-    :class:`PlantEnv` itself and no subclass, because it never calls the step of a subclass. Only :class:`StateFeedback`
-    flies by steps, because no machine code plans.
+    :class:`PlantEnv` itself and no subclass, because it never calls the step of a subclass. Of :class:`StateFeedback`
+    only what is :class:`Remembering` flies by machine code, because none plans.
 
     Args:
         env: the real system in simulation.
@@ -92,7 +119,9 @@ class FlightCollector:
     def rollout(self) -> TensorDict:
         """Fly one episode; its TensorDict has the batch size ``batch n``."""
         env = self.env
-        if isinstance(self.actor.policy, StateFeedback):
+        policy = self.actor.policy
+        law = policy if isinstance(policy, Remembering) else None
+        if isinstance(policy, StateFeedback) and law is None:
             return self._by_steps.rollout()
         pass_over(env)
         env.reset()
@@ -101,11 +130,16 @@ class FlightCollector:
         noise = torch.stack([self.actor.draw_noise((len(initial_state), len(plant.actions))) for _ in range(n)], 1)
         factors = torch.stack([factor, *(env.sensor_factor() for _ in range(n))], 1)
         drive = drive_of(plant, exogenous, torch.cat([noise, factors[:, :-1]], -1))
-        interval = ExploringInterval(plant, closure, self.actor)
-        ends = self._engine.end_states(interval, initial_state, drive)
-        require_finite(plant, ends, initial_state, [closure, self.actor.policy])
-        states = torch.cat([initial_state.unsqueeze(0), ends])
-        return flown(interval, states, drive, factors.transpose(0, 1)).transpose(0, 1)
+        start = initial_state
+        if law is not None:
+            start = torch.cat([start, law.first_memory(start * factors[:, 0])], -1)
+        interval = (ExploringInterval if law is None else RememberingInterval)(plant, closure, self.actor)
+        ends = self._engine.end_states(interval, start, drive)
+        require_finite(plant, ends, initial_state, [closure, policy])
+        carries = torch.cat([start.unsqueeze(0), ends])
+        command = interval.command(carries[:-1], drive)
+        states = carries[..., : len(plant.states)]
+        return flown(plant, states, command, drive, factors.transpose(0, 1)).transpose(0, 1)
 
 
 def collector_of(env: EnvBase, actor: LivePolicy, plant: Plant) -> EpisodeCollector | FlightCollector:
@@ -137,11 +171,13 @@ def pass_over(env: EnvBase) -> None:
 
 
 def flown(
-    interval: ExploringInterval, states: Float[Tensor, "samples batch n_s"], drive: Drive, factors: Tensor
+    plant: Plant,
+    states: Float[Tensor, "samples batch n_s"],
+    command: Float[Tensor, "n batch n_a"],
+    drive: Drive,
+    factors: Tensor,
 ) -> TensorDict:
     """The entries of an episode, computed from its true states, with the batch size ``n batch``."""
-    plant = interval.plant
-    command = interval.command(states[:-1], drive)
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
     reward[-1] -= plant.terminal_cost(states[-1]) / plant.dt

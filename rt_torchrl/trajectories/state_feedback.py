@@ -56,6 +56,19 @@ class StateFeedback(Protocol):
         """Numbers about the episode in which it acted last, for the report of that episode."""
 
 
+@runtime_checkable
+class Remembering(Protocol):
+    """State feedback that is a function of state and memory alone, so that an interval with it can be traced."""
+
+    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
+        """Memory at the start of an episode."""
+
+    def respond(
+        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """The command, within the ranges of the actions, and the new memory."""
+
+
 @torch.no_grad()
 def commands_along(controller: StateFeedback, flown: Trajectory, dt: float) -> Float[Tensor, "batch n n_a"]:
     """The commands of a controller in states that another one has reached.
