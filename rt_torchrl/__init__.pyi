@@ -10,6 +10,7 @@ from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.signal import Signal
 from .contract import ContractReport, PlantContractError, check_plant
+from .baselines.acting import ActingController
 from .baselines.classical import ClassicalController
 
 # Real systems
@@ -69,6 +70,7 @@ __version__: str
 __all__ = [
     "DDPG",
     "TD3",
+    "ActingController",
     "ActorCritic",
     "Actuation",
     "AssimilationConfig",
