@@ -135,10 +135,10 @@ class FlightCollector:
             start = torch.cat([start, law.first_memory(start * factors[:, 0])], -1)
         interval = (ExploringInterval if law is None else RememberingInterval)(plant, closure, self.actor)
         ends = self._engine.end_states(interval, start, drive)
-        require_finite(plant, ends, initial_state, [closure, policy])
         carries = torch.cat([start.unsqueeze(0), ends])
-        command = interval.command(carries[:-1], drive)
         states = carries[..., : len(plant.states)]
+        require_finite(plant, states[1:], initial_state, [closure, policy])
+        command = interval.command(carries[:-1], drive)
         return flown(plant, states, command, drive, factors.transpose(0, 1)).transpose(0, 1)
 
 
