@@ -8,7 +8,6 @@ from typing import Any, TypeVar, cast
 
 import tyro
 
-from rt_torchrl.runs.delayed_import import delay_import
 from rt_torchrl.runs.machine import quieten_libraries
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
@@ -20,7 +19,6 @@ Configuration = TypeVar("Configuration")
 def main_of(config_class: type, main: Callable[[Any], None]) -> None:
     """Run a recipe's main on its command line; an error that the user can mend is one line, without a traceback."""
     quieten_libraries()  # recipes check plants and make real systems before they make a run, or make none
-    delay_import("ray")  # TorchRL imports it where it is installed, which takes seconds; only a study uses it
     try:
         main(from_command_line(config_class))
     except (ValueError, OSError, DivergenceError) as error:
