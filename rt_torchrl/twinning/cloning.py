@@ -1,7 +1,6 @@
 """The idle policy becomes a clone of the live one."""
 
 import copy
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
@@ -19,8 +18,6 @@ from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 Result = TypeVar("Result")
-ROUGHER = 4
-"""Share of the gradients of a clone, as a divisor, that the imitation of a first controller takes."""
 
 
 class Cloning:
@@ -35,9 +32,6 @@ class Cloning:
     def __init__(self, virtual: VirtualEpisodes, config: DistillationConfig, count: int):
         self.virtual, self.count = virtual, count
         self.distillation = Distillation(virtual.twin, config)
-        # A plan follows the imitation of a first controller, so that this need not be as exact as a clone.
-        rough = dataclasses.replace(config, iterations=max(1, config.iterations // ROUGHER))
-        self.first_distillation = Distillation(virtual.twin, rough)
 
     def clone(
         self,
@@ -107,7 +101,7 @@ class Cloning:
             if first != role:
                 policy.load_state_dict(pupils[first].state_dict())
             elif judged_on is None:
-                report.update(findings(**{f"start_error_{role}": self.first_distillation.of_record(policy, record)}))
+                report.update(findings(**{f"start_error_{role}": self.distillation.of_record(policy, record)}))
             else:
                 report = merged(report, self._imitated(controller, role, policy, record, judged_on))
         return report
@@ -116,7 +110,7 @@ class Cloning:
         self, controller: nn.Module, role: Role, policy: nn.Module, record: Trajectory, judged_on: Scenario
     ) -> TensorDict:
         before, start = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
-        error = self.first_distillation.imitate(
+        error = self.distillation.imitate(
             controller, policy, seen=record, draw=functools.partial(self.virtual.draw, self.count)
         )
         cost, wanted = (self.virtual.cost(flown, judged_on).item() for flown in (policy, controller))
