@@ -102,7 +102,9 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from rt_torchrl.figures import identification as charts  # here, because --help need not wait for Matplotlib
+    # Here, because --help need not wait for Matplotlib.
+    from rt_torchrl.figures import identification as charts
+    from rt_torchrl.figures import save_figure
 
     plant = config.make_plant()
     log = checked(read_log(config.log, plant, [Column.parse(text) for text in config.columns]), plant, drop=config.drop)
@@ -123,7 +125,7 @@ def main(config: Config) -> None:
     drawn = {"twin_and_log": charts.twin_and_log(plant, measured, training, held_out, found)}
     drawn["weights"] = charts.weights(found)
     for name, figure in drawn.items():
-        figure.savefig(folder / "figures" / f"{name}.png", dpi=120)
+        save_figure(figure, folder / "figures" / f"{name}.png")
     print(table(metrics))
     print(f"results in {folder}")
 

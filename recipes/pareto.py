@@ -12,6 +12,7 @@ from rt_torchrl import ClassicalController, check_options, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.runs.results_file import make_folder
 from rt_torchrl.study.pareto import Effort, Point, classical_point, keep, pareto_front
 
 
@@ -85,7 +86,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    config.log_dir.mkdir(parents=True, exist_ok=True)
+    make_folder("log_dir", config.log_dir)
     front, recipe = FRONTS[config.plant], Path(__file__).with_name(f"{config.plant}.py")
     values = config.values or front.values
     found = pareto_front(recipe, front.options, front.weight, values, front.effort)

@@ -25,7 +25,7 @@ ROOMS_OF = {
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
     "limit.py": {"evaluation", "optimal_control", "runs", "study"},
-    "pareto.py": {"study"},
+    "pareto.py": {"runs", "study"},
     "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
     "study.py": {"study", "runs"},

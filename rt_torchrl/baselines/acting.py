@@ -42,9 +42,7 @@ class ActingController(nn.Module):
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command, within the ranges of the actions, and the new memory."""
-        law = self.controller
-        command, memory = law.act(state, memory)
-        return command.clamp(law.low_action, law.high_action), memory
+        return self.controller.respond(state, memory)
 
     def fly(
         self,

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.rollout import drive_of
+from rt_torchrl.trajectories.state_feedback import RememberingInterval
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 
@@ -62,7 +62,14 @@ class ClassicalController(nn.Module, ABC):
     def act(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
-        """The command, which the caller clamps to the ranges of the actions, and the new memory."""
+        """The command, which :meth:`respond` clamps to the ranges of the actions, and the new memory."""
+
+    def respond(
+        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """The command within the ranges of the actions, and the new memory."""
+        command, memory = self.act(state, memory)
+        return command.clamp(self.low_action, self.high_action), memory
 
     @torch.no_grad()
     def fly(
@@ -82,40 +89,10 @@ class ClassicalController(nn.Module, ABC):
             plant: physics of the system, such as a twin's; None for the controller's own plant.
         """
         plant = self.plant if plant is None else plant
-        loop, n_s = ControlledInterval(self, plant.closure if closure is None else closure, plant), len(plant.states)
+        loop = RememberingInterval(plant, plant.closure if closure is None else closure, self)
         start = torch.cat([initial_state, self.first_memory(initial_state)], -1)
         drive = drive_of(plant, exogenous, None)
         carries = torch.cat([start.unsqueeze(0), self._engine.end_states(loop, start, drive)])
-        states = carries[..., :n_s].transpose(0, 1)
-        command = loop.commanded(carries[:-1].flatten(0, 1))[0].unflatten(0, carries[:-1].shape[:2])
-        return Trajectory(states, plant.actuate(states[:, :-1], command.transpose(0, 1)), exogenous)
-
-
-class ControlledInterval(Interval):
-    """One control interval of a system under a classical controller; its state is (s, m).
-
-    Args:
-        controller: the controller.
-        closure: closure of the system.
-        plant: physics of the system.
-    """
-
-    policy: ClassicalController
-
-    def __init__(self, controller: ClassicalController, closure: nn.Module, plant: Plant):
-        super().__init__(plant, closure, controller)
-
-    def commanded(
-        self, carry: Float[Tensor, "batch n_c"]
-    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
-        """The command, clamped to the ranges of the actions, and the new memory."""
-        n_s = len(self.plant.states)
-        command, memory = self.policy.act(carry[..., :n_s], carry[..., n_s:])
-        return command.clamp(self.policy.low_action, self.policy.high_action), memory
-
-    def forward(self, state: Tensor, drive: Drive) -> Tensor:
-        """State and memory, (s, m), at the end of the interval."""
-        command, memory = self.commanded(state)
-        s = state[..., : len(self.plant.states)]
-        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
-        return torch.cat([end, memory], -1)
+        states = carries[..., : len(plant.states)].transpose(0, 1)
+        command = loop.command(carries[:-1], drive).transpose(0, 1)
+        return Trajectory(states, plant.actuate(states[:, :-1], command), exogenous)

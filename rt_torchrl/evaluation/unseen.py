@@ -139,6 +139,10 @@ class Judged(NamedTuple):
     control_costs: Float[Tensor, " count"]
     merit: dict[str, Float[Tensor, " count"]]
 
+    def means(self) -> dict[str, float]:
+        """Mean of each of the plant's own quantities."""
+        return {name: values.mean().item() for name, values in self.merit.items()}
+
     def statistics(self, chosen: Bool[Tensor, " count"] | None = None) -> dict[str, Any]:
         """Mean and confidence interval of ``J_a`` and of each quantity in ``merit``, which also has its median.
 

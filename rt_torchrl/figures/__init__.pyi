@@ -5,6 +5,7 @@ from .learning import closure_weights, learning_curves, seconds
 from .overview import figures_of
 from .policy import policy_contours
 from .snapshot import Snapshot
+from .style import save_figure
 from .unseen_episodes import unseen
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "figures_of",
     "learning_curves",
     "policy_contours",
+    "save_figure",
     "seconds",
     "states",
     "unseen",

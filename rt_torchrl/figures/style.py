@@ -4,7 +4,9 @@ The colours are those of Okabe and Ito (2008), which colour-blind readers can te
 pyplot, so they need no backend and no display, and are freed with their last reference.
 """
 
+import io
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from torch import Tensor, nn
 
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
@@ -57,6 +60,13 @@ def panels(
         ax.spines[["top", "right"]].set_visible(False)
         ax.tick_params(labelsize=9)
     return figure, axes
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG at 120 dpi, whole or not at all."""
+    drawing = io.BytesIO()
+    figure.savefig(drawing, dpi=120)
+    write_atomically(path, drawing.getvalue())
 
 
 def caption(ax: Axes, label: str, note: str = "") -> None:

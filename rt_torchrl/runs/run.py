@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import io
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
-from rt_torchrl.atomic_file import finite, write_atomically, write_json
+from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.baselines.acting import ActingController
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.contract.check import check_plant
@@ -256,9 +255,7 @@ class Run:
         drawn = self._figures(snapshot) | {"unseen": figures.unseen(judged, self.unseen.categories())}
         (self.folder / "figures").mkdir(exist_ok=True)
         for name, figure in drawn.items():
-            drawing = io.BytesIO()
-            figure.savefig(drawing, dpi=120)
-            write_atomically(self.folder / "figures" / f"{name}.png", drawing.getvalue())
+            figures.save_figure(figure, self.folder / "figures" / f"{name}.png")
         dashboard.figures(drawn, len(self.episodes) - 1)
         if self.animate:
             self.animate(snapshot, self.folder / "figures" / "animation.gif")

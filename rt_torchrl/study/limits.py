@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,9 +54,9 @@ def judged(
     episodes: UnseenEpisodes, flown: Trajectory, milliseconds: dict[str, float] | None, **details: Any
 ) -> Contender:
     """The contender that has flown the episodes."""
-    costs, merit = episodes.judge(flown)
-    means = {name: values.mean().item() for name, values in merit.items()}
-    return Contender(costs=costs.tolist(), merit=means, milliseconds=milliseconds, details=details)
+    found = episodes.judge(flown)
+    costs = found.control_costs.tolist()
+    return Contender(costs=costs, merit=found.means(), milliseconds=milliseconds, details=details)
 
 
 def limit(
@@ -116,12 +116,8 @@ def classical(episodes: UnseenEpisodes, kind: type[ClassicalController], *, call
     """A classical controller with its default gains; ``calls`` is the number of actions that are timed."""
     controller = kind(episodes.plant)
     flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1]
-    memory, seconds = controller.first_memory(state), []
-    for _ in range(calls):
-        began = time.perf_counter()
-        controller.act(state, memory)
-        seconds.append(time.perf_counter() - began)
-    return judged(episodes, flown, in_milliseconds(seconds))
+    memory = controller.first_memory(state)
+    return judged(episodes, flown, timed(lambda: controller.act(state, memory), calls))
 
 
 def learned(episodes: UnseenEpisodes, policy: nn.Module, *, calls: int = 50) -> Contender:
@@ -129,13 +125,8 @@ def learned(episodes: UnseenEpisodes, policy: nn.Module, *, calls: int = 50) -> 
     plant, flown = episodes.plant, episodes.fly(policy)
     if isinstance(policy, StateFeedback):
         return judged(episodes, flown, None)
-    start, seconds = torch.zeros(1, dtype=torch.float64), []
-    with torch.no_grad():
-        for _ in range(calls):
-            began = time.perf_counter()
-            policy(plant.observe(start, episodes.initial_state[:1], episodes.exogenous[:1, 0]))
-            seconds.append(time.perf_counter() - began)
-    return judged(episodes, flown, in_milliseconds(seconds))
+    seen = torch.zeros(1, dtype=torch.float64), episodes.initial_state[:1], episodes.exogenous[:1, 0]
+    return judged(episodes, flown, timed(lambda: policy(plant.observe(*seen)), calls))
 
 
 def receding(
@@ -157,6 +148,17 @@ def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: fl
     longest = min(horizon, 0.5 * plant.horizon)
     decaying = Decaying.fitted(records, dt=plant.dt, horizon=longest)
     return {"held": Held(), "decaying": decaying, "preview": Foreseen(exogenous, dt=plant.dt)}
+
+
+@torch.no_grad()
+def timed(action: Callable[[], object], calls: int) -> dict[str, float]:
+    """Median and greatest wall-clock time of some calls of an action [ms]."""
+    seconds = []
+    for _ in range(calls):
+        began = time.perf_counter()
+        action()
+        seconds.append(time.perf_counter() - began)
+    return in_milliseconds(seconds)
 
 
 def in_milliseconds(seconds: list[float]) -> dict[str, float]:

@@ -1,21 +1,20 @@
 """What one quantity costs another: optima of a class of policies along one weight of the cost."""
 
 import copy
-import io
 import math
-import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import nn
 
-from rt_torchrl.atomic_file import finite, write_atomically, write_json
+from rt_torchrl import figures
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.results_file import write_results
 from rt_torchrl.runs.run_config import RunConfig, plant_of
 from rt_torchrl.study.yardsticks import TRAINING_SEED, Options, configured
 
@@ -116,8 +115,7 @@ def classical_point(recipe: Path, options: Options, kind: type[ClassicalControll
 
 def point(judged: Judged, weight: float | None) -> Point:
     """The means over the episodes."""
-    merit = {name: statistics.fmean(values.tolist()) for name, values in judged.merit.items()}
-    return Point(weight, None if weight is None else judged.control_costs.mean().item(), merit)
+    return Point(weight, None if weight is None else judged.control_costs.mean().item(), judged.means())
 
 
 def keep(
@@ -145,7 +143,7 @@ def keep(
 
     front = [found._asdict() for found in points]
     classical = {name: found.merit for name, found in others.items()}
-    write_json(path, finite({"weight": weight, "effort": asdict(effort), "front": front, "classical": classical}))
+    write_results(path, {"weight": weight, "effort": effort, "front": front, "classical": classical})
     x, y = merits
     figure = pareto(
         [(found.weight or 0.0, found.merit[x], found.merit[y]) for found in points],
@@ -153,6 +151,4 @@ def keep(
         title=title,
         axes=merits,
     )
-    drawing = io.BytesIO()
-    figure.savefig(drawing, dpi=120)
-    write_atomically(path.with_suffix(".png"), drawing.getvalue())
+    figures.save_figure(figure, path.with_suffix(".png"))

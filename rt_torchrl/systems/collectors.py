@@ -1,7 +1,5 @@
 """Collectors fly whole real episodes, one at a time: by steps or, in simulation, by machine code."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict
@@ -15,7 +13,7 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.rollout import drive_of, require_finite
-from rt_torchrl.trajectories.state_feedback import Remembering, StateFeedback
+from rt_torchrl.trajectories.state_feedback import Remembering, RememberingInterval, StateFeedback
 
 
 class ExploringInterval(Interval):
@@ -45,29 +43,16 @@ class ExploringInterval(Interval):
         return (self.policy(observation) + noise).clamp(self.low, self.high)
 
 
-class RememberingInterval(ExploringInterval):
+class ExploringController(RememberingInterval, ExploringInterval):
     """The same interval of a controller with a memory m; its state is (s, m)."""
 
-    policy: Any
-
-    def answer(self, carry: Tensor, disturbance: Tensor) -> tuple[Tensor, Tensor]:
+    def answer(self, carry: Tensor, drive_command: Tensor) -> tuple[Tensor, Tensor]:
         """The command to the actuators and the new memory, with the noise and the factors of the sensors."""
         n_s = len(self.plant.states)
-        noise, factor = disturbance.split((len(self.plant.actions), n_s), -1)
-        command, memory = self.policy.respond(carry[..., :n_s] * factor, carry[..., n_s:])
+        noise, factor = drive_command.split((len(self.plant.actions), n_s), -1)
+        seen = torch.cat([carry[..., :n_s] * factor, carry[..., n_s:]], -1)
+        command, memory = super().answer(seen, drive_command)
         return (command + noise).clamp(self.low, self.high), memory
-
-    def command(self, state: Tensor, drive: Drive) -> Tensor:
-        """The commands in the states and memories of a whole episode, whose first dimension is the time."""
-        command, _ = self.answer(state.flatten(0, 1), drive.command.flatten(0, 1))
-        return command.unflatten(0, state.shape[:2])
-
-    def forward(self, state: Tensor, drive: Drive) -> Tensor:
-        """State and memory at the end of the interval."""
-        command, memory = self.answer(state, drive.command)
-        s = state[..., : len(self.plant.states)]
-        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
-        return torch.cat([end, memory], -1)
 
 
 class EpisodeCollector:
@@ -133,7 +118,7 @@ class FlightCollector:
         start = initial_state
         if law is not None:
             start = torch.cat([start, law.first_memory(start * factors[:, 0])], -1)
-        interval = (ExploringInterval if law is None else RememberingInterval)(plant, closure, self.actor)
+        interval = (ExploringInterval if law is None else ExploringController)(plant, closure, self.actor)
         ends = self._engine.end_states(interval, start, drive)
         carries = torch.cat([start.unsqueeze(0), ends])
         states = carries[..., : len(plant.states)]

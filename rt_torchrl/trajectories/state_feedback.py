@@ -1,12 +1,13 @@
 """State feedback: a controller of time, state and measured inputs, which may plan and remember."""
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 
@@ -67,6 +68,32 @@ class Remembering(Protocol):
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command, within the ranges of the actions, and the new memory."""
+
+
+class RememberingInterval(Interval):
+    """One control interval under a controller with a memory m; its state is (s, m), its policy :class:`Remembering`."""
+
+    policy: Any
+
+    def answer(
+        self, carry: Float[Tensor, "batch n_c"], drive_command: Float[Tensor, "batch n"]
+    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+        """The command and the new memory; a subclass may read the drive's command, of any width."""
+        n_s = len(self.plant.states)
+        command, memory = self.policy.respond(carry[..., :n_s], carry[..., n_s:])
+        return command, memory
+
+    def command(self, state: Tensor, drive: Drive) -> Tensor:
+        """The commands in the states and memories of whole episodes, whose first dimension is the time."""
+        command, _ = self.answer(state.flatten(0, 1), drive.command.flatten(0, 1))
+        return command.unflatten(0, state.shape[:2])
+
+    def forward(self, state: Tensor, drive: Drive) -> Tensor:
+        """State and memory, (s, m), at the end of the interval."""
+        command, memory = self.answer(state, drive.command)
+        s = state[..., : len(self.plant.states)]
+        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
+        return torch.cat([end, memory], -1)
 
 
 @torch.no_grad()

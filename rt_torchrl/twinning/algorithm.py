@@ -26,7 +26,7 @@ from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
-from rt_torchrl.twinning.flight import fly
+from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
@@ -129,9 +129,7 @@ class ReinforcementTwinning:
     def start(self) -> TensorDict:
         """Before the first episode, ``first`` flies one; twin and policies learn from it (paper: random weights)."""
         assert self.first is not None
-        flight = fly(self.actor, self.collector.rollout, self.first, strength=0.0)
-        self.learner.store(flight.transitions)
-        self.short_term.append(flight.record)
+        flight = self._flown(self.first, strength=0.0)
         if on_twin := self.config.arm != "model_free":
             self.fit_exogenous()
             self.assimilate()
@@ -142,19 +140,20 @@ class ReinforcementTwinning:
         return merged(found, findings(start_cost=flight.cost))
 
     def interact(self) -> TensorDict:
-        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S.
-
-        See :func:`fly` for episodes that cannot be learned from; no memory holds anything of them.
-        """
+        """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
-        flight = fly(self.actor, self.collector.rollout, self.policies[live], strength=strength)
-        self.learner.store(flight.transitions)
-        self.short_term.append(flight.record)
+        flight = self._flown(self.policies[live], strength=strength)
         self.track_record.append(flight.record, live, flight.cost.item())
-        report = merged(flight.report(), findings(exploration=self.actor.strength))
-        report.set_non_tensor("live", live)
+        report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
         flew = self.policies[live]
         return report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
+
+    def _flown(self, policy: nn.Module, *, strength: float) -> Flight:
+        """An episode on the real system, which both memories hold; of those that :func:`fly` refuses, none does."""
+        flight = fly(self.actor, self.collector.rollout, policy, strength=strength)
+        self.learner.store(flight.transitions)
+        self.short_term.append(flight.record)
+        return flight
 
     def update_model_free(self) -> TensorDict:
         """Step 2: the learner improves π_mf."""
