@@ -20,7 +20,7 @@ from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
 from rt_torchrl.plants.integrators import rk4_step
-from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.stability import require_stable_step
 
@@ -66,7 +66,7 @@ class CryogenicTank(Plant):
         closure: closure of the real tank, from :meth:`features` to U_s, U_HX, K_JT; None for the paper's constants.
         load: source of the heat load.
         fluid: pure fluid in the tank, by its name in CoolProp; ``ParaHydrogen`` is what hydrogen becomes when stored.
-        wall: ``explicit`` integrates the wall with the rest, ``exponential`` by its own solution, see :meth:`step`.
+        wall: ``explicit`` integrates the wall with the rest, ``exponential`` by its own solution, see :meth:`advance`.
         wall_heat_capacity: heat capacity m_s c_s of the wall [J/K].
         cost: running and terminal cost of J_a, see ``costs.py``; None for the paper's.
         command: action: the drop of a valve that is held half open, or the duty cycle of a valve that is either shut or
@@ -173,15 +173,15 @@ class CryogenicTank(Plant):
         wall = (exogenous[..., 0] - Q_sf) / self.wall_heat_capacity
         return torch.stack([wall, *self._mixture_rates(state[..., 1], now, Q_sf)], -1)
 
-    def step(
+    def advance(
         self,
         t: Float[Tensor, "*#batch"],
         state: Float[Tensor, "*batch 3"],
-        command: Float[Tensor, "*batch 1"],
+        applied: Float[Tensor, "*batch 1"],
         exogenous: Float[Tensor, "*#batch 1"],
         closure: nn.Module,
-    ) -> Transition:
-        r"""One control interval; with ``wall="exponential"`` the wall follows :func:`wall_rise`.
+    ) -> Float[Tensor, "*batch 3"]:
+        r"""The state after Δt; with ``wall="exponential"`` the wall follows :func:`wall_rise`.
 
         T and U_s keep their values at the start, and the mixture receives the mean of Q_sf that closes the wall's
         balance, :math:`Q_h - m_sc_s\Delta T_s/\Delta t`. No energy is lost, and a wall of any heat capacity is stable.
@@ -189,8 +189,7 @@ class CryogenicTank(Plant):
         field itself with the wall, and therefore still needs a wall that is stable.
         """
         if self.wall == "explicit":
-            return super().step(t, state, command, exogenous, closure)
-        applied = self.actuate(state, command)
+            return super().advance(t, state, applied, exogenous, closure)
         T_s, load = state[..., :1], exogenous[..., 0]
         start = self._conditions(state, applied, closure)
         superheat = T_s[..., 0] - start.tank.T
@@ -202,7 +201,7 @@ class CryogenicTank(Plant):
             return torch.stack(self._mixture_rates(s[..., 0], now, Q_sf), -1)
 
         end = rk4_step(mixture, t, state[..., 1:], self.dt)
-        return Transition(torch.cat([T_s + rise.unsqueeze(-1), end], -1), applied)
+        return torch.cat([T_s + rise.unsqueeze(-1), end], -1)
 
     def features(
         self, state: Float[Tensor, "*batch 3"], action: Float[Tensor, "*batch 1"], T: Float[Tensor, "*batch"]

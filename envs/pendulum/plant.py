@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.pendulum.merit import merit
 from rt_torchrl.envs.pendulum.models import UniformRod
-from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
 
@@ -108,14 +108,14 @@ class Pendulum(Plant):
         """The torque of the motor, at most ±2 N m."""
         return command.clamp(-self.greatest_torque, self.greatest_torque)
 
-    def step(
+    def advance(
         self,
         t: Float[Tensor, "*#batch"],
         state: Float[Tensor, "*batch 2"],
-        command: Float[Tensor, "*batch 1"],
+        applied: Float[Tensor, "*batch 1"],
         exogenous: Float[Tensor, "*#batch 0"],
         closure: nn.Module,
-    ) -> Transition:
+    ) -> Float[Tensor, "*batch 2"]:
         r"""Gymnasium's own step, semi-implicit Euler with a stop at ±8 rad/s, because it is the real system here.
 
         .. math:: \dot\theta' = \mathrm{stop}(\dot\theta + \ddot\theta\,\Delta t), \qquad
@@ -123,11 +123,10 @@ class Pendulum(Plant):
 
         The angle is kept within ±π, which its sine and cosine determine.
         """
-        applied = self.actuate(state, command)
         theta, rate = state.unbind(-1)
         acceleration = self.vector_field(t, state, applied, exogenous, closure)[..., 1]
         rate = (rate + acceleration * self.dt).clamp(-self.greatest_speed, self.greatest_speed)
-        return Transition(torch.stack([wrapped(theta + rate * self.dt), rate], -1), applied)
+        return torch.stack([wrapped(theta + rate * self.dt), rate], -1)
 
     # The control problem
 

@@ -1,7 +1,6 @@
 """A check that the explicit Runge-Kutta step is stable for the fastest decay of the plant."""
 
 from collections.abc import Iterator
-from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -41,10 +40,10 @@ def stability(calls: Calls) -> Iterator[str]:
 
 
 def steps_by_runge_kutta(plant: Plant, arguments: Arguments) -> bool:
-    """Whether the plant's step has the results of :meth:`Plant.step`, which it may wrap."""
+    """Whether the plant's step has the results of one Runge-Kutta step, which it may wrap."""
     t, state, command, exogenous = (arguments[name] for name in ("t", "state", "command", "exogenous"))
-    steps = (plant.step, partial(Plant.step, plant))
-    own, library = (step(t, state, command, exogenous, plant.closure).state for step in steps)
+    own, applied = plant.step(t, state, command, exogenous, plant.closure).state, plant.actuate(state, command)
+    library = plant.latch(Plant.advance(plant, t, state, applied, exogenous, plant.closure), applied)
     return torch.allclose(own, library, rtol=1e-12, atol=1e-12)
 
 

@@ -66,7 +66,7 @@ class Plant(nn.Module, ABC):
     observation_sets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """Names of measurements that are observed together, by the name of the set."""
     own_scheme: bool = False
-    """Whether :meth:`step` has a scheme of its own, which a twin must follow to the last digit.
+    """Whether :meth:`advance` has a scheme of its own, which a twin must follow to the last digit.
 
     The engine ``odeint_adjoint`` cannot follow it and is refused.
     """
@@ -75,6 +75,8 @@ class Plant(nn.Module, ABC):
 
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
+    unread: int = 0
+    """Number of states, the last ones, that no sensor reads; twins and policies do not know of them."""
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
@@ -101,6 +103,11 @@ class Plant(nn.Module, ABC):
     def acting_inputs(self) -> tuple[Signal, ...]:
         """Inputs that act on the plant; previews of these stand after them in ``inputs``."""
         return self.inputs[: len(self.inputs) - len(self.previews)]
+
+    @property
+    def readings(self) -> tuple[Signal, ...]:
+        """The states that sensors read, which are all that a record holds."""
+        return self.states[: len(self.states) - self.unread]
 
     @property
     def horizon(self) -> float:
@@ -132,6 +139,20 @@ class Plant(nn.Module, ABC):
         """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
 
+    def advance(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        applied: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        """The state after Δt under a held action, by one Runge-Kutta step of the vector field.
+
+        A plant that overrides this method has a scheme of its own; see :attr:`own_scheme`.
+        """
+        return rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
+
     def step(
         self,
         t: Float[Tensor, "*#batch"],
@@ -140,18 +161,16 @@ class Plant(nn.Module, ABC):
         exogenous: Float[Tensor, "*#batch n_z"],
         closure: nn.Module,
     ) -> Transition:
-        r"""One control interval, :math:`\Phi`: actuate, hold, integrate, latch.
+        r"""One control interval from ``t`` on, :math:`\Phi`: actuate, advance under the held action, latch.
 
-        Args:
-            t: start of the interval [s].
-            state: state at ``t``.
-            command: action that the policy asks for.
-            exogenous: exogenous input, held over the interval.
-            closure: the true closure in the real system, the learned one in the twin.
+        The closure is the true one in the real system, and the learned one in the twin.
         """
         applied = self.actuate(state, command)
-        end = rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
-        return Transition(self.latch(end, applied), applied)
+        return Transition(self.latch(self.advance(t, state, applied, exogenous, closure), applied), applied)
+
+    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> Float[Tensor, "*batch n_s"]:
+        """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
+        return read
 
     # The control problem
 
@@ -220,8 +239,7 @@ class Plant(nn.Module, ABC):
 
         Args:
             measured: states that were logged, by name.
-            exogenous: exogenous inputs of the n intervals between the samples.
-            actions: applied actions of the n intervals between the samples.
+            exogenous, actions: inputs and applied actions of the n intervals between the samples.
 
         Raises:
             ValueError: if states are missing; the message names them.
@@ -237,19 +255,11 @@ class Plant(nn.Module, ABC):
     def controller_start(
         self, measured: Float[Tensor, "*batch n_y"], exogenous: Float[Tensor, "*batch n_z"]
     ) -> Float[Tensor, "*batch n_c"]:
-        """The :attr:`controller_states` of a controller that is switched on; by default zeros.
-
-        Args:
-            measured: the other states, in their order.
-            exogenous: exogenous inputs.
-        """
+        """The :attr:`controller_states` of a controller that is switched on, given the other ones; by default zeros."""
         return measured.new_zeros(*measured.shape[:-1], len(self.controller_states))
 
     def with_previews(self, exogenous: Float[Tensor, "*batch n n_b"]) -> Float[Tensor, "*batch n n_z"]:
-        """All exogenous inputs of whole episodes, from those that act on the plant: previews are their shifts.
-
-        Args:
-            exogenous: ``acting_inputs`` at all n control intervals.
+        """All exogenous inputs of whole episodes, from the ``acting_inputs``: previews are their shifts.
 
         Raises:
             ValueError: if the time ahead of a preview is no whole number of control intervals.

@@ -171,8 +171,9 @@ def flown(
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
     truncated = torch.zeros(*reward.shape, 1, dtype=torch.bool, device=states.device)
     truncated[-1] = True
-    seen = {"state": states * factors, "exogenous": exogenous}
-    seen["observation"] = plant.observe(t, seen["state"], exogenous)
+    felt = states * factors
+    seen = {"state": felt[..., : len(plant.readings)], "exogenous": exogenous}
+    seen["observation"] = plant.observe(t, felt, exogenous)
     seen["applied"] = torch.cat([torch.zeros_like(applied[:1]), applied])
     never = torch.zeros_like(truncated)
     ended = {"reward": reward.unsqueeze(-1), "done": truncated, "truncated": truncated.clone(), "terminated": never}

@@ -27,7 +27,7 @@ class PlantEnv(EnvBase):
 
     =====================================  ======  ===================================================================
     ``observation``                        n_o     the tracking errors e_k
-    ``state``, ``exogenous``               n_s, z  s_k and z_k, which a record holds beside the actions
+    ``state``, ``exogenous``               n_r, z  readings of s_k, and z_k, which a record holds beside actions
     ``action``                             n_a     the command, within the ranges of the plant's actions
     ``("next", "applied")``                n_a     the action that the actuators applied
     ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k); at the horizon also −Φ_a(s_n)/Δt
@@ -170,7 +170,8 @@ class PlantEnv(EnvBase):
         self._factor = self.sensor_factor()
         state = self._state * self._factor
         observation = self.plant.observe(self._time(), state, exogenous)
-        entries |= {"observation": observation, "state": state, "exogenous": exogenous}
+        read = state[..., : len(self.plant.readings)]
+        entries |= {"observation": observation, "state": read, "exogenous": exogenous}
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def sensor_factor(self) -> Float[Tensor, "batch n_s"]:
@@ -197,10 +198,10 @@ def declare_specs(env: EnvBase, plant: Plant) -> None:
     def unbounded(n: int) -> Unbounded:
         return Unbounded(shape=(*batch, n), dtype=torch.float64, device=device)
 
-    n_o, n_s, n_a, n_z = map(len, (plant.observations, plant.states, plant.actions, plant.inputs))
+    n_o, n_r, n_a, n_z = map(len, (plant.observations, plant.readings, plant.actions, plant.inputs))
     env.observation_spec = Composite(
         observation=unbounded(n_o),
-        state=unbounded(n_s),
+        state=unbounded(n_r),
         exogenous=unbounded(n_z),
         applied=unbounded(n_a),
         shape=batch,

@@ -1,0 +1,104 @@
+"""A force that follows the flow with a lag: the coefficients of the closure are filtered."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.extensions.actuator_coefficients import ActuatorCoefficients
+from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+
+
+class _Lagging(nn.Module):
+    """The coefficients of a closure as the lag leaves them in one interval; it keeps what the closure said.
+
+    Args:
+        closure: the closure.
+        held: lagged coefficients at the start of the interval.
+        share: share of the way from the closure's to the lagged ones that is left, as a mean over the interval.
+    """
+
+    def __init__(self, closure: nn.Module, held: Tensor, share: Tensor):
+        super().__init__()
+        self.closure, self._held, self._share = closure, held, share
+        self.said: list[Tensor] = []
+
+    def forward(self, features: Tensor) -> Tensor:
+        now = self.closure(features)
+        if now.shape != self._held.shape:
+            raise ValueError(
+                f"the closure gives coefficients of shape {tuple(now.shape)} where {tuple(self._held.shape)} lag; only "
+                "a closure that is evaluated once for each state can lag."
+            )
+        self.said.append(now)
+        return now + (self._held - now) * self._share
+
+
+class LaggedCoefficients(Extension):
+    r"""A plant whose closure's coefficients reach the system with a time constant τ, such as a rotor's inflow.
+
+    .. math:: \tau\dot c = g(s) - c
+
+    The mean of c over the interval, for a g that is held at its mean over the stages of the step, acts in the place of
+    g. A short τ makes the plant that is extended.
+
+    Args:
+        base: the plant, which evaluates its closure once for each state.
+        time_constant: τ of the true system [s].
+        start: coefficients c at the start of an episode.
+        guess: τ that a twin begins with [s]; None for ``time_constant``.
+
+    Raises:
+        ValueError: if a time constant is not positive and finite, or the base is an extension.
+    """
+
+    initial: Tensor
+
+    def __init__(self, base: Plant, time_constant: float, start: tuple[float, ...], *, guess: float | None = None):
+        if isinstance(base, Extension):
+            raise ValueError(
+                "LaggedCoefficients changes the closure of the plant itself; extend its result, not its base."
+            )
+        hidden = [Signal(symbol=f"c_{k}", name=f"lagged_coefficient_{k}", unit="-") for k in range(len(start))]
+        super().__init__(base, hidden, self._coefficients(time_constant).requires_grad_(False))
+        self._guess = self._coefficients(time_constant if guess is None else guess)
+        self.register_buffer("initial", torch.tensor(start, dtype=torch.float64))
+
+    def _coefficients(self, time_constant: float) -> ActuatorCoefficients:
+        return ActuatorCoefficients({"force_lag": "s"}, {"force_lag": "time constant of the force"}, [time_constant])
+
+    def make_own(self) -> nn.Module:
+        return ActuatorCoefficients(self._guess.names, self._guess.meanings, self._guess.true_coefficients)
+
+    def vector_field(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        action: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        base, held = self.split(state)
+        lagging = _Lagging(self.of_base(closure), held, torch.ones_like(held[..., :1]))
+        field = self.base.vector_field(t, base, action, exogenous, lagging)
+        return torch.cat([field, (lagging.said[0] - held) / closure.get_submodule("own")()[0]], -1)
+
+    def advance(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        applied: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        base, held = self.split(state)
+        steps = self.dt / closure.get_submodule("own")()[0]
+        left = torch.exp(-steps)
+        lagging = _Lagging(self.of_base(closure), held, (1.0 - left) / steps)
+        end = self.base.advance(t, base, applied, exogenous, lagging)
+        mean = torch.stack(lagging.said).mean(0)
+        return torch.cat([end, mean + (held - mean) * left], -1)
+
+    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n"]:
+        return self.initial.expand(*base.shape[:-1], len(self.initial))
