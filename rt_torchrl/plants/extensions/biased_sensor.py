@@ -79,7 +79,7 @@ class BiasedSensor(Extension):
     def make_own(self) -> nn.Module:
         return SensorErrors(*self._arguments, (0.0, 0.0))
 
-    def true(self, read: Float[Tensor, "*batch n_b"], bias: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch n_b"]:
+    def true(self, read: Float[Tensor, "*batch n_b"], bias: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch n_b"]:
         """States of the plant, from what the sensors read."""
         shift = torch.zeros_like(read)
         return read - torch.cat(
