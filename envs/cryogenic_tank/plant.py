@@ -17,6 +17,7 @@ from rt_torchrl.envs.cryogenic_tank.mixture import Conditions, evaporation_heat,
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.neural import first_neural_guess
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
+from rt_torchrl.envs.cryogenic_tank.suspects import suspects
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
 from rt_torchrl.plants.integrators import rk4_step
@@ -275,7 +276,7 @@ class CryogenicTank(Plant):
         r"""The sum of the squared errors of T_s, V_l and p over their natural sizes, over T_o (paper, eq. of J_p)."""
         return (((state - measured) / self.error_sizes) ** 2).sum(-1) / self.horizon
 
-    merit, make_neural_closure = judgement.merit, first_neural_guess
+    merit, make_neural_closure, suspects = judgement.merit, first_neural_guess, suspects
 
     # Randomness
 

@@ -13,6 +13,7 @@ from rt_torchrl.envs.flapping_wing.costs import TrackingCost, needs_memory, requ
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
+from rt_torchrl.envs.flapping_wing.suspects import suspects
 from rt_torchrl.envs.flapping_wing.wings import Wings
 from rt_torchrl.plants.cost import RunningCost
 from rt_torchrl.plants.plant import Plant
@@ -248,7 +249,12 @@ class FlappingWing(Plant):
         """The discrepancy ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
-    merit, categories, make_neural_closure = judgement.merit, judgement.categories, drawn_neural_polar
+    merit, categories, make_neural_closure, suspects = (
+        judgement.merit,
+        judgement.categories,
+        drawn_neural_polar,
+        suspects,
+    )
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """All states; the stroke plane angle that was applied last is that of the record."""

@@ -291,6 +291,10 @@ class Plant(nn.Module, ABC):
             f"plant {self.name!r} has no neural closure; define its make_neural_closure, or use that of make_closure."
         )
 
+    def suspects(self) -> Mapping[str, "Plant"]:
+        """Plants that extend this one by what the real system may have beside it, by name; by default none."""
+        return {}
+
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The policy that both controllers start from, w_a⁰; by default a saturated affine law of the observation."""
         return SaturatedAffine(len(self.observations), self.actions, generator=generator)

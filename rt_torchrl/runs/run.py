@@ -34,9 +34,9 @@ from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.cloning import of_each_role
+from rt_torchrl.twinning.hypotheses import make_twin
 from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class Run:
         policies = config.acting_policies(policies, physics, closure)
         self.algorithm = ReinforcementTwinning(
             env,
-            DigitalTwin(physics, closure, engine=config.engine, compiled=compiled),
+            make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine, compiled=compiled),
             model_free=policies["model_free"],
             model_based=policies["model_based"],
             config=config.twinning,

@@ -21,12 +21,12 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
+from rt_torchrl.twinning.hypotheses import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
@@ -84,7 +84,7 @@ class ReinforcementTwinning:
             if part.policy is not self.policies[role]:
                 raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
         share_critic(self.learner, model_based)
-        self.assimilation = Assimilation(twin, config.assimilation)
+        self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses)
         self.short_term = ShortTermMemory(config.records)
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
@@ -170,7 +170,8 @@ class ReinforcementTwinning:
         processes = list(self.virtual.processes)[-len(self.short_term) :]
         self._earlier_closure = copy.deepcopy(self.twin.closure.state_dict())
         found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
-        return findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
+        fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
+        return merged(fit, self.assimilation.report())
 
     def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
         """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode.
@@ -193,6 +194,7 @@ class ReinforcementTwinning:
         self.policies["model_based"].load_state_dict(policy)  # state feedback holds the refused closure too
         self.twin.closure.load_state_dict(self._earlier_closure)
         self._earlier_closure = None
+        self.assimilation.retreat()
         self.generator.set_state(state)
         self.planner.restart()
         return merged(step(), findings(refused, closure_refused=1.0))

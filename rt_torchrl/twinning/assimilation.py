@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -22,6 +23,7 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
+from rt_torchrl.twinning.findings import findings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,6 +226,13 @@ class Assimilation:
             share * torch.einsum("bki,bkiw->w", g, S),
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
+
+    def retreat(self) -> None:
+        """React to a twin that diverges with the policy that has just flown; one that is alone cannot."""
+
+    def report(self) -> TensorDict:
+        """What the last update has found beside J_p; of one twin, nothing."""
+        return findings()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""

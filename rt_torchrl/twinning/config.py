@@ -8,6 +8,7 @@ from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
+from rt_torchrl.twinning.hypotheses import HypothesesConfig
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.referees import RefereeConfig
@@ -30,6 +31,7 @@ class TwinningConfig:
         learner: parameters of step 2.
         exogenous: parameters of step 3.
         assimilation: parameters of step 4.
+        hypotheses: parameters of the hypotheses about what the real system has beside its twin.
         planner: parameters of step 5.
         referee: parameters of step 6.
         distillation: parameters of step 6 for a clone between policies of different architectures.
@@ -43,6 +45,7 @@ class TwinningConfig:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)
     assimilation: AssimilationConfig = field(default_factory=AssimilationConfig)
+    hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     referee: RefereeConfig = field(default_factory=RefereeConfig)
     distillation: DistillationConfig = field(default_factory=DistillationConfig)

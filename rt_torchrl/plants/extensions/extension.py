@@ -224,13 +224,16 @@ class Extension(Plant):
         return self.base.draw_exogenous(batch, generator)
 
     def make_closure(self, generator: torch.Generator) -> nn.Module:
-        return self.extended(self.base.make_closure(generator))
+        return self._with_own(self.base.make_closure(generator))
 
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
-        return self.extended(self.base.make_neural_closure(generator, hidden))
+        return self._with_own(self.base.make_neural_closure(generator, hidden))
 
     def extended(self, closure: nn.Module) -> nn.Module:
-        """A closure of the plant with the parameters of :meth:`make_own` beside it."""
+        """A closure of the plant without extensions, with the parameters of all its extensions beside it."""
+        return self._with_own(self.base.extended(closure) if isinstance(self.base, Extension) else closure)
+
+    def _with_own(self, closure: nn.Module) -> nn.Module:
         return ExtendedClosure(closure, self.make_own()) if self._parametric else closure
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:

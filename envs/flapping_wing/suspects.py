@@ -1,0 +1,32 @@
+"""What a real drone may have beside the plant: dynamics of its two actuators."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
+from rt_torchrl.plants.plant import Plant
+
+if TYPE_CHECKING:
+    from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+
+LAG = 0.05  # [s]; one wing beat, with which the identification begins
+DEAD_TIME = 0.1  # [s]
+AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
+
+
+def suspects(plant: "FlappingWing") -> Mapping[str, Plant]:
+    """Lags and dead times of the stroke plane and of the amplitude."""
+
+    def lagging(base: Plant, action: str) -> Plant:
+        return LaggedActuator(base, action, LAG)
+
+    def late(base: Plant, action: str) -> Plant:
+        return SlowActuator(base, action, DEAD_TIME, stages=4)
+
+    return {
+        "plane lags": lagging(plant, PLANE),
+        "plane late": late(plant, PLANE),
+        "both lag": lagging(lagging(plant, PLANE), AMPLITUDE),
+        "both late": late(late(plant, PLANE), AMPLITUDE),
+    }

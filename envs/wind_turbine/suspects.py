@@ -1,0 +1,39 @@
+"""What a real turbine may have beside the plant: dynamics of the pitch drive and of the inflow."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
+from rt_torchrl.plants.plant import Plant
+
+if TYPE_CHECKING:
+    from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+
+PITCH_LAG = 0.7  # [s]; guess with which the identification begins
+INFLOW_LAG = 6.0  # [s]; about D/u at rated wind speed, 126 m/11.4 m/s = 11 s, within a factor of two
+INFLOW = (0.4,)  # C_p at the start of an episode [-]
+
+
+def suspects(plant: "WindTurbine") -> Mapping[str, Plant]:
+    """Dead times of one to three control intervals and a lag of the pitch drive, and a lagging inflow."""
+
+    def late(base: Plant, intervals: int) -> Plant:
+        return DelayedActuator(base, "blade_pitch", intervals * plant.dt)
+
+    def lagging(base: Plant) -> Plant:
+        return LaggedActuator(base, "blade_pitch", PITCH_LAG)
+
+    def inflow() -> Plant:
+        return LaggedCoefficients(plant, INFLOW_LAG, INFLOW)
+
+    return {
+        "pitch lag": lagging(plant),
+        "pitch late by 1": late(plant, 1),
+        "pitch late by 3": late(plant, 3),
+        "pitch lag, late by 1": late(lagging(plant), 1),
+        "pitch lag, late by 3": late(lagging(plant), 3),
+        "inflow": inflow(),
+        "inflow, pitch lag, late by 2": late(lagging(inflow()), 2),
+    }

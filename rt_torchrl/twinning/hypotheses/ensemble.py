@@ -1,0 +1,113 @@
+"""Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.rollout import Engine
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+ALONE = "as the twin"
+"""Name of the hypothesis that the real system has nothing beside its twin."""
+
+
+class TwinEnsemble(DigitalTwin):
+    r"""A digital twin whose predictions are those of weighted hypotheses.
+
+    .. math:: J(\pi) = (1 - \rho)\sum_h w_hJ_h(\pi) + \rho\max_h J_h(\pi)
+
+    Each hypothesis is a twin of its own, of a plant that extends the ensemble's. Initial states and records are those
+    that sensors read; every hypothesis has its hidden states at rest at the start. Replays and sensitivities are those
+    of the twin alone.
+
+    Args:
+        plant: physics of the twin alone.
+        closure: its closure.
+        suspects: plants that extend ``plant``, by name.
+        closures: closures of these plants, by name.
+        engine, compiled: see :class:`DigitalTwin`.
+
+    Raises:
+        ValueError: if a plant has no closure, or does not extend the twin's plant.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        closure: nn.Module,
+        suspects: Mapping[str, Plant],
+        closures: Mapping[str, nn.Module],
+        *,
+        engine: Engine = "native",
+        compiled: bool = False,
+    ):
+        super().__init__(plant, closure, engine=engine, compiled=compiled)
+        if suspects.keys() != closures.keys():
+            raise ValueError(
+                f"suspects {', '.join(suspects)} and closures {', '.join(closures)} must have equal names."
+            )
+        for name, suspect in suspects.items():
+            if suspect.readings != plant.states or suspect.dt != plant.dt:
+                raise ValueError(
+                    f"hypothesis {name!r} must extend the twin's plant {plant.name!r}: other states are read."
+                )
+        self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine, compiled=compiled)} | {
+            name: DigitalTwin(suspect, closures[name], engine=engine, compiled=compiled)
+            for name, suspect in suspects.items()
+        }
+        self.risk = 0.0
+        self.weights = {ALONE: 1.0}
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weights of the hypotheses that are planned on; they sum to one."""
+        return dict(self._shares)
+
+    @weights.setter
+    def weights(self, shares: Mapping[str, float]) -> None:
+        total = sum(shares.values())
+        self._shares = {name: share / total for name, share in shares.items()}
+
+    @property
+    def likeliest(self) -> str:
+        """Name of the hypothesis with the greatest weight."""
+        return max(self._shares, key=self._shares.__getitem__)
+
+    def control(
+        self,
+        policy: nn.Module,
+        initial_state: Float[Tensor, "batch n_s"],
+        exogenous: Float[Tensor, "batch n n_z"],
+        *,
+        start: float | Float[Tensor, " batch"] = 0.0,
+    ) -> Trajectory:
+        """Virtual episodes under the likeliest hypothesis, as sensors read them; see :meth:`DigitalTwin.control`."""
+        twin = self.twins[self.likeliest]
+        flown = twin.control(policy, twin.plant.at_rest(initial_state), exogenous, start=start)
+        return flown._replace(states=flown.states[..., : len(self.plant.states)])
+
+    def costs(
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+    ) -> dict[str, Float[Tensor, ""]]:
+        """Mean J_a under each hypothesis that is planned on."""
+        twins = {name: self.twins[name] for name in self._shares}
+        return {name: twin.cost(policy, twin.plant.at_rest(initial_state), exogenous) for name, twin in twins.items()}
+
+    def cost(
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+    ) -> Float[Tensor, ""]:
+        """Mean J_a of virtual episodes over the hypotheses; that of state feedback is the twin's own.
+
+        State feedback plans on the twin itself, and its flights take too long for all hypotheses.
+        """
+        if isinstance(policy, StateFeedback):
+            return super().cost(policy, initial_state, exogenous)
+        found = self.costs(policy, initial_state, exogenous)
+        each = torch.stack(list(found.values()))
+        shares = each.new_tensor(list(self._shares.values()))
+        return (1.0 - self.risk) * (shares * each).sum() + self.risk * each.max()
