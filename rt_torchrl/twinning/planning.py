@@ -8,7 +8,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
@@ -80,7 +79,7 @@ class Planning:
         self.planner.restart()
         try:
             found = self.planner.plan(planned_on)
-        except DivergenceError:
+        except FloatingPointError:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
         if found is not None and self.virtual.cost(policy, judged_on) < least:
             return planned(found, accepted=True)
@@ -95,7 +94,7 @@ class Planning:
         incumbent = judgement.incumbent(judged_on).item() if judged else 0.0
         try:
             found = self.planner.plan(planned_on)
-        except DivergenceError as error:
+        except FloatingPointError as error:
             judgement.require_sound_twin(planned_on)
             policy.load_state_dict(before)
             self.planner.restart()

@@ -40,7 +40,7 @@ class LaggedActuator(Extension):
         return ActuatorCoefficients({name: "s"}, {name: f"time constant of {self.action}"}, [time_constant])
 
     def make_own(self) -> nn.Module:
-        return ActuatorCoefficients(self._guess.names, self._guess.meanings, self._guess.true_coefficients)
+        return self._guess.fresh()
 
     def respond(
         self, hidden: Float[Tensor, "*batch 1"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module

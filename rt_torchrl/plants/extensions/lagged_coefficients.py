@@ -69,7 +69,7 @@ class LaggedCoefficients(Extension):
         return ActuatorCoefficients({"force_lag": "s"}, {"force_lag": "time constant of the force"}, [time_constant])
 
     def make_own(self) -> nn.Module:
-        return ActuatorCoefficients(self._guess.names, self._guess.meanings, self._guess.true_coefficients)
+        return self._guess.fresh()
 
     def vector_field(
         self,

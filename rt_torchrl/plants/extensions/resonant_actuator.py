@@ -47,7 +47,7 @@ class ResonantActuator(Extension):
         return ActuatorCoefficients(names, meanings, [frequency, damping / (1.0 - damping)])
 
     def make_own(self) -> nn.Module:
-        return ActuatorCoefficients(self._guess.names, self._guess.meanings, self._guess.true_coefficients)
+        return self._guess.fresh()
 
     def respond(
         self, hidden: Float[Tensor, "*batch 2"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module

@@ -46,7 +46,7 @@ class SlowActuator(Extension):
         return ActuatorCoefficients({name: "s"}, {name: f"dead time of {self.action}"}, [delay])
 
     def make_own(self) -> nn.Module:
-        return ActuatorCoefficients(self._guess.names, self._guess.meanings, self._guess.true_coefficients)
+        return self._guess.fresh()
 
     def respond(
         self, hidden: Float[Tensor, "*batch n"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module

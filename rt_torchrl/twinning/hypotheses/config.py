@@ -19,6 +19,8 @@ class HypothesesConfig:
             before anything is added.
         sharpness: exponent κ, which stands for the number of independent samples in the records.
         least: weight, as a share of the greatest one, below which a hypothesis is left out of the plan.
+        segment: number of control intervals after which a replay begins again with what was read; by default a sixtieth
+            of an episode.
         risk: share ρ of the worst hypothesis in the cost that is planned on, (1 − ρ) Σ w_h J_h + ρ max J_h.
 
     Raises:
@@ -30,6 +32,7 @@ class HypothesesConfig:
     prior: float = 0.05
     sharpness: float = 6.0
     least: float = 0.1
+    segment: int | None = None
     risk: float = 0.0
 
     def __post_init__(self) -> None:
@@ -40,5 +43,7 @@ class HypothesesConfig:
         for argument in ("least", "risk"):
             if not 0.0 <= getattr(self, argument) < 1.0:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the hypotheses must lie in [0, 1).")
+        if self.segment is not None and self.segment < 2:
+            raise ValueError(f"segment={self.segment} of the hypotheses must be at least 2 control intervals.")
         if self.names and self.which == "none":
             raise ValueError(f"names={self.names} of the hypotheses need which='automatic'; it is 'none'.")
