@@ -8,11 +8,13 @@ from pathlib import Path
 import fresh_process
 import pytest
 from benchmarking.case import Case, system_of
-from benchmarking.contenders import Contenders
+from benchmarking.contenders import QUANTITIES, Contenders
+from benchmarking.figures import save_figures
 from benchmarking.sizes import Grid, Size
 from benchmarking.summary import DRONE, Summary
 from benchmarking.timing import Cell, Stopwatch
 from benchmarking.updates import milliseconds_of_update
+from matplotlib.image import imread
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
 SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--plants", "wind_turbine", "--jax"]
@@ -43,6 +45,16 @@ def test_every_engine_is_timed_and_compared(tmp_path):
     assert 1e-11 < found["odeint_adjoint", "gradient"]["gap"] < 1e-4
     assert (tmp_path / "wind_turbine-law-affine-1.png").stat().st_size > 10_000
     assert "parallel" in (tmp_path / "benchmark.txt").read_text()
+
+
+def test_a_size_that_does_not_vary_has_no_panels(tmp_path):
+    sizes = [Size(Case("wind_turbine"), 1, steps, batch) for steps, batch in ((10, 5), (20, 5), (20, 1))]
+    heights = []
+    for count in (3, 2):
+        cells = [cell(size, "native", quantity, wall=0.1) for size in sizes[:count] for quantity in QUANTITIES]
+        (path,) = save_figures(cells, tmp_path)
+        heights.append(len(imread(path)))
+    assert heights[0] == 2 * heights[1] > 0
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 import shlex
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -55,14 +56,16 @@ def test_a_recipe_takes_its_printed_options(command):
 @pytest.mark.parametrize("given", options())
 def test_a_recipe_takes_the_options_that_a_sentence_names(given):
     """Some recipe does; an option that is named without its value stands in its help."""
-    arguments = shlex.split(given)
-    said = [refusal(name, whole(name, arguments)) for name in RECIPES]
-    if len(arguments) == 1 and None not in said:
-        assert any(re.search(rf"{given}\b", help_of(name)) for name in RECIPES), given
-    else:
-        assert None in said, said
+    arguments, said = shlex.split(given), []
+    for name in ("wind_turbine", *RECIPES):  # most sentences are about it
+        said.append(refusal(name, whole(name, arguments)))
+        if said[-1] is None:
+            return
+    assert len(arguments) == 1, said
+    assert any(re.search(rf"{given}\b", help_of(name)) for name in RECIPES), given
 
 
+@cache
 def help_of(name):
     shown = io.StringIO()
     with contextlib.redirect_stdout(shown), pytest.raises(SystemExit):

@@ -24,7 +24,10 @@ AXES = {"steps": "control intervals", "realisations": "realisations"}
 
 
 def save_figures(cells: Sequence[Cell], folder: Path) -> list[Path]:
-    """Draw one figure for each case and number of threads, with wall time over horizons and over realisations.
+    """Draw one figure for each case and number of threads, with time over horizons and over realisations.
+
+    On one thread it is CPU time, which other processes on the machine change least; on more threads it is wall time.
+    A size that does not vary has no panels.
 
     Args:
         cells: the cells; those that were left out are not drawn.
@@ -38,12 +41,14 @@ def save_figures(cells: Sequence[Cell], folder: Path) -> list[Path]:
     for case, threads in dict.fromkeys((cell.size.case, cell.size.threads) for cell in drawn):
         chosen = [cell for cell in drawn if (cell.size.case, cell.size.threads) == (case, threads)]
         plural = "thread" if threads == 1 else "threads"
-        title = f"{case.name}, {threads} {plural}\nwall time [s]"
-        figure, axes = panels(2, 2, title=title, size=(10.5, 8.0), sharey="row")
-        for row, quantity in zip(axes, QUANTITIES, strict=True):
-            of_quantity = [cell for cell in chosen if cell.quantity == quantity]
-            for ax, along in zip(row, AXES, strict=True):
-                _draw(ax, of_quantity, along, quantity)
+        clock = "CPU" if threads == 1 else "wall"
+        varied = [along for along in AXES if len({getattr(cell.size, along) for cell in chosen}) > 1] or ["steps"]
+        title = f"{case.name}, {threads} {plural}\n{clock} time [s]"
+        figure, axes = panels(len(varied), 2, title=title, size=(10.5, 4.0 * len(varied)), sharey="row")
+        for row, along in zip(axes, varied, strict=True):
+            for ax, quantity in zip(row, QUANTITIES, strict=True):
+                of_quantity = [cell for cell in chosen if cell.quantity == quantity]
+                _draw(ax, of_quantity, along, quantity, clock.lower())
         legend_below(figure, list(axes.flat))
         path = folder / f"{case.plant}-{case.closure}-{case.policy}-{threads}.png"
         figure.savefig(path)
@@ -51,7 +56,7 @@ def save_figures(cells: Sequence[Cell], folder: Path) -> list[Path]:
     return paths
 
 
-def _draw(ax: Axes, cells: Sequence[Cell], along: str, quantity: str) -> None:
+def _draw(ax: Axes, cells: Sequence[Cell], along: str, quantity: str, clock: str) -> None:
     """Draw the line of each contender along one of the two sizes, at the value of the other with the most points."""
     across = next(other for other in AXES if other != along)
     values = [getattr(cell.size, across) for cell in cells]
@@ -59,7 +64,7 @@ def _draw(ax: Axes, cells: Sequence[Cell], along: str, quantity: str) -> None:
     names = list(dict.fromkeys(cell.contender for cell in cells))
     for k, name in enumerate(names):
         line = sorted(
-            (getattr(cell.size, along), cell.wall)
+            (getattr(cell.size, along), getattr(cell, clock))
             for cell in cells
             if cell.contender == name and getattr(cell.size, across) == at
         )
