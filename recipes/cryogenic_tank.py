@@ -17,6 +17,7 @@ from rt_torchrl import (
     ExogenousConfig,
     ExplorationConfig,
     LearnerConfig,
+    LimitConfig,
     PlannerConfig,
     PredictiveConfig,
     RefereeConfig,
@@ -27,7 +28,7 @@ from rt_torchrl import (
 from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+from rt_torchrl.envs.cryogenic_tank.valves import NarrowOnOff, OnOffValve, PIValve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,6 +77,9 @@ NEURAL = dataclasses.replace(
     ),
 )
 """Configuration of the training with ``--closure mlp``."""
+
+VALVES = {"on-off": OnOffValve, "PI": PIValve}
+"""Classical controllers that the policies are compared with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +163,12 @@ class Config(RunConfig):
         """The cost that the options ask for."""
         return PressureCost(vented=self.vented_weight, end=self.end_weight)
 
+    def limit(self) -> LimitConfig:
+        if self.command == "duty":  # which changes within hours: a command is held for 10 min
+            return LimitConfig(starts=VALVES, hold=20, window=self.twinning.planner.receding_horizon)
+        # Gradients find no plans of a half-open valve; its many minima want a start that is close to the best one.
+        return LimitConfig(starts=VALVES | {"narrow on-off": NarrowOnOff}, resting=("narrow on-off",))
+
     def wear(self, plant: CryogenicTank) -> Callable[[int], nn.Module] | None:
         if not self.model_error:
             return None
@@ -183,8 +193,7 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 def main(config: Config) -> None:
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    baselines = {"on-off": OnOffValve, "PI": PIValve}
-    Run(config, config.plant(), plant_figures=plant_figures, baselines=baselines, first=PIValve).train()
+    Run(config, config.plant(), plant_figures=plant_figures, baselines=VALVES, first=PIValve).train()
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from rt_torchrl import (
     ExogenousConfig,
     ExplorationConfig,
     LearnerConfig,
+    LimitConfig,
     PlannerConfig,
     PredictiveConfig,
     RefereeConfig,
@@ -161,6 +162,9 @@ class Config(RunConfig):
     def cost(self) -> TrackingCost:
         """The running cost that the options ask for."""
         return TrackingCost(peak=self.peak, energy=self.energy, rate=self.tilt)
+
+    def limit(self) -> LimitConfig:
+        return LimitConfig(starts={"PD": TrimmedPD}, window=self.twinning.planner.receding_horizon)
 
     def believed(self) -> FlappingWing | None:
         """The physics of a twin that is wrong about them; None if it is right."""

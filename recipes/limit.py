@@ -12,43 +12,35 @@ if __name__ == "__main__":
 
 import torch
 
-from rt_torchrl import ClassicalController, LoadedRun, Plant, RecedingHorizonConfig, check_options, load_run, main_of
+from rt_torchrl import ClassicalController, LimitConfig, LoadedRun, Plant, RunConfig, check_options, load_run, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
-from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
-from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.runs.shipped_plants import plant_class
-from rt_torchrl.study.limits import (
+from rt_torchrl.evaluation.limits import (
     Contender,
     classical,
+    fitting,
+    flown_starts,
     forecasts,
     general_starts,
     learned,
     limit,
     receding,
-    resting_at_the_end,
 )
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.runs.command_line import load_recipe
+from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.runs.run_config import plant_of
 
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "wind_turbine": {"Jonkman": JonkmanController},
     "flapping_wing": {"PD": TrimmedPD},
     "cryogenic_tank": {"on-off": OnOffValve, "on-off, resting": RestingOnOff, "PI": PIValve},
 }
-
-
-class NarrowBand(OnOffValve):
-    """An on-off valve whose band is too narrow for a real one; a mixture of shut and open is close to the optimum."""
-
-    half_band = 200.0
-
-
-HORIZONS = {
-    "wind_turbine": RecedingHorizonConfig(horizon=20.0),
-    "flapping_wing": RecedingHorizonConfig(horizon=1.0, hold=5e-3, iterations=30, tolerance=1e-5),
-}
-"""Windows of model predictive control; the tank has none, because every pattern of its valve is near a minimum."""
+"""Classical controllers that are judged beside the limit."""
+TO_THE_END = BoundedDescentConfig(iterations=8000, tolerance=1e-15, gradient=1e-12)
+"""Descents until nothing more is gained; each of the turbine's takes five to eight thousand gradients."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,9 +52,10 @@ class Config:
         episodes: number of episodes, at least 2.
         seed: seed of the episodes; by default that of the unseen episodes of the trainings.
         horizon: length of an episode [s]; by default the plant's. A run has its own.
-        hold: number of control intervals for which a command of the optimum is held.
+        hold: number of control intervals for which a command of the optimum is held; 0 for the plant's own.
         starts: all, or classical to leave out constant and random commands.
-        mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none.
+        mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none while it
+            commands the drop.
         run: folder of a training. Its plant takes the place of plant, with its cost, command and limits; its policies
             are judged beside the controllers, and model predictive control plans on its closure, too.
         folder: folder of the results, which are in PLANT.json.
@@ -73,18 +66,16 @@ class Config:
     episodes: int = 8
     seed: int = UNSEEN_SEED
     horizon: float | None = None
-    hold: int = 1
+    hold: int = 0
     starts: Literal["all", "classical"] = "all"
     mpc: tuple[Literal["held", "decaying", "preview"], ...] = ("held", "decaying", "preview")
     run: Path | None = None
     folder: Path = Path("runs/limit")
-    descent: BoundedDescentConfig = field(
-        default_factory=lambda: BoundedDescentConfig(iterations=3000, tolerance=1e-11)
-    )
+    descent: BoundedDescentConfig = field(default_factory=lambda: TO_THE_END)
 
     def __post_init__(self):
         check_options(self)
-        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 1)):
+        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
         if self.run is not None and (self.plant is not None or self.horizon is not None):
@@ -95,10 +86,11 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     make_folder("folder", config.folder)
     run = None if config.run is None else load_run(config.run)
-    plant = chosen_plant(config) if run is None else run.plant
+    options = settings(config) if run is None else run.config
+    plant = plant_of(options) if run is None else run.plant
     path, found = config.folder / f"{plant.name}.json", {}
     print(f"seeking the clairvoyant optimum of {config.episodes} episodes", flush=True)
-    for name, contender in contenders(config, plant, run):
+    for name, contender in contenders(config, plant, limit_of(options), run):
         if not found:
             print(header(contender), flush=True)
         found[name] = contender
@@ -108,33 +100,44 @@ def main(config: Config) -> None:
     print(f"results in {path}")
 
 
-def chosen_plant(config: Config) -> Plant:
-    """The plant that the options name; the turbine if they name none."""
-    kind = plant_class(config.plant or "wind_turbine")
-    return kind() if config.horizon is None else kind(horizon=config.horizon)
+def settings(config: Config) -> RunConfig:
+    """The options of a training as in the paper; that of the turbine if no plant is named."""
+    recipe = load_recipe(Path(__file__).with_name(f"{config.plant or 'wind_turbine'}.py"))
+    horizon = {} if config.horizon is None else {"horizon": config.horizon}
+    return dataclasses.replace(recipe.Config(paper=True).defaults(), **horizon)
 
 
-def contenders(config: Config, plant: Plant, run: LoadedRun | None) -> Iterator[tuple[str, Contender]]:
+def limit_of(options: RunConfig) -> LimitConfig:
+    """How the limit of a training's plant is computed.
+
+    Raises:
+        ValueError: if its recipe does not say it.
+    """
+    found = options.limit()
+    if found is None:
+        raise ValueError(f"{type(options).__qualname__} has no limit; override RunConfig.limit() in the recipe.")
+    return found
+
+
+def contenders(
+    config: Config, plant: Plant, known: LimitConfig, run: LoadedRun | None
+) -> Iterator[tuple[str, Contender]]:
     """The clairvoyant optimum and all controllers, as they are found."""
-    episodes, controllers = UnseenEpisodes(plant, config.episodes, seed=config.seed), CONTROLLERS.get(plant.name, {})
-    starts = {name: episodes.fly_baseline(controller(plant)).actions for name, controller in controllers.items()}
-    if plant.name == "cryogenic_tank":
-        mixture = episodes.fly_baseline(NarrowBand(plant)).actions
-        starts["narrow on-off, shut at the end"] = resting_at_the_end(episodes, mixture)
+    episodes = UnseenEpisodes(plant, config.episodes, seed=config.seed)
+    starts = flown_starts(episodes, known)
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts
-    yield "clairvoyant", limit(episodes, chosen, hold=config.hold, config=config.descent)
-    for name, controller in controllers.items():
+    yield "clairvoyant", limit(episodes, chosen, hold=config.hold or known.hold, config=config.descent)
+    for name, controller in CONTROLLERS.get(plant.name, {}).items():
         yield name, classical(episodes, controller)
     for role, policy in {} if run is None else run.policies.items():
         yield role.replace("_", "-"), learned(episodes, policy)
-    if plant.name not in HORIZONS:
+    if known.window is None:
         return
-    horizon = HORIZONS[plant.name]
-    horizon = dataclasses.replace(horizon, horizon=min(horizon.horizon, plant.horizon))
-    known = forecasts(plant, episodes.exogenous, horizon.horizon)
+    window = fitting(known.window, plant)
+    foreseen = forecasts(plant, episodes.exogenous, window.horizon)
     for model, closure in {"exact": None, **({} if run is None else {"fitted": run.closure})}.items():
         for name in config.mpc:
-            yield f"MPC, {model}, {name}", receding(episodes, horizon, known[name], closure)
+            yield f"MPC, {model}, {name}", receding(episodes, window, foreseen[name], closure)
 
 
 def header(best: Contender) -> str:

@@ -22,7 +22,16 @@ from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.task import Task
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
-from rt_torchrl.study.yardsticks import Yardstick, classical, cost_along_gain, cost_over_episodes, oracle
+from rt_torchrl.study.yardsticks import (
+    Yardstick,
+    classical,
+    cost_along_gain,
+    cost_over_episodes,
+    least_cost,
+    oracle,
+    plans,
+    predictive_control,
+)
 
 if TYPE_CHECKING:
     from rt_torchrl.study.report import CaptionedFigure
@@ -85,6 +94,8 @@ class Config:
         ray_address: address of the Ray cluster, such as 10.0.0.1:6379. By default that of RAY_ADDRESS if it is set, or
             else a cluster on this machine alone.
         unseen: number of unseen episodes that judge everything.
+        limit_episodes: number of unseen episodes, the first ones, on which the limit and model predictive control are
+            computed; 0 leaves them out.
         folder: folder of the report and of all runs.
         quick: make the same report from one seed of short trainings, and mark it as quick.
     """
@@ -96,6 +107,7 @@ class Config:
     backend: Literal["loky", "ray"] = "loky"
     ray_address: str | None = None
     unseen: int = 100
+    limit_episodes: int = 8
     folder: Path = Path("runs/study")
     quick: bool = False
 
@@ -106,6 +118,8 @@ class Config:
         for argument, least in (("seeds", 1), ("variant_seeds", 0), ("jobs", 0), ("unseen", 2)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
+        if self.limit_episodes not in (0, *range(2, self.unseen + 1)):
+            raise ValueError(f"limit_episodes={self.limit_episodes} must be 0, or from 2 to unseen={self.unseen}.")
 
     def chosen(self) -> list[str]:
         """Names of the plants."""
@@ -165,6 +179,19 @@ class Config:
         found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
         return {name: Yardstick(place / f"{name}.json", compute) for name, compute in found.items()}
 
+    def limits(self, plant: str) -> dict[str, Yardstick]:
+        """The clairvoyant optimum of a plant, and model predictive control where it finds plans."""
+        if not self.limit_episodes:
+            return {}
+        count, iterations = (2, 100) if self.quick else (self.limit_episodes, 3000)
+        size = {"unseen": QUICK_UNSEEN if self.quick else self.unseen, "count": count}
+        system = recipe_of(plant), ("--episodes", str(self.episodes_of(plant)), *self.options_of(plant))
+        found = {"limit": partial(least_cost, *system, **size, iterations=iterations)}
+        if plans(*system):
+            found["mpc"] = partial(predictive_control, *system, **size)
+        place = self.kept / "yardsticks" / plant
+        return {name: Yardstick(place / f"{name}-{count}.json", compute) for name, compute in found.items()}
+
     def line(self, plant: str) -> Yardstick | None:
         """Costs of a plant along one quantity; None for a plant whose tables say enough."""
         counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
@@ -218,9 +245,9 @@ def short_batches(config: Config) -> list[list[Task]]:
 
 
 def yardstick_tasks(config: Config, plant: str) -> list[Task]:
-    """Tasks that compute the yardsticks of a plant, and its line of costs if it has one."""
+    """Tasks that compute the yardsticks of a plant, its limit, and its line of costs if it has one."""
     line = config.line(plant)
-    return [*config.yardsticks(plant).values(), *([line] if line else [])]
+    return [*config.yardsticks(plant).values(), *config.limits(plant).values(), *([line] if line else [])]
 
 
 def entries_of(config: Config, plant: str) -> list[Entry]:
@@ -244,10 +271,11 @@ def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
 
 def gather(config: Config) -> Results:
     """Gather the results that the report needs."""
-    results = Results({}, {}, {})
+    results = Results({}, {}, {}, {})
     for plant in config.chosen():
         nominal = config.trainings(plant)["nominal", "twinning"]
         results.entries[plant], results.variants[plant] = entries_of(config, plant), harder_of(config, plant)
+        results.limits[plant] = [yardstick_entry(name, task.run()) for name, task in config.limits(plant).items()]
         results.summaries[plant] = [training.metrics()["summary"] for training in nominal]
     return results
 
@@ -296,7 +324,8 @@ def command(config: Config) -> str:
     """The command line that makes this report."""
     plants = " ".join(config.plants)
     size = f"--seeds {config.seeds} --variant-seeds {config.variant_seeds} --unseen {config.unseen}"
-    return f"uv run recipes/study.py --plants {plants} {'--quick' if config.quick else size}"
+    limits = "" if config.limit_episodes == 8 else f" --limit-episodes {config.limit_episodes}"
+    return f"uv run recipes/study.py --plants {plants} {'--quick' if config.quick else size}{limits}"
 
 
 def main(config: Config) -> None:

@@ -17,6 +17,7 @@ from rt_torchrl import (
     AssimilationConfig,
     DescentConfig,
     LearnerConfig,
+    LimitConfig,
     PlannerConfig,
     PredictiveConfig,
     RunConfig,
@@ -172,6 +173,9 @@ class Config(RunConfig):
         if self.policy == "bias":
             return plant.make_policy(generator, bias=True)
         return super().make_policy(plant, generator)
+
+    def limit(self) -> LimitConfig:
+        return LimitConfig(starts={"Jonkman": JonkmanController}, window=self.twinning.planner.receding_horizon)
 
     def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
         if not self.model_error:

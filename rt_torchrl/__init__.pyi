@@ -33,6 +33,7 @@ from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen
 from .optimal_control.predictive_control import PredictiveConfig, PredictiveControl
 from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
+from .evaluation.limits import LimitConfig
 from .identification.identification import Identification, IdentificationConfig
 from .identification.sensor_log import read_log
 
@@ -99,6 +100,7 @@ __all__ = [
     "IdentificationConfig",
     "Learner",
     "LearnerConfig",
+    "LimitConfig",
     "LoadedRun",
     "LongTermMemoryConfig",
     "Measurement",

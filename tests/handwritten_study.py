@@ -102,4 +102,12 @@ def results(tmp_path):
     variants = {"noise 1 %": noisy, CHANGED: [*changed[:3], yardsticks[0]]}
     summaries = [t.metrics()["summary"] for t in trainings]
     plant = "flapping_wing"
-    return Results({plant: [twinning, *halves, *yardsticks]}, {plant: summaries}, {plant: variants})
+    few = np.array(ruler[:8])
+    limits = [
+        yardstick_entry("limit", {"costs": (0.5 * few).tolist(), "merit": {"m [m]": {"mean": 1.0}}}),
+        yardstick_entry(
+            "mpc",
+            {"costs": (0.75 * few).tolist(), "merit": {"m [m]": {"mean": 1.0}}, "milliseconds": {"median": 3.25}},
+        ),
+    ]
+    return Results({plant: [twinning, *halves, *yardsticks]}, {plant: summaries}, {plant: variants}, {plant: limits})

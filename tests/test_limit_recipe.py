@@ -13,10 +13,10 @@ from test_export_recipe import leave_run, recipe
 
 from rt_torchrl import load_run
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
+from rt_torchrl.evaluation.limits import resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.runs.results_file import write_results
-from rt_torchrl.study.limits import resting_at_the_end
 from rt_torchrl.trajectories.rollout import Rollout
 
 
@@ -51,9 +51,10 @@ def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
 
 
 def test_a_run_has_its_own_cost_and_command(tmp_path):
-    config, _ = leave_run(tmp_path / "run", "cryogenic_tank", command="duty", end_weight=7200.0, horizon=3000.0)
-    found, plant = run(tmp_path, run=tmp_path / "run"), config.plant()
-    assert list(found) == ["clairvoyant", "on-off", "on-off, resting", "PI", "model-based", "model-free"]
+    config, _ = leave_run(tmp_path / "run", "cryogenic_tank", command="duty", end_weight=7200.0, horizon=7200.0)
+    found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",)), config.plant()
+    planned = ["MPC, exact, held", "MPC, fitted, held"]
+    assert list(found) == ["clairvoyant", "on-off", "on-off, resting", "PI", "model-based", "model-free", *planned]
     episodes = UnseenEpisodes(plant, 2)
     judged = episodes.judge(episodes.fly_baseline(OnOffValve(plant)))
     assert found["on-off"]["costs"] == judged.control_costs.tolist()
@@ -97,7 +98,7 @@ def test_the_printed_example_runs(capsys):
     assert 0.0 < first < 0.1 and 0.0 < second < 0.1
 
 
-@pytest.mark.parametrize("option", [{"episodes": 1}, {"seed": -1}, {"hold": 0}])
+@pytest.mark.parametrize("option", [{"episodes": 1}, {"seed": -1}, {"hold": -1}])
 def test_impossible_options_are_refused(option):
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"{name}={value}"):

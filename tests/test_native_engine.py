@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections import OrderedDict
 
 import pytest
 import torch
@@ -18,10 +19,12 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.engines import programs
 from rt_torchrl.trajectories.engines.autograd import Autograd
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.native import LEAST_MEMORY, Native
 from rt_torchrl.trajectories.engines.weights import Weights
+from rt_torchrl.trajectories.rollout import Rollout
 
 PLANTS = {
     "linear_quadratic": LinearQuadratic,
@@ -293,3 +296,25 @@ def test_states_that_leave_the_numbers_are_kept():
 
 def test_weights_are_one_row():
     assert Weights(nn.Linear(2, 1).double()).row().shape == (3,)
+
+
+class Saturated(nn.Module):
+    """A policy whose gradient is rounding: 1 − tanh² of about 18 is some units in the last place of one."""
+
+    def __init__(self, bias):
+        super().__init__()
+        self.weight = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
+        self.bias = nn.Parameter(torch.tensor(bias, dtype=torch.float64))
+
+    def forward(self, observation):
+        return torch.tanh(self.bias + (observation * self.weight).sum(-1, keepdim=True))
+
+
+@pytest.mark.parametrize("bias", [17.0, 17.34, 17.85, 18.36, 18.7])
+def test_the_rounding_of_a_saturated_policy_is_no_reason_to_refuse_it(bias, monkeypatch):
+    monkeypatch.setattr(programs, "_kept", OrderedDict())  # policies of the same kind share their programs
+    plant, generator = LinearQuadratic(horizon=1.0), torch.Generator().manual_seed(0)
+    state, exogenous = plant.draw_initial_state(4, generator), plant.draw_exogenous(4, generator)
+    policy = Saturated(bias)
+    Rollout(plant, plant.closure, policy).costs(state, exogenous).mean().backward()
+    assert policy.weight.grad.abs().max() < 1e-12

@@ -6,10 +6,11 @@ import torch
 from linear_quadratic import LinearQuadratic
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig, descend
 from rt_torchrl.optimal_control.clairvoyant import clairvoyant, constant_starts, random_starts
 from rt_torchrl.optimal_control.forecasts import Foreseen
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
@@ -97,6 +98,20 @@ def test_an_optimum_without_a_start_is_refused():
     plant = LinearQuadratic(horizon=1.0)
     with pytest.raises(ValueError, match="starts is empty"):
         clairvoyant(plant, *episodes(plant, 1), {})
+
+
+def test_a_descent_uses_one_thread_for_its_scalar_products():
+    """Two threads wait for each other in each of thousands of products; beside other work that takes milliseconds."""
+    threads = set()
+
+    def evaluate(point):
+        threads.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+        return float(np.square(point - 0.3).sum()), 2.0 * (point - 0.3)
+
+    with threadpool_limits(2, "blas"):
+        found = descend(evaluate, np.full((1, 5), 0.9), BoundedDescentConfig())
+    np.testing.assert_allclose(found.point, 0.3, atol=1e-6)
+    assert threads == {1, 2}  # the cost at the start is taken outside
 
 
 def test_starts_that_diverge_are_reported():

@@ -24,9 +24,24 @@ def test_short_trainings_of_a_plant_share_a_worker(tmp_path):
     assert plants_of == [{"cryogenic_tank"}, {"flapping_wing"}, {"wind_turbine"}, {"wind_turbine"}, set()]
     (alone,) = batches[3]
     assert alone.options[-2:] == ("--policy", "scheduled")
-    assert [task.path.stem for task in batches[4]] == ["oracle", "Jonkman"]
+    assert [task.path.stem for task in batches[4]] == ["oracle", "Jonkman", "limit-2", "mpc-2"]
     planned = [task for batch in batches for task in batch]
     assert len(planned) == len(study.ordered_tasks(study.Config(quick=True, folder=tmp_path)))
+
+
+def test_the_limit_and_predictive_control_can_be_left_out(tmp_path):
+    config = recipe("study").Config
+    plants = ("wind_turbine", "flapping_wing", "cryogenic_tank")
+    asked = {plant: list(config(folder=tmp_path).limits(plant)) for plant in plants}
+    # Gradients find no plans of the tank's half-open valve.
+    assert asked == {"wind_turbine": ["limit", "mpc"], "flapping_wing": ["limit", "mpc"], "cryogenic_tank": ["limit"]}
+    assert all(config(folder=tmp_path, limit_episodes=0).limits(plant) == {} for plant in plants)
+    few = config(folder=tmp_path, limit_episodes=3)
+    assert few.limits("wind_turbine")["mpc"].path.name == "mpc-3.json"  # other results than those on 8 episodes
+    assert "--limit-episodes 3" in recipe("study").command(few)
+    for impossible in (1, 101, -1):
+        with pytest.raises(ValueError, match=f"limit_episodes={impossible} must be 0, or from 2 to unseen=100"):
+            config(limit_episodes=impossible)
 
 
 def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
@@ -77,7 +92,8 @@ def test_the_report_is_written_from_what_is_kept(tmp_path):
     shown = [part.split(")")[0] for part in text.split("](figures/")[1:]]
     assert shown == [f"{name}.png" for name in [*study_figures, *(f"flapping_wing_{name}" for name in names)]]
     assert page.read_text().count("data:image/png;base64,") == len(shown)
-    assert all(f"| {name} |" in text for name in ("twinning", "twinning, perceptron", "PD", "oracle"))
+    names = ("twinning", "twinning, perceptron", "PD", "oracle", "limit", "mpc")
+    assert all(f"| {name} |" in text for name in names)
     assert "1.2 on 2, 1.1 on 5" in text and "--quick" in text
     numbers = json.loads((page.parent / "study.json").read_text())["flapping_wing"]
     assert list(numbers["variants"]) == ["noise 5 %", "model error"]

@@ -37,6 +37,23 @@ def test_the_report_says_what_was_found(tmp_path):
     assert numbers["variants"]["noise 1 %"]["twinning"]["J_a"] == pytest.approx(1.5 * 1.0, rel=0.1)
 
 
+def test_the_table_has_the_limit_and_predictive_control_on_the_first_episodes(tmp_path):
+    found = results(tmp_path)
+    text = report.write(tmp_path, found, figures=[], quick=False, command="x")[0].read_text()
+    rows = {line.split(" | ")[0][2:]: line.split(" | ") for line in text.splitlines() if line.startswith("| ")}
+    entries = {entry.name: entry for entry in found.entries["flapping_wing"]}
+    best = 0.5 * entries["twinning"].costs[0, :8].mean()
+    assert rows["limit"][4] == "1.000" and rows["mpc"][4] == "1.500"
+    assert rows["twinning"][4] == f"{entries['twinning'].costs[:, :8].mean() / best:.3f}"
+    assert rows["mpc"][3] == f"{1.5 * best / entries['oracle'].costs[:, :8].mean():.3f}"
+    assert "first\n8 of the unseen episodes" in text and "3.25 ms in the median" in text
+    assert "against the classical limit" not in text and "against the classical mpc" not in text
+    numbers = json.loads((tmp_path / "study.json").read_text())["flapping_wing"]
+    assert numbers["limits"]["mpc"]["milliseconds"] == 3.25 and numbers["limits"]["limit"]["episodes"] == 8
+    without = report.write(tmp_path, found._replace(limits={"flapping_wing": []}), figures=[], quick=False, command="x")
+    assert "limit" not in without[0].read_text()
+
+
 def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     found = results(tmp_path)
     curves = charts.learning(found.entries)
@@ -103,6 +120,6 @@ def test_the_page_holds_its_figures(tmp_path):
 
 def test_a_study_without_variants_has_no_section_of_them(tmp_path):
     found = results(tmp_path)
-    alone = Results(found.entries, found.summaries, {"flapping_wing": {}})
+    alone = Results(found.entries, found.summaries, {"flapping_wing": {}}, {"flapping_wing": []})
     source, _ = report.write(tmp_path, alone, figures=[], quick=False, command="uv run x")
     assert "Sensor noise and model error" not in source.read_text()

@@ -4,10 +4,19 @@ import pytest
 import torch
 from handwritten_study import RECIPES
 
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.runs.shipped_plants import shipped_plants
 from rt_torchrl.study import yardsticks
-from rt_torchrl.study.yardsticks import Yardstick, changed_closure, configured, cost_over_episodes
+from rt_torchrl.study.results import yardstick_entry
+from rt_torchrl.study.yardsticks import (
+    Yardstick,
+    changed_closure,
+    configured,
+    cost_over_episodes,
+    least_cost,
+    predictive_control,
+)
 
 
 def test_what_is_kept_is_not_computed_again(tmp_path):
@@ -51,6 +60,28 @@ def test_a_plan_on_training_episodes_is_judged_on_unseen_ones(monkeypatch):
     start = plant.make_policy(torch.Generator().manual_seed(UNSEEN_SEED))
     assert planned[0]["costs"] == pytest.approx([UnseenEpisodes(plant, 4).control_costs(start).mean().item()] * 2)
     assert planned[8]["values"] == [2, 3] and max(planned[8]["costs"]) < planned[0]["costs"][0]
+
+
+def test_the_limit_is_below_predictive_control_on_the_first_unseen_episodes(monkeypatch):
+    monkeypatch.setattr(yardsticks, "missing_for_compilation", lambda: "a compiler")
+    system = RECIPES / "wind_turbine.py", ("--horizon", "15", "--policy", "paper")
+    best = least_cost(*system, unseen=4, count=2, iterations=3000)
+    planned = predictive_control(*system, unseen=4, count=2)
+    assert all(low < high for low, high in zip(best["costs"], planned["costs"], strict=True))
+    assert len(best["costs"]) == 2 and best["details"]["projected_gradient"] < 1e-2
+    assert best["milliseconds"] is None and planned["milliseconds"]["median"] > 0.0
+    episodes = UnseenEpisodes(configured(*system).plant(), 4).first(2)
+    jonkman = episodes.judge(episodes.fly_baseline(JonkmanController(episodes.plant)))
+    assert set(best["merit"]) == set(jonkman.merit) and max(best["costs"]) < jonkman.control_costs.max()
+    entry = yardstick_entry("mpc", planned)
+    assert entry.milliseconds == planned["milliseconds"]["median"] and entry.over(yardstick_entry("limit", best)) > 1.0
+
+
+def test_what_a_recipe_does_not_say_is_refused():
+    with pytest.raises(ValueError, match="no model predictive control with the options --command drop"):
+        predictive_control(RECIPES / "cryogenic_tank.py", ("--command", "drop", "--horizon", "3000"), unseen=2, count=2)
+    with pytest.raises(ValueError, match="does not say how the limit is computed"):
+        least_cost(RECIPES / "pendulum.py", (), unseen=2, count=2, iterations=1)
 
 
 def test_yardsticks_are_measured_on_the_plant_of_the_trainings():

@@ -31,6 +31,12 @@ class OnOffValve(ClassicalController):
         return self.plant.command.of_drop(is_open * self.log_gains[0].exp()), is_open
 
 
+class NarrowOnOff(OnOffValve):
+    """An on-off valve whose band is too narrow for a real one; a mixture of shut and open is close to the optimum."""
+
+    half_band = 200.0
+
+
 class RestingOnOff(OnOffValve):
     r"""The on-off valve with a clock: it stays shut for the last part of the episode.
 

@@ -1,5 +1,6 @@
 """Evaluation of twin and policies on episodes that they were never trained on."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -51,6 +52,16 @@ class UnseenEpisodes:
         self.closure: nn.Module | None = plant.closure
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
+
+    def first(self, count: int) -> "UnseenEpisodes":
+        """The first of these episodes, on the system as it is now.
+
+        Args:
+            count: number of episodes, at least 2; all of them if there are fewer.
+        """
+        found = copy.copy(self)
+        found.initial_state, found.exogenous = self.initial_state[:count], self.exogenous[:count]
+        return found
 
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:

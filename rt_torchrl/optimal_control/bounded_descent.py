@@ -1,8 +1,9 @@
 """The descent of a cost between bounds by L-BFGS-B."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -99,6 +100,7 @@ def descend(
     from scipy.optimize import minimize  # here, because it takes a second to load and --help need not wait for it
 
     seen = _Seen(evaluate, start)
+    seen = _Seen(evaluate, start)
     options = {
         "maxiter": config.iterations,
         "maxfun": 2 * config.iterations + 20,
@@ -106,8 +108,22 @@ def descend(
         "ftol": config.tolerance,
         "gtol": config.gradient,
     }
-    minimize(seen, start.ravel(), jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * start.size, options=options)
+    bounds = [(0.0, 1.0)] * start.size
+    with _libraries().limit(limits=1, user_api="blas"):
+        minimize(seen, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return seen.best._replace(evaluations=seen.count)
+
+
+@functools.cache
+def _libraries() -> Any:
+    """The linear algebra of NumPy and SciPy.
+
+    L-BFGS-B takes scalar products of thousands of numbers. Two threads wait for each other in each of them, and on a
+    machine with other work they wait for milliseconds.
+    """
+    from threadpoolctl import ThreadpoolController  # after SciPy, whose libraries it finds
+
+    return ThreadpoolController()
 
 
 def projected_gradient(

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.closure_error import rms_error, visited_features
-from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -59,7 +59,6 @@ def summarise(
     initial_closure: nn.Module,
     episodes: list[dict[str, Any]],
     untrained: Float[Tensor, " starts"] | None,
-    optimum: Optimum | None,
 ) -> dict[str, Any]:
     """The entry ``summary`` of ``metrics.json``.
 
@@ -74,7 +73,7 @@ def summarise(
     better, chosen_on = better_of(algorithm, unseen)
     means = {"J_p": J_p, "J_p_before": J_p_before} | ({} if untrained is None else {"J_a_untrained": untrained})
     means |= {"J_a_before": before["model_based"], "J_a_before_model_free": before["model_free"]}
-    found = {
+    return {
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
         **over_untrained(after, untrained),
@@ -88,16 +87,6 @@ def summarise(
         | {"described": described_weights(closure)},
         "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "seconds": seconds_per_step(episodes),
-    }
-    return found if optimum is None else found | {"reference": against(optimum, after[better])}
-
-
-def against(optimum: Optimum, cost: float) -> dict[str, Any]:
-    """The entry ``reference``: the best that the class of policies can do, and a cost over it."""
-    return {
-        "J_a": optimum.cost,
-        "J_a_of_each_start": optimum.costs,
-        "better_over_reference": cost / optimum.cost,
     }
 
 

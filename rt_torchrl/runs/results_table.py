@@ -33,6 +33,7 @@ def results_table(metrics: dict[str, Any]) -> str:
         best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
         best, share = _number(best, ".5g"), _number(share, ".3f")
         lines.append(f"  exact gradients on the true plant: J_a {best}; the better policy is at {share} of it")
+        lines += limit_lines(found["reference"])
     for name, baseline in unseen["baselines"].items():
         lines.append(
             f"  {f'J_a {name}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
@@ -42,6 +43,20 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += closure_lines(found["closure"])
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
+
+
+def limit_lines(reference: dict[str, Any]) -> list[str]:
+    """Lines with the limit and what costs how much over it, if it was computed."""
+    if "limit" not in reference:
+        return []
+    best = reference["limit"]
+    shares = [
+        (name, best[key]) for name, key in (("better policy", "better_over_limit"), ("optimum", "optimum_over_limit"))
+    ]
+    if "mpc" in best:
+        shares.append(("model predictive control", best["mpc"]["over_limit"]))
+    text = ", ".join(f"{name} {_number(share, '.4f')}" for name, share in shares)
+    return [f"  limit on the first {best['episodes']} episodes: J_a {_number(best['J_a'], '.5g')}; over it: {text}"]
 
 
 def _number(value: float | None, digits: str) -> str:

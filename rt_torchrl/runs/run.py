@@ -18,12 +18,12 @@ from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import FOR_PERCEPTRONS, Judged, UnseenEpisodes, exact_optimum, untrained_costs
+from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs import checkpoint, results
+from rt_torchrl.runs import checkpoint, reference, results
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.progress import Progress
@@ -228,12 +228,12 @@ class Run:
             self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
 
     def _results(self, gap: float, flights: dict[Role, Trajectory], judged: dict[str, Judged]) -> dict[str, Any]:
-        thorough = FOR_PERCEPTRONS if self.config.policy == "mlp" else {}
-        optimum = exact_optimum(self.unseen, self.make_policy, **thorough) if self.config.reference else None
         starts = self.config.untrained
         untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
-        parts = self.initial_policies, self.initial_closure, self.episodes, untrained, optimum
+        parts = self.initial_policies, self.initial_closure, self.episodes, untrained
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
+        better = self.algorithm.policies[summary["better"]]
+        summary |= reference.found(self.config, self.unseen, self.make_policy, better)
         summary["engine_gap"] = gap
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})

@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from torch import nn
 
+from rt_torchrl.evaluation.limits import LimitConfig
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.plants.plant import Plant
@@ -60,7 +61,9 @@ class RunConfig:
         untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
             compared with; 0 leaves this comparison out.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
-            unseen episodes.
+            unseen episodes, and the limit of the cost.
+        limit_episodes: number of unseen episodes, the first ones, on which reference computes the clairvoyant optimum
+            and model predictive control; 0 leaves them out.
         figures: whether to draw figures; without them a training among many ends sooner.
         figures_every: number of episodes after which the figures are drawn into the dashboard again; they are drawn at
             the end too, and with 0 only there.
@@ -92,6 +95,7 @@ class RunConfig:
     unseen: int = 20
     untrained: int = 20
     reference: bool = False
+    limit_episodes: int = 8
     figures: bool = True
     figures_every: int = 5
     unseen_every: int = 0
@@ -117,6 +121,7 @@ class RunConfig:
             ("unseen", 2),
             ("untrained", 0),
             ("figures_every", 0),
+            ("limit_episodes", 0),
             ("unseen_every", 0),
         ):
             if getattr(self, argument) < least:
@@ -127,6 +132,13 @@ class RunConfig:
             raise ValueError(f"noise={self.noise} must not be negative; it is a share of what the sensors read.")
         if self.log_dir == Path():
             raise ValueError("log_dir='' is the current folder; name a folder that is the run's own.")
+        if self.reference and self.limit_episodes and self.device != "cpu" and self.limit() is not None:
+            raise ValueError(
+                f"reference computes the limit on the CPU alone, and device={self.device!r}; give limit_episodes=0 to "
+                "leave it out."
+            )
+        if self.limit_episodes == 1:
+            raise ValueError("limit_episodes=1 must be 0, or at least 2.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
 
@@ -174,6 +186,13 @@ class RunConfig:
         if planner.method != "receding_horizon":
             return policies
         return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
+
+    def limit(self) -> LimitConfig | None:
+        """How the limit of the cost and model predictive control beside it are computed; None leaves them out.
+
+        Override this method for a plant whose limit shall be known.
+        """
+        return None
 
     def believed(self) -> Plant | None:
         """The physics of a twin that is wrong about them; None if it has those of the real system.

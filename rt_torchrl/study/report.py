@@ -73,6 +73,7 @@ def numbers(results: Results) -> dict[str, Any]:
     return {
         plant: {
             "entries": {entry.name: numbers_of(entry) for entry in entries},
+            "limits": {entry.name: numbers_of(entry) for entry in results.limits[plant]},
             "variants": {
                 variant: {entry.name: numbers_of(entry) for entry in harder}
                 for variant, harder in results.variants[plant].items()
@@ -93,4 +94,6 @@ def numbers_of(entry: Entry) -> dict[str, Any]:
         "weight_error": entry.weight_error,
         "J_a_unseen": entry.curves,
         "J_p": entry.twin_errors,
+        "episodes": entry.costs.shape[1],
+        "milliseconds": entry.milliseconds,
     }

@@ -27,6 +27,7 @@ class Entry:
         weight_error: greatest relative error among the closure's weights, of each seed.
         curves: mean J_a of the live policy on the unseen episodes after each real episode, a list for each seed.
         twin_errors: J_p of the twin over the records it holds, after each real episode, a list for each seed.
+        milliseconds: median wall-clock time of an action [ms]; None where nobody has measured it.
     """
 
     name: str
@@ -36,10 +37,16 @@ class Entry:
     weight_error: list[float] = field(default_factory=list)
     curves: list[list[float]] = field(default_factory=list)
     twin_errors: list[list[float]] = field(default_factory=list)
+    milliseconds: float | None = None
 
     @property
     def mean(self) -> float:
         return float(self.costs.mean())
+
+    def over(self, other: "Entry") -> float:
+        """Mean over the other's mean, on the first episodes, which both have."""
+        count = min(self.costs.shape[1], other.costs.shape[1])
+        return float(self.costs[:, :count].mean() / other.costs[:, :count].mean())
 
     def interval(self) -> tuple[float, float]:
         """95 % interval of the mean over seeds and episodes."""
@@ -93,9 +100,10 @@ def arm_entry(name: str, trainings: list[Training]) -> Entry:
 
 
 def yardstick_entry(name: str, found: dict[str, Any]) -> Entry:
-    """Entry of the oracle or of a classical controller."""
+    """Entry of the oracle, of a classical controller, of the limit or of model predictive control."""
     merit = {quantity: values["mean"] for quantity, values in found["merit"].items()}
-    return Entry(name=name, costs=np.array([found["costs"]]), merit=merit)
+    median = (found.get("milliseconds") or {}).get("median")
+    return Entry(name=name, costs=np.array([found["costs"]]), merit=merit, milliseconds=median)
 
 
 def weight_errors(summaries: list[dict[str, Any]]) -> list[float]:
@@ -118,8 +126,11 @@ class Results(NamedTuple):
         entries: entries of the nominal table.
         summaries: ``summary`` in ``metrics.json`` of the nominal twinning runs.
         variants: entries of each variant.
+        limits: entries of the clairvoyant optimum, ``limit``, and of model predictive control, ``mpc``, on the first of
+            the unseen episodes; none where they were left out.
     """
 
     entries: dict[str, list[Entry]]
     summaries: dict[str, list[dict[str, Any]]]
     variants: dict[str, dict[str, list[Entry]]]
+    limits: dict[str, list[Entry]]

@@ -26,14 +26,23 @@ def table(header: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def nominal_table(entries: list[Entry]) -> str:
-    """J_a of every arm and yardstick of a plant, its interval and ratio to the oracle's, and the plant's quantities."""
+def nominal_table(entries: list[Entry], limits: list[Entry]) -> str:
+    """J_a of every arm and yardstick of a plant, its interval and ratio to the oracle's, and the plant's quantities.
+
+    Args:
+        entries: arms and yardsticks on all unseen episodes.
+        limits: the limit and model predictive control on the first of them, on which every ratio to the limit is taken;
+            may be empty.
+    """
     oracle = named(entries)["oracle"]
-    header = ["", *COST_HEADER, "over oracle", *oracle.merit, *TWIN_HEADER, "episodes to 110 %"]
+    best = named(limits).get("limit")
+    header = ["", *COST_HEADER, "over oracle", *(["over limit"] if best else [])]
+    header += [*oracle.merit, *TWIN_HEADER, "episodes to 110 %"]
     rows = []
-    for entry in entries:
+    for entry in (*entries, *limits):
         reached = ", ".join("never" if k is None else str(k) for k in entry.episodes_to(oracle.mean))
-        cells = [shown(entry.name), *cost_cells(entry), f"{entry.mean / oracle.mean:.3f}"]
+        cells = [shown(entry.name), *cost_cells(entry), f"{entry.over(oracle):.3f}"]
+        cells += [f"{entry.over(best):.3f}"] if best else []
         rows.append([*cells, *merit_cells(entry), *twin_cells(entry), reached or "–"])
     return table(header, rows)
 

@@ -4,7 +4,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,13 @@ from torch import nn
 from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune
+from rt_torchrl.evaluation.limits import (
+    Contender,
+    LimitConfig,
+    few_starts,
+    limit,
+    predictive,
+)
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
@@ -181,6 +188,69 @@ def cost_over_episodes(
         best = exact_optimum(met, make_policy, starts=1, iterations=iterations, few=count, polish=0)
         costs.append(judged.control_costs(best.policy).mean().item())
     return {"name": "episodes planned on", "unit": "-", "values": list(counts), "costs": costs}
+
+
+def least_cost(recipe: Path, options: Options, *, unseen: int, count: int, iterations: int) -> dict[str, Any]:
+    """The least cost that any controller can have: the optimal commands where all disturbances are known.
+
+    Args:
+        recipe: recipe of the plant.
+        options: options of its trainings.
+        unseen: number of unseen episodes.
+        count: number of them, the first ones, whose commands are optimised.
+        iterations: greatest number of iterations from each start.
+
+    Returns:
+        What :func:`contender_of` returns; ``details`` say how well the commands are known to be an optimum.
+    """
+    episodes, known = first_episodes(recipe, options, unseen=unseen, count=count)
+    descent = replace(known.descent, iterations=iterations)
+    return contender_of(limit(episodes, few_starts(episodes, known), hold=known.hold, config=descent))
+
+
+def predictive_control(recipe: Path, options: Options, *, unseen: int, count: int) -> dict[str, Any]:
+    """Model predictive control on the exact model, without preview, as the recipe sets it up.
+
+    Args:
+        recipe: recipe of the plant.
+        options: options of its trainings.
+        unseen: number of unseen episodes.
+        count: number of them, the first ones, that it flies.
+
+    Returns:
+        What :func:`contender_of` returns.
+
+    Raises:
+        ValueError: if the recipe has no model predictive control with these options.
+    """
+    episodes, known = first_episodes(recipe, options, unseen=unseen, count=count)
+    if known.window is None:
+        raise ValueError(f"recipe={recipe} has no model predictive control with the options {' '.join(options)}.")
+    return contender_of(predictive(episodes, known.window))
+
+
+def plans(recipe: Path, options: Options) -> bool:
+    """Whether a recipe has model predictive control with these options."""
+    known = configured(recipe, options).limit()
+    return known is not None and known.window is not None
+
+
+def first_episodes(recipe: Path, options: Options, *, unseen: int, count: int) -> tuple[UnseenEpisodes, LimitConfig]:
+    """The first of the unseen episodes, and how the limit of their cost is computed.
+
+    Raises:
+        ValueError: if the recipe does not say how.
+    """
+    config = configured(recipe, options)
+    if (known := config.limit()) is None:
+        raise ValueError(f"recipe={recipe} does not say how the limit is computed; override RunConfig.limit().")
+    return unseen_episodes(plant_of(config), unseen).first(count), known
+
+
+def contender_of(found: Contender) -> dict[str, Any]:
+    """Per-episode ``costs``, means of the plant's quantities in ``merit``, ``milliseconds`` and ``details``."""
+    merit = {name: {"mean": value} for name, value in found.merit.items()}
+    return {"costs": found.costs, "merit": merit, "milliseconds": found.milliseconds, "details": found.details}
 
 
 def unseen_episodes(plant: Plant, count: int, *, seed: int = UNSEEN_SEED) -> UnseenEpisodes:

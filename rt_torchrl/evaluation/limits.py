@@ -1,9 +1,11 @@
 """The limit of a plant's cost, and how far classical controllers and model predictive control are from it."""
 
+import dataclasses
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,6 +17,7 @@ from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
 from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.plants.plant import Plant
@@ -26,6 +29,27 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 RECORDS = 20
 """Number of episodes, with other draws, whose inputs a forecast is fitted to."""
 RECORDS_SEED = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitConfig:
+    """How the limit of a plant's cost is computed, and model predictive control beside it.
+
+    Args:
+        starts: controllers whose flights the descents to the limit start from, by name.
+        resting: names of those that rest at the end of an episode; see :func:`resting_at_the_end`.
+        hold: number of control intervals for which a command of the optimum is held.
+        window: parameters of model predictive control; None where gradients find no plans.
+        descent: parameters of the descents.
+    """
+
+    starts: Mapping[str, type[ClassicalController]]
+    resting: tuple[str, ...] = ()
+    hold: int = 1
+    window: PredictiveConfig | None = None
+    descent: BoundedDescentConfig = field(
+        default_factory=lambda: BoundedDescentConfig(iterations=3000, tolerance=1e-11)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +94,24 @@ def limit(
     plant, state, exogenous = episodes.plant, episodes.initial_state, episodes.exogenous
     found = clairvoyant(plant, state, exogenous, starts, closure=episodes.known_closure(), hold=hold, config=config)
     return judged(episodes, found.flown, None, **evidence(found))
+
+
+def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Float[Tensor, "batch n n_a"]]:
+    """The commands of the controllers, some of which rest at the end."""
+    starts = {}
+    for name, kind in config.starts.items():
+        flown = episodes.fly_baseline(kind(episodes.plant)).actions
+        if name in config.resting:
+            starts[f"{name}, resting"] = resting_at_the_end(episodes, flown)
+        else:
+            starts[name] = flown
+    return starts
+
+
+def few_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Float[Tensor, "batch n n_a"]]:
+    """The commands of the controllers, and the middle of all ranges, where a descent knows nothing of them."""
+    middle = constant_starts(episodes.plant, len(episodes.initial_state), episodes.plant.n_steps)["constant 0.5"]
+    return flown_starts(episodes, config) | {"constant 0.5": middle}
 
 
 def general_starts(episodes: UnseenEpisodes, *, seed: int) -> dict[str, Float[Tensor, "batch n n_a"]]:
@@ -129,6 +171,22 @@ def learned(episodes: UnseenEpisodes, policy: nn.Module, *, calls: int = 50) -> 
     return judged(episodes, flown, timed(lambda: policy(plant.observe(*seen)), calls))
 
 
+def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
+    """The window, or one that is as long as the plant's episodes where these are shorter.
+
+    Raises:
+        ValueError: if an episode is shorter than the time between two plans.
+    """
+    unit = max(plant.dt if seconds is None else seconds for seconds in (window.hold, window.period))
+    longest = unit * math.floor(plant.horizon / unit + 1e-9)
+    if not longest:
+        raise ValueError(
+            f"horizon={plant.horizon:g} s of plant {plant.name!r} is shorter than the {unit:g} s between two plans of "
+            "model predictive control; take longer episodes."
+        )
+    return dataclasses.replace(window, horizon=min(window.horizon, longest))
+
+
 def receding(
     episodes: UnseenEpisodes, config: RecedingHorizonConfig, forecast: Forecast, closure: nn.Module | None = None
 ) -> Contender:
@@ -140,6 +198,13 @@ def receding(
     milliseconds = in_milliseconds([solve.seconds for solve in solves[batch:]])  # the first solves trace the programs
     gradients = statistics.median(solve.gradients for solve in solves)
     return judged(episodes, flown, milliseconds, gradients=gradients, late=sum(solve.late for solve in solves))
+
+
+def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
+    """Model predictive control on the exact model, with its own forecast; see :func:`receding`."""
+    window = fitting(window, episodes.plant)
+    known = forecasts(episodes.plant, episodes.exogenous, window.horizon)
+    return receding(episodes, window, known[window.forecast])
 
 
 def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: float) -> dict[str, Forecast]:
