@@ -34,7 +34,7 @@ from .optimal_control.predictive_control import PredictiveConfig, PredictiveCont
 from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
 from .identification.identification import Identification, IdentificationConfig
-from .identification.sensor_log import read_log
+from .identification.sensor_log import LogConfig, read_log
 
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig
@@ -53,6 +53,7 @@ from .twinning.planners import (
     WholeEpisodes,
 )
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
+from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
 from .options import check_options
@@ -87,11 +88,13 @@ __all__ = [
     "DigitalTwin",
     "DistillationConfig",
     "DivergenceError",
+    "EarlierPolicies",
     "Engine",
     "EpisodeAbandoned",
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "FirstController",
     "Forecast",
     "Foreseen",
     "Held",
@@ -100,6 +103,7 @@ __all__ = [
     "Learner",
     "LearnerConfig",
     "LoadedRun",
+    "LogConfig",
     "LongTermMemoryConfig",
     "Measurement",
     "Planner",
@@ -117,6 +121,7 @@ __all__ = [
     "RecedingHorizon",
     "RecedingHorizonConfig",
     "RecedingHorizonPlanner",
+    "RecordedFlights",
     "Referee",
     "RefereeConfig",
     "ReinforcementTwinning",
@@ -135,6 +140,7 @@ __all__ = [
     "Signal",
     "SmoothClip",
     "Snapshot",
+    "Start",
     "StateFeedback",
     "TD3Config",
     "Trajectory",
