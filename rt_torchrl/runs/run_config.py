@@ -196,12 +196,12 @@ class RunConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
 
         A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
+        Without that noise the critic cannot be trusted far, and updates of the model-free policy are judged.
         """
         if self.start == "random":
             return twinning
-        return dataclasses.replace(
-            twinning, exploration=dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
-        )
+        exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
+        return dataclasses.replace(twinning, exploration=exploration, judged_updates=True)
 
     def defaults(self) -> "RunConfig":
         """The defaults of all options, given the closure and the sensors that the options ask for.

@@ -28,6 +28,7 @@ from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.learners import Learner, make_learner
+from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
@@ -90,6 +91,7 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.learning = Learning(self.learner, self.virtual)
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
@@ -172,7 +174,7 @@ class ReinforcementTwinning:
     def update_model_free(self) -> TensorDict:
         """Step 2: the learner improves π_mf."""
         self._earlier_weights = {role: weight_vector(policy) for role, policy in self.policies.items()}
-        return self.learner.update()
+        return self.learning.update()
 
     def fit_exogenous(self) -> TensorDict:
         """Step 3: fit a Gaussian process to the exogenous input of this episode."""
@@ -204,6 +206,7 @@ class ReinforcementTwinning:
     def switch_policies(self) -> TensorDict:
         """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
         judged_on = self.virtual.draw(self.judged)
+        judged = self.learning.judge(judged_on, self.referee.worse) if self.config.judged_updates else findings()
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
         change = weight_change(self.policies[idle], self._earlier_weights[idle])
@@ -217,7 +220,7 @@ class ReinforcementTwinning:
         event = self.referee.decide(evidence)
         diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]
         report = findings(*diverged, **{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
-        report.set_non_tensor("event", event)
+        report = merged(judged, report).set_non_tensor("event", event)
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
     def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
