@@ -112,7 +112,7 @@ class Config(RunConfig):
     paper: bool = False
     policy: Literal["paper", "mlp"] = "paper"
     hidden: tuple[int, ...] = (16, 16)
-    start: Literal["random", "controller"] = "controller"
+    start: str = "controller"
     observe: tuple[str, ...] = ()
     command: Literal["duty", "drop"] = "duty"
     vented_weight: float = 5000.0
@@ -131,10 +131,11 @@ class Config(RunConfig):
         super().__post_init__()
         CryogenicTank.chosen(self.observe)
         self.cost()
-        if self.twinning.planner.method == "receding_horizon" and self.command != "duty":
+        planned = self.start == "mpc" or self.twinning.planner.method == "receding_horizon"
+        if planned and self.command != "duty":
             raise ValueError(
-                f"command={self.command!r} does not go with method='receding_horizon': gradients find no plans of a "
-                "half-open valve, whose cost has many minima. Use command duty."
+                f"command={self.command!r} does not go with start='mpc' or method='receding_horizon': gradients find "
+                "no plans of a half-open valve, whose cost has many minima. Use command duty."
             )
 
     def defaults(self) -> "Config":

@@ -116,7 +116,7 @@ class Config(RunConfig):
     paper: bool = False
     policy: Literal["mlp", "paper"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
-    start: Literal["random", "controller"] = "controller"
+    start: str = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     dt: float = 5e-4
     horizon: float = 5.0

@@ -110,7 +110,7 @@ class Config(RunConfig):
     paper: bool = False
     policy: Literal["mlp", "paper", "bias", "scheduled"] = "mlp"
     hidden: tuple[int, ...] = (16, 16)
-    start: Literal["random", "controller"] = "controller"
+    start: str = "controller"
     closure: Literal["paper", "mlp"] = "paper"
     observe: tuple[str, ...] = ()
     task: Literal["paper", "engineering"] = "paper"

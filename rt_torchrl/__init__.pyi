@@ -35,7 +35,7 @@ from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .identification.identification import Identification, IdentificationConfig
-from .identification.sensor_log import read_log
+from .identification.sensor_log import LogConfig, read_log
 
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig
@@ -54,6 +54,7 @@ from .twinning.planners import (
     WholeEpisodes,
 )
 from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
+from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
 from .options import check_options
@@ -88,11 +89,13 @@ __all__ = [
     "DigitalTwin",
     "DistillationConfig",
     "DivergenceError",
+    "EarlierPolicies",
     "Engine",
     "EpisodeAbandoned",
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "FirstController",
     "Forecast",
     "Foreseen",
     "Held",
@@ -102,6 +105,7 @@ __all__ = [
     "LearnerConfig",
     "LimitConfig",
     "LoadedRun",
+    "LogConfig",
     "LongTermMemoryConfig",
     "Measurement",
     "Planner",
@@ -119,6 +123,7 @@ __all__ = [
     "RecedingHorizon",
     "RecedingHorizonConfig",
     "RecedingHorizonPlanner",
+    "RecordedFlights",
     "Referee",
     "RefereeConfig",
     "ReinforcementTwinning",
@@ -137,6 +142,7 @@ __all__ = [
     "Signal",
     "SmoothClip",
     "Snapshot",
+    "Start",
     "StateFeedback",
     "TD3Config",
     "Trajectory",

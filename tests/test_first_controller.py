@@ -19,6 +19,7 @@ from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.starts import FirstController
 
 GAINS = (0.4, 0.3)
 
@@ -37,7 +38,7 @@ def twinning(*, gains=GAINS, iterations=0, model_free=None, **options):
         model_based=plant.make_policy(generator),
         config=TwinningConfig(realisations=4, virtual_episodes=4, **parts, **options),
         generator=generator,
-        first=ActingController(PD(plant, gains)),
+        first=FirstController(ActingController(PD(plant, gains))),
     )
 
 

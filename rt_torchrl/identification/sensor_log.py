@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.identification.units import converted
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 TIME = "time"
+READERS = (".csv", ".parquet")
+"""Ends of the names of files that are read."""
 NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
 COLUMN = re.compile(
     rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
@@ -74,6 +77,25 @@ class Column:
         return cls(
             header=found["header"], signal=found["signal"], factor=factor, offset=offset, unit=found["unit"] or None
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogConfig:
+    """How a log is read.
+
+    Args:
+        columns: columns of the log with another name than their signal or another unit, as HEADER=SIGNAL[UNIT] or
+            HEADER=SIGNAL*FACTOR+OFFSET.
+        drop: whether to leave out rows of the log with a value that is missing or out of range; they become gaps.
+        gap: longest time between two rows of the log that is bridged [s]; by default three sampling intervals.
+    """
+
+    columns: tuple[str, ...] = ()
+    drop: bool = False
+    gap: float | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,14 +229,15 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False) -> SensorLog:
             raise ValueError(
                 f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log (counted from 0, t = "
                 f"{log.times[k]:g} s), {int((~inside).sum())} such rows; it must be a number from {signal.low:g} to "
-                f"{signal.high:g} {signal.unit}. Mend the log or the column's unit, or leave such rows out with --drop."
+                f"{signal.high:g} {signal.unit}. Mend the log or the column's unit, or leave such rows out with "
+                "--drop (of a training: --log.drop)."
             )
         good &= inside
     return log if good.all() else log.chosen(good)
 
 
 def _read(path: Path) -> Any:
-    readers = {".csv": pandas().read_csv, ".parquet": pandas().read_parquet}
+    readers = dict(zip(READERS, (pandas().read_csv, pandas().read_parquet), strict=True))
     if path.suffix not in readers:
         raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
     try:

@@ -99,6 +99,11 @@ class PredictiveControl(nn.Module):
         """What prices the end of a window."""
         return self._config.terminal
 
+    @property
+    def virtual_episodes(self) -> int:
+        """Number of virtual episodes that it flies at a time."""
+        return self._config.virtual_episodes
+
     def _forecast(self) -> Forecast:
         """The forecast of the configuration, whose numbers are the buffers."""
         if self._config.forecast == "held":

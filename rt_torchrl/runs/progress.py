@@ -11,7 +11,7 @@ from rt_torchrl.runs.results_table import progress
 from rt_torchrl.trajectories.engines.compilation import watched_compilation
 
 WORDS = {
-    "start": "episode of the first controller",
+    "start": "learning from what is known",
     "interact": "real episode",
     "update_model_free": "model-free update",
     "fit_exogenous": "fitting the input",

@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
-from rt_torchrl.baselines.acting import ActingController
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline, RealController
@@ -30,6 +29,7 @@ from rt_torchrl.runs.progress import Progress
 from rt_torchrl.runs.results_table import results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
+from rt_torchrl.runs.run_start import start_of
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
@@ -68,9 +68,9 @@ class Run:
     Raises:
         PlantContractError: before any work, if a plant breaks its contract in a way that is found at once;
             ``check_plant`` also finds what takes seconds to find.
-        ValueError: before any work, if the device does not exist, the run folder cannot be written, is in use or holds
-            a run, the run to resume had other options, its checkpoint is damaged or does not fit, or options need a
-            plant in simulation and there is an ``env``.
+        ValueError: before any work, if what ``config.start`` names does not exist or fit, the device does not exist,
+            the run folder cannot be written, is in use or holds a run, the run to resume had other options, its
+            checkpoint is damaged or does not fit, or options need a plant in simulation and there is an ``env``.
     """
 
     def __init__(
@@ -93,11 +93,9 @@ class Run:
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
         require_simulation(config, plant, env, baselines)
-        if config.start == "controller" and first is None:
-            raise ValueError("start='controller' needs the controller: give Run(..., first=...), or start='random'.")
-        self.first = first if config.start == "controller" else None
         for physics in filter(None, (plant, believed)):
             check_plant(physics, steps=CHECKED_STEPS, traced=False)
+        self._start = start_of(config, plant, believed, first)
         if config.threads:
             torch.set_num_threads(config.threads)
         self._held = RunFolder(config, plant.name)
@@ -130,7 +128,7 @@ class Run:
             model_based=policies["model_based"],
             config=config.twinning,
             generator=generator,
-            first=None if self.first is None else ActingController(self.first(plant)).to(device),
+            first=self._start(physics, closure),
         )
         # Copies made after the algorithm know its learner's critic, where model predictive control needs one.
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)

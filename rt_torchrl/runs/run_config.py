@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.evaluation.limits import LimitConfig
+from rt_torchrl.identification.sensor_log import LogConfig
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.plants.plant import Plant
@@ -21,6 +22,8 @@ from rt_torchrl.twinning.referees import Role
 
 SPREAD_OF_IMITATION = 0.02
 """Exploration around the imitation of a controller, as a share of half the range of each action."""
+STARTS = ("random", "controller", "mpc")
+"""Values of the option ``start`` that name no file."""
 QUICK_EPISODES, QUICK_ITERATIONS, QUICK_UNSEEN = 3, 200, 5
 GREATEST_SEED = 2**63 - 2
 """Greatest seed: torch takes signed integers of 64 bits, and the sensors of a simulated system take ``seed`` + 1."""
@@ -50,8 +53,12 @@ class RunConfig:
             says if it cannot. Without compilation these start at once, but every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default.
-        start: random, or controller: the controller that the real system has had so far flies one episode before all
-            others, twin and policies begin with what it did, and the model-based policy goes on.
+        start: what the training begins with, so that the real system never flies a random policy. controller: the
+            controller that the real system has had so far flies one episode before all others, and twin and policies
+            learn from it. mpc: model predictive control on the first twin flies that episode. The folder of a finished
+            run: its policies and its closure go on. A log, as a .csv or .parquet file that identify.py reads: the twin
+            is fitted to it, and the policies imitate the actions in it. random: random weights.
+        log: how the log is read that the training begins with.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir.
         overwrite: whether to replace the files that an earlier run left in log_dir.
@@ -87,7 +94,8 @@ class RunConfig:
     compiled: bool | None = None
     device: str = "cpu"
     threads: int = 0
-    start: Literal["random", "controller"] = "random"
+    start: str = "random"
+    log: LogConfig = field(default_factory=LogConfig)
     log_dir: Path | None = None
     resume: bool = False
     overwrite: bool = False
@@ -139,6 +147,8 @@ class RunConfig:
             )
         if self.limit_episodes == 1:
             raise ValueError("limit_episodes=1 must be 0, or at least 2.")
+        if self.log != LogConfig() and self.start in STARTS:
+            raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
 
@@ -205,12 +215,12 @@ class RunConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
 
         A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
+        Without that noise the critic cannot be trusted far, and updates of the model-free policy are judged.
         """
         if self.start == "random":
             return twinning
-        return dataclasses.replace(
-            twinning, exploration=dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
-        )
+        exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
+        return dataclasses.replace(twinning, exploration=exploration, judged_updates=True)
 
     def defaults(self) -> "RunConfig":
         """The defaults of all options, given the closure and the sensors that the options ask for.

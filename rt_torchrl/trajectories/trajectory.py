@@ -1,5 +1,6 @@
 """Trajectories of a system, the scenarios that they start from, and their costs."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -63,6 +64,16 @@ class Trajectory(NamedTuple):
         """The trajectories of a batch, one by one."""
         starts = torch.as_tensor(self.start, dtype=torch.float64, device="cpu").expand(len(self.states)).tolist()
         return [Trajectory(*parts) for parts in zip(self.states, self.actions, self.exogenous, starts, strict=True)]
+
+
+def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """Trajectories of equal length without batch dimensions as one batch."""
+    states = torch.stack([each.states for each in trajectories])
+    actions = torch.stack([each.actions for each in trajectories])
+    exogenous = torch.stack([each.exogenous for each in trajectories])
+    starts = [float(each.start) for each in trajectories]
+    together = len(set(starts)) == 1
+    return Trajectory(states, actions, exogenous, starts[0] if together else states.new_tensor(starts))
 
 
 def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"]:

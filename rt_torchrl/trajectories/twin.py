@@ -82,6 +82,9 @@ class DigitalTwin:
             return control_cost(self.plant, self.control(policy, initial_state, exogenous)).mean()
         return self._planning(policy).costs(initial_state, exogenous).mean()
 
+    def retreat(self) -> None:
+        """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""
+
     def _planning(self, policy: nn.Module) -> Rollout:
         """The rollout of a policy under the closure held constant, kept as long as both are the same."""
         for planned in self._planned:

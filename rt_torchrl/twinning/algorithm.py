@@ -4,9 +4,8 @@ There are two policies of the same observation, π_mf (model-free) and π_mb (mo
 real system. The other is idle: it learns at the same time and can take over.
 """
 
-import copy
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -19,20 +18,23 @@ from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
+from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.hypotheses import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
+from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.twinning.saved_state import load_parts, on_device
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
+from rt_torchrl.twinning.starts import Start
 from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -50,8 +52,8 @@ class ReinforcementTwinning:
         learner: learner of step 2, which trains ``model_free``; by default ``config.learner`` makes it.
         planner: planner of step 5, which trains ``model_based``; by default ``config.planner`` makes it.
         referee: referee of step 6; by default ``config.referee`` makes it.
-        first: controller that the real system has had so far, as :class:`StateFeedback`. It flies one episode before
-            all others, with which twin and policies begin; None begins with the policies as they are.
+        first: what is known before the first episode, such as :class:`FirstController`, with which twin and policies
+            begin; None begins with the policies as they are.
 
     Raises:
         ValueError: if the real system's batch size is not 1, or the learner or planner trains another policy.
@@ -69,13 +71,13 @@ class ReinforcementTwinning:
         learner: Learner | None = None,
         planner: Planner | None = None,
         referee: Referee | None = None,
-        first: nn.Module | None = None,
+        first: Start | None = None,
     ):
         self.env, self.twin, self.config, self.generator = env, twin, config, generator
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
         self.first = first
-        planned = config.arm == "model_based" or (first is not None and config.arm == "twinning")
-        acting: Role = "model_based" if planned else "model_free"
+        acting: Role = "model_free" if first is None else first.live
+        acting = acting if config.arm == "twinning" else config.arm
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, acting)
@@ -89,12 +91,13 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.learning = Learning(self.learner, self.virtual)
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = collector_of(env, self.actor, twin.plant)
         self.episodes_done = 0
-        self._earlier_closure: dict[str, Any] | None = None
+        self.earlier = EarlierClosure(twin, model_based, self.planner, generator)
 
     @property
     def judged(self) -> int:
@@ -121,23 +124,33 @@ class ReinforcementTwinning:
             safe_point()
             tell(step.__name__)
             start = time.perf_counter()
-            merged(report, self.on_sound_twin(step) if step in (self.plan, self.switch_policies) else step())
+            merged(report, self.earlier.sound(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
         return EpisodeReport(report.update({"seconds": findings(**seconds)}))
 
     def start(self) -> TensorDict:
-        """Before the first episode, ``first`` flies one; twin and policies learn from it (paper: random weights)."""
+        """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
         assert self.first is not None
-        flight = self._flown(self.first, strength=0.0)
-        if on_twin := self.config.arm != "model_free":
-            self.fit_exogenous()
-            self.assimilate()
-            self.planning.remember()
-        found = self.cloning.begin(self.first, self.policies, flight.record, on_twin=on_twin)
+        pupils = self.first.take(self.policies, self.twin.closure)
         for part in (self.learner, self.planner):
             part.restart()
-        return merged(found, findings(start_cost=flight.cost))
+        if not pupils:
+            return findings()
+        flights = self.first.flights(lambda policy: fly(self.actor, self.collector.rollout, policy, strength=0.0))
+        on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
+        for flight in flights:
+            self._keep(flight)
+            self.virtual.learn(flight.record) if on_twin else None
+        if on_twin:
+            self.assimilate(records)
+            self.planning.remember() if "model_based" in pupils else None
+        imitating = {role: self.policies[role] for role in pupils}
+        found = self.cloning.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
+        if len(records[-1].actions) != self.twin.plant.n_steps:
+            self.short_term.clear()  # later records are whole episodes
+            self.virtual.processes.clear()
+        return merged(found, findings(start_cost=torch.stack([flight.cost for flight in flights]).mean()))
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
@@ -151,53 +164,33 @@ class ReinforcementTwinning:
     def _flown(self, policy: nn.Module, *, strength: float) -> Flight:
         """An episode on the real system, which both memories hold; of those that :func:`fly` refuses, none does."""
         flight = fly(self.actor, self.collector.rollout, policy, strength=strength)
+        self._keep(flight)
+        return flight
+
+    def _keep(self, flight: Flight) -> None:
         self.learner.store(flight.transitions)
         self.short_term.append(flight.record)
-        return flight
 
     def update_model_free(self) -> TensorDict:
         """Step 2: the learner improves π_mf."""
         self._earlier_weights = {role: weight_vector(policy) for role, policy in self.policies.items()}
-        return self.learner.update()
+        return self.learning.update()
 
     def fit_exogenous(self) -> TensorDict:
         """Step 3: fit a Gaussian process to the exogenous input of this episode."""
         self.virtual.learn(self.short_term[-1])
         return findings()
 
-    def assimilate(self) -> TensorDict:
-        """Step 4: n_G gradient steps on J_p over n_S × N_z virtual trajectories with the stored actions."""
-        processes = list(self.virtual.processes)[-len(self.short_term) :]
-        self._earlier_closure = copy.deepcopy(self.twin.closure.state_dict())
-        found = self.assimilation.update(self.short_term, processes, self.config.realisations, self.generator)
+    def assimilate(self, records: Sequence[Trajectory] = ()) -> TensorDict:
+        """Step 4: n_G gradient steps on J_p over virtual trajectories with stored actions, of D_S or ``records``."""
+        records = list(records or self.short_term)
+        processes = list(self.virtual.processes)[-len(records) :]
+        self.earlier.remember()
+        found = self.assimilation.update(
+            records[-len(processes) :], processes, self.config.realisations, self.generator
+        )
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
         return merged(fit, self.assimilation.report())
-
-    def on_sound_twin(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode.
-
-        The weights that have just flown did not diverge on the real system. If the twin diverges with them, the closure
-        must be wrong. Any other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure.
-        Where the sensors' noise is larger than the effect of the closure, even the closure that replays the records
-        best may diverge in other flights, and the real system cannot wait.
-
-        Raises:
-            DivergenceError: if the twin diverges under these weights with the earlier closure too.
-        """
-        state, policy = self.generator.get_state(), copy.deepcopy(self.policies["model_based"].state_dict())
-        try:
-            return step()
-        except DivergenceError as error:
-            if self._earlier_closure is None:
-                raise
-            refused = f"closure refused: {error}"
-        self.policies["model_based"].load_state_dict(policy)  # state feedback holds the refused closure too
-        self.twin.closure.load_state_dict(self._earlier_closure)
-        self._earlier_closure = None
-        self.assimilation.retreat()
-        self.generator.set_state(state)
-        self.planner.restart()
-        return merged(step(), findings(refused, closure_refused=1.0))
 
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""
@@ -214,6 +207,7 @@ class ReinforcementTwinning:
     def switch_policies(self) -> TensorDict:
         """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
         judged_on = self.virtual.draw(self.judged)
+        judged = self.learning.judge(judged_on, self.referee.worse) if self.config.judged_updates else findings()
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
         change = weight_change(self.policies[idle], self._earlier_weights[idle])
@@ -227,7 +221,7 @@ class ReinforcementTwinning:
         event = self.referee.decide(evidence)
         diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]
         report = findings(*diverged, **{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
-        report.set_non_tensor("event", event)
+        report = merged(judged, report).set_non_tensor("event", event)
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
     def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:

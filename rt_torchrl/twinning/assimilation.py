@@ -20,7 +20,7 @@ from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.closures import BoundedPerceptron
-from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
 from rt_torchrl.twinning.findings import findings
@@ -122,14 +122,12 @@ class Assimilation:
         Returns:
             J_p of the whole records before and after, without the prior, and the descent's gradient and iterations.
         """
-        if self.config.inputs == "record":
-            count, exogenous = 1, torch.stack([record.exogenous for record in records])
-        else:
+        whole = batch_of(records)
+        if self.config.inputs == "realisations":
             sampled = torch.cat([process.sample(count, generator) for process in processes])
-            exogenous = self.twin.plant.with_previews(sampled)
-        measured = torch.stack([record.states for record in records]).repeat_interleave(count, 0)
-        actions = torch.stack([record.actions for record in records]).repeat_interleave(count, 0)
-        whole = Trajectory(measured, actions, exogenous)
+            states, actions = (part.repeat_interleave(count, 0) for part in whole[:2])
+            start = whole.start.repeat_interleave(count, 0) if isinstance(whole.start, Tensor) else whole.start
+            whole = Trajectory(states, actions, self.twin.plant.with_previews(sampled), start)
         if not self.config.segment:
             return self._descend(whole)
         before = self._cost_of(whole)
@@ -226,9 +224,6 @@ class Assimilation:
             share * torch.einsum("bki,bkiw->w", g, S),
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
-
-    def retreat(self) -> None:
-        """React to a twin that diverges with the policy that has just flown; one that is alone cannot."""
 
     def report(self) -> TensorDict:
         """What the last update has found beside J_p; of one twin, nothing."""

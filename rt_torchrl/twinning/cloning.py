@@ -10,8 +10,9 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
@@ -78,14 +79,14 @@ class Cloning:
         return findings(reason, **found).set_non_tensor("event", "keep")
 
     def begin(
-        self, controller: nn.Module, policies: Mapping[Role, nn.Module], record: Trajectory, *, on_twin: bool
+        self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory, *, on_twin: bool
     ) -> TensorDict:
         """Make the policies imitate a controller; one that would fare worse on the twin than before stays as it was.
 
         Args:
-            controller: the teacher, which is :class:`StateFeedback`.
+            teacher: the controller, a policy or :class:`StateFeedback`; None if only the records show its actions.
             policies: the policies by role; state feedback among them is left alone.
-            record: real episode that the controller has flown.
+            records: real episodes that the controller has flown.
             on_twin: whether policies also learn from virtual episodes and are judged in them.
 
         Returns:
@@ -94,26 +95,32 @@ class Cloning:
         """
         pupils = {role: policy for role, policy in policies.items() if not isinstance(policy, StateFeedback)}
         starts = {role: copy.deepcopy(policy) for role, policy in pupils.items()}
-        judged_on = self.virtual.draw(self.count) if on_twin else None
+        # Every virtual episode of model predictive control takes as long as its solves.
+        count = teacher.virtual_episodes if isinstance(teacher, PredictiveControl) else self.count
+        judged_on = self.virtual.draw(count) if on_twin else None
         report = findings()
         for role, policy in pupils.items():
             first = next(other for other, start in starts.items() if clones(start, starts[role]))
             if first != role:
                 policy.load_state_dict(pupils[first].state_dict())
             elif judged_on is None:
-                report.update(findings(**{f"start_error_{role}": self.distillation.of_record(policy, record)}))
+                report.update(findings(**{f"start_error_{role}": self.distillation.of_record(policy, records)}))
             else:
-                report = merged(report, self._imitated(controller, role, policy, record, judged_on))
+                report = merged(report, self._imitated(teacher, role, policy, records, judged_on))
         return report
 
     def _imitated(
-        self, controller: nn.Module, role: Role, policy: nn.Module, record: Trajectory, judged_on: Scenario
+        self, teacher: nn.Module | None, role: Role, policy: nn.Module, records: Trajectory, judged_on: Scenario
     ) -> TensorDict:
         before, start = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
-        error = self.distillation.imitate(
-            controller, policy, seen=record, draw=functools.partial(self.virtual.draw, self.count)
-        )
-        cost, wanted = (self.virtual.cost(flown, judged_on).item() for flown in (policy, controller))
+        if teacher is None:
+            error = self.distillation.of_record(policy, records)
+            wanted = control_cost(self.virtual.twin.plant, records).mean().item()
+        else:
+            draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
+            error = self.distillation.imitate(teacher, policy, seen=records, draw=draw)
+            wanted = self.virtual.cost(teacher, judged_on).item()
+        cost = self.virtual.cost(policy, judged_on).item()
         found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": cost / wanted}
         if cost <= start:
             return findings(**found)

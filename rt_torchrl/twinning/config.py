@@ -27,6 +27,9 @@ class TwinningConfig:
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
+        judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse on the twin, in the
+            arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
+            ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
         exploration: parameters of step 1.
         learner: parameters of step 2.
         exogenous: parameters of step 3.
@@ -41,6 +44,7 @@ class TwinningConfig:
     realisations: int = 5
     records: int = 1
     virtual_episodes: int = 20
+    judged_updates: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)

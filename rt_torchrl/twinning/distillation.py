@@ -70,8 +70,8 @@ class Distillation:
         Args:
             live: the teacher, which is not changed.
             idle: the student, which starts from its present weights.
-            seen: observations of the real system, or an episode that the teacher has flown there. State feedback needs
-                the episode, because its actions are no function of the observation; its actions are taken as recorded.
+            seen: observations of the real system, or episodes that the teacher has flown there. State feedback needs
+                the episodes, because its actions are no function of the observation; they are taken as recorded.
             draw: function that draws new initial states and disturbances of virtual episodes at each call.
 
         Returns:
@@ -87,7 +87,7 @@ class Distillation:
         return error
 
     def of_record(self, idle: nn.Module, record: Trajectory) -> float:
-        """Train ``idle`` in place to act as in a record, without the twin; the error is that of :meth:`imitate`."""
+        """Train ``idle`` in place to act as in records, without the twin; the error is that of :meth:`imitate`."""
         observations, actions = self._of_record(record)
         return match_actions(self.twin.plant, actions, idle, observations, self.config.iterations)
 
@@ -113,7 +113,8 @@ class Distillation:
 
     def _observed(self, flown: Trajectory) -> Float[Tensor, "n n_o"]:
         plant, exogenous = self.twin.plant, flown.exogenous
-        t = plant.dt * torch.arange(exogenous.shape[-2], dtype=torch.float64, device=exogenous.device)
+        clock = plant.dt * torch.arange(exogenous.shape[-2], dtype=torch.float64, device=exogenous.device)
+        t = (flown.start.unsqueeze(-1) if isinstance(flown.start, Tensor) else flown.start) + clock
         seen = plant.observe(t, flown.states[..., :-1, :], exogenous)
         return seen.reshape(-1, seen.shape[-1])
 

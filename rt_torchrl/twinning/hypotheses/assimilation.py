@@ -118,10 +118,6 @@ class EnsembleAssimilation(Assimilation):
         self.ensemble.weights = weighed(self.misfits, self.hypotheses)
         return found
 
-    def retreat(self) -> None:
-        """Leave every hypothesis out for this episode: the policy that has just flown diverges under one."""
-        self.ensemble.weights = {ALONE: 1.0}
-
     def report(self) -> TensorDict:
         """The weight and the misfit of every hypothesis."""
         shares = {f"hypothesis/{name}": self.ensemble.weights.get(name, 0.0) for name in self.ensemble.twins}

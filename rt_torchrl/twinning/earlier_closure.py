@@ -1,0 +1,59 @@
+"""The closure of the last episode, which the twin gets back if it diverges with the new one."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.findings import findings, merged
+from rt_torchrl.twinning.planners import Planner
+
+
+class EarlierClosure:
+    """The closure from before the last assimilation.
+
+    Args:
+        twin: twin whose closure is kept.
+        model_based: policy that is planned on the twin.
+        planner: planner of that policy.
+        generator: source of the draws of steps 5 and 6.
+    """
+
+    def __init__(self, twin: DigitalTwin, model_based: nn.Module, planner: Planner, generator: torch.Generator):
+        self.twin, self.model_based, self.planner, self.generator = twin, model_based, planner, generator
+        self._closure: dict[str, Any] | None = None
+
+    def remember(self) -> None:
+        """Keep the present closure."""
+        self._closure = copy.deepcopy(self.twin.closure.state_dict())
+
+    def sound(self, step: Callable[[], TensorDict]) -> TensorDict:
+        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode.
+
+        The weights that have just flown did not diverge on the real system. If the twin diverges with them, the closure
+        must be wrong. Any other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure.
+        Where the sensors' noise is larger than the effect of the closure, even the closure that replays the records
+        best may diverge in other flights, and the real system cannot wait.
+
+        Raises:
+            DivergenceError: if the twin diverges under these weights with the earlier closure too.
+        """
+        state, policy = self.generator.get_state(), copy.deepcopy(self.model_based.state_dict())
+        try:
+            return step()
+        except DivergenceError as error:
+            if self._closure is None:
+                raise
+            refused = f"closure refused: {error}"
+        self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
+        self.twin.closure.load_state_dict(self._closure)
+        self._closure = None
+        self.twin.retreat()
+        self.generator.set_state(state)
+        self.planner.restart()
+        return merged(step(), findings(refused, closure_refused=1.0))

@@ -1,0 +1,57 @@
+"""Step 2: the learner's update, which step 6 can take back where it is worse on the twin."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.learners import Learner
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+
+
+class Learning:
+    """Lets the learner update its policy, and judges the update on the twin.
+
+    Note: the paper keeps every update. A critic knows the value of actions near those that were taken. Where a training
+    begins with a controller it explores little, and an actor that climbs the critic leaves those actions within one
+    update. Plans and clones are judged on the twin, too.
+
+    Args:
+        learner: learner of step 2.
+        virtual: virtual episodes.
+    """
+
+    def __init__(self, learner: Learner, virtual: VirtualEpisodes):
+        self.learner, self.virtual = learner, virtual
+        self._before: dict[str, Any] = {}
+
+    def update(self) -> TensorDict:
+        """Update the policy; see :meth:`Learner.update`."""
+        self._before = copy.deepcopy(self.learner.policy.state_dict())
+        return self.learner.update()
+
+    @torch.no_grad()
+    def judge(self, judged_on: Scenario, worse: Callable[[float, float], bool]) -> TensorDict:
+        """Go back to the policy before the update if the update is worse; the critic keeps what it has learned.
+
+        Args:
+            judged_on: virtual episodes on which both are flown.
+            worse: function that says whether the first of two mean J_a is worse than the second one.
+
+        Returns:
+            ``update_accepted``, and the reason if it is 0.
+        """
+        policy = self.learner.policy
+        after, found = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
+        policy.load_state_dict(self._before)
+        earlier = self.virtual.cost(policy, judged_on).item()
+        if worse(found, earlier):
+            self.learner.restart()
+            reason = f"update refused: J_a of model_free would be {found:.4g}, it was {earlier:.4g}"
+            return findings(reason, update_accepted=0.0)
+        policy.load_state_dict(after)
+        return findings(update_accepted=1.0)

@@ -1,0 +1,60 @@
+"""A start with the policies and the closure of an earlier training."""
+
+from collections.abc import Mapping
+
+from torch import nn
+
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.twinning.cloning import same_architecture
+from rt_torchrl.twinning.flight import Flight
+from rt_torchrl.twinning.referees import Role
+from rt_torchrl.twinning.starts.start import Fly
+
+
+class EarlierPolicies:
+    """Policies and closure of an earlier training begin a new one; see :class:`Start` for the members.
+
+    The weights of a policy of the same architecture are taken as they are: those of its own role, or else those of the
+    policy that was live. Where a policy has another architecture, the policy that was live flies one episode, and the
+    other architecture imitates it.
+
+    Args:
+        policies: policies that were trained, by role; the live one is among them.
+        closure: trained closure of the twin.
+        live: role that was live at the end of that training.
+    """
+
+    def __init__(self, policies: Mapping[Role, nn.Module], closure: nn.Module, live: Role):
+        self.policies, self.closure, self.live = policies, closure, live
+
+    @property
+    def teacher(self) -> nn.Module:
+        """The policy that was live."""
+        return self.policies[self.live]
+
+    def take(self, policies: Mapping[Role, nn.Module], closure: nn.Module) -> list[Role]:
+        """See :meth:`Start.take`.
+
+        Raises:
+            RuntimeError: if the closures are not of the same architecture.
+        """
+        closure.load_state_dict(self.closure.state_dict())
+        pupils: list[Role] = []
+        for role, policy in policies.items():
+            own = self.policies.get(role, self.teacher)
+            known = next((earlier for earlier in (own, self.teacher) if takes(policy, earlier)), None)
+            if known is not None:
+                policy.load_state_dict(known.state_dict())
+            elif not isinstance(policy, StateFeedback):  # which plans on the closure and needs no weights
+                pupils.append(role)
+        return pupils
+
+    def flights(self, fly: Fly) -> list[Flight]:
+        return [fly(self.teacher)]
+
+
+def takes(policy: nn.Module, earlier: nn.Module) -> bool:
+    """Whether a policy takes the weights of an earlier one as they are."""
+    if isinstance(policy, StateFeedback) or isinstance(earlier, StateFeedback):
+        return type(policy) is type(earlier)
+    return same_architecture(policy, earlier)

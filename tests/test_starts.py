@@ -1,0 +1,211 @@
+"""A training begins with an earlier run, with a log, or with model predictive control; with its own weights at once."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from small_runs import SMALL
+from test_classical import PD
+
+from rt_torchrl.identification.sensor_log import LogConfig
+from rt_torchrl.identification.simulated_log import ClassicalLaw, recorded
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs.loaded_run import load_run
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.cloning import clones
+from rt_torchrl.twinning.distillation import DistillationConfig
+from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.starts.recorded_flights import pieces_of_equal_length, transitions_of
+
+GAINS = (0.6, 0.5)
+TWINNING = dataclasses.replace(
+    SMALL,
+    assimilation=AssimilationConfig(iterations=20, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    distillation=DistillationConfig(iterations=50),
+    planner=PlannerConfig(receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2)),
+)
+
+
+class Config(RunConfig):
+    """The oracle plant."""
+
+    def plant(self):
+        return LinearQuadratic(horizon=2.0, noise=0.1)
+
+    def make_closure(self, plant, generator):
+        return LinearClosure(torch.zeros(1, 2, 2)) if self.closure == "mlp" else super().make_closure(plant, generator)
+
+
+class OtherObservations(LinearQuadratic):
+    observations = (*LinearQuadratic.observations[:1], Signal(symbol="v", name="speed", unit="-"))
+
+
+class OtherPlant(LinearQuadratic):
+    name = "another_plant"
+
+
+def training(folder, plant=None, episodes=2, twinning=TWINNING, **options):
+    options = {"figures": False, "untrained": 0, "unseen": 2, "figures_every": 0, "compiled": False} | options
+    config = Config(episodes=episodes, log_dir=folder, twinning=twinning, **options)
+    return Run(config, plant or config.plant(), first=PD)
+
+
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("earlier") / "run"
+    training(folder, start="controller", model_free_policy="mlp", hidden=(6,)).train()
+    return folder
+
+
+def live_of(folder):
+    return json.loads((folder / "metrics.json").read_text())["summary"]["live"]
+
+
+def test_weights_of_a_run_are_taken_as_they_are(earlier, tmp_path):
+    run, known = training(tmp_path, start=str(earlier), model_free_policy="mlp", hidden=(6,)), load_run(earlier)
+    found = run.algorithm
+    assert not len(found.start()) and found.referee.live == live_of(earlier)
+    assert all(clones(policy, known.policy(role)) for role, policy in found.policies.items())
+    assert torch.equal(found.twin.closure.matrix, known.closure.matrix) and not found.short_term
+
+
+def test_another_kind_of_policy_imitates_the_one_that_was_live(earlier, tmp_path):
+    run, known = training(tmp_path, start=str(earlier), policy="mlp", hidden=(4,)), load_run(earlier)
+    found, teacher = run.algorithm, known.policy(live_of(earlier))
+    report = found.start()
+    assert report["start_cost"] > 0.0 and report["start_error_model_free"] < 0.1
+    seen = found.short_term[0]
+    torch.testing.assert_close(seen.actions, teacher(seen.states[:-1]).clamp(-2.0, 2.0).detach())
+    assert all(isinstance(policy, SaturatedMLP) for policy in found.policies.values())
+
+
+def test_a_half_that_was_not_trained_begins_as_the_other(tmp_path):
+    arm = dataclasses.replace(TWINNING, arm="model_free")
+    training(tmp_path / "half", start="controller", twinning=arm).train()
+    found = training(tmp_path / "whole", start=str(tmp_path / "half")).algorithm
+    found.start()
+    assert clones(found.policies["model_based"], load_run(tmp_path / "half").policy("model_free"))
+
+
+@pytest.mark.parametrize(
+    ("plant", "options", "message"),
+    [
+        (OtherPlant(horizon=2.0), {}, "is a run of plant 'linear_quadratic', this run is of plant 'another_plant'"),
+        (OtherObservations(horizon=2.0), {}, "whose observations are .*velocity_error"),
+        (None, {"closure": "mlp"}, r"does not fit the LinearClosure of this run"),
+    ],
+)
+def test_a_run_that_does_not_fit_is_refused_before_any_work(earlier, tmp_path, plant, options, message):
+    with pytest.raises(ValueError, match=message):
+        training(tmp_path / "new", plant, start=str(earlier), **options)
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_does_not_exist_is_refused(tmp_path):
+    for name, message in (
+        ("contoller", r"start='contoller' is none of random, controller, mpc"),
+        ("log.csv", "there is no such run folder or log"),
+        (str(tmp_path), "is no run folder"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            training(tmp_path / "new", start=name)
+    with pytest.raises(ValueError, match=r"log\.\* says how a log is read, and start='random' names none"):
+        Config(log=LogConfig(columns=("x=position",)))
+
+
+def log_of(path, horizon, gap=False):
+    plant = LinearQuadratic(horizon=horizon, noise=0.1)
+    log = recorded(plant, ClassicalLaw(PD(plant, GAINS)), torch.Generator().manual_seed(1))
+    keep = abs(log.times - 0.5 * horizon) > 0.25 if gap else log.times >= 0.0
+    log.chosen(keep).write(path)
+    return log
+
+
+@pytest.mark.parametrize(("horizon", "gap"), [(8.0, False), (1.5, False), (3.0, True)])
+def test_a_log_teaches_twin_and_policies(tmp_path, horizon, gap):
+    path = tmp_path / "log.csv"
+    log_of(path, horizon, gap)
+    run = training(tmp_path / "run", start=str(path))
+    found, before = run.algorithm, torch.dist(run.initial_closure.matrix, run.algorithm.twin.plant.closure.matrix)
+    report, whole = found.start(), horizon > 2.0 and not gap
+    for policy in found.policies.values():
+        torch.testing.assert_close(policy.gain.detach(), torch.tensor([GAINS]).double(), rtol=0.02, atol=0.02)
+    assert torch.dist(found.twin.closure.matrix, found.twin.plant.closure.matrix) < 0.5 * before
+    assert report["start_cost"] > 0.0 and found.referee.live == "model_based"
+    assert (
+        len(found.short_term) == len(found.virtual.processes) == 0 if not whole else len(found.virtual.processes) == 4
+    )
+    assert len(found.learner.observations()) == {8.0: 80, 1.5: 15, 3.0: 24}[horizon]
+
+
+def test_a_run_from_a_log_is_resumed_without_the_log(tmp_path):
+    path = tmp_path / "log.csv"
+    log_of(path, 4.0)
+    options = {"start": str(path)}
+    first = training(tmp_path / "run", episodes=1, **options).train()["episodes"]
+    path.unlink()
+    both = training(tmp_path / "run", episodes=2, resume=True, **options).train()["episodes"]
+    assert "start_cost" in first[0] and "start_cost" not in both[1] and len(both) == 2
+    assert load_run(tmp_path / "run").config.start == str(path)
+    with pytest.raises(ValueError, match="start is random here and was"):
+        training(tmp_path / "run", episodes=3, resume=True)
+
+
+def test_columns_of_a_log_may_have_other_names(tmp_path):
+    path = tmp_path / "log.csv"
+    log_of(path, 4.0)
+    path.write_text(path.read_text().replace("force", "F"))
+    with pytest.raises(ValueError, match="has no column force"):
+        training(tmp_path / "run", start=str(path))
+    reads = LogConfig(columns=("F=force",))
+    assert training(tmp_path / "run", start=str(path), log=reads).algorithm.start()["start_cost"] > 0.0
+
+
+def test_a_run_goes_on_in_its_own_place(tmp_path):
+    training(tmp_path, start="controller").train()
+    known = load_run(tmp_path)
+    again = training(tmp_path, start=str(tmp_path), overwrite=True)
+    assert len(again.train()["episodes"]) == 2
+    found = again.algorithm
+    found.start()
+    assert clones(found.policies["model_based"], known.policy("model_based"))
+
+
+def test_model_predictive_control_flies_first(tmp_path):
+    found = training(tmp_path, start="mpc").algorithm
+    report = found.start()
+    controller = training(tmp_path / "controller", start="controller").algorithm.start()["start_cost"]
+    assert report["start_cost"] < controller and report["start_error_model_free"] < 0.05
+    assert report["start_cost_ratio_model_free"] < 1.1
+
+
+def test_transitions_of_a_record_are_those_of_a_flight():
+    plant = LinearQuadratic(horizon=2.0)
+    env = PlantEnv(plant, seed=0)
+    episode = env.rollout(plant.n_steps)[0]
+    states = torch.cat([episode["state"], episode["next", "state"][-1:]])
+    record = Trajectory(states, episode["next", "applied"], episode["exogenous"])
+    found = transitions_of(plant, record)
+    for key in ("observation", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated")):
+        torch.testing.assert_close(found[key], episode[key], rtol=1e-13, atol=1e-13)
+
+
+def test_pieces_keep_most_of_a_log():
+    def lengths(*counts, longest=10):
+        states = [torch.arange(float(n + 1)).unsqueeze(-1) for n in counts]
+        segments = [Trajectory(s, s[:-1], s[:-1], 5.0) for s in states]
+        return pieces_of_equal_length(segments, longest, 0.5)
+
+    assert [len(piece.actions) for piece in lengths(25, 31)] == [10] * 5
+    assert [len(piece.actions) for piece in lengths(6, 5)] == [5, 5]
+    assert [piece.start for piece in lengths(25)] == [5.0, 10.0]
+    assert lengths(25)[1].states[0] == 10.0
