@@ -36,7 +36,7 @@ from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.cloning import of_each_role
-from rt_torchrl.twinning.hypotheses import make_twin
+from rt_torchrl.twinning.hypotheses.choice import make_twin
 from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
-from rt_torchrl.twinning.hypotheses import make_assimilation
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.planners import Planner, make_planner

@@ -8,7 +8,7 @@ from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.hypotheses import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.referees import RefereeConfig

@@ -1,0 +1,64 @@
+"""The twin and its step 4 as a configuration asks for them."""
+
+import copy
+
+import torch
+from torch import nn
+
+from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.rollout import Engine
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
+
+
+def make_twin(
+    plant: Plant,
+    closure: nn.Module,
+    config: HypothesesConfig,
+    *,
+    engine: Engine = "native",
+    compiled: bool = False,
+) -> DigitalTwin:
+    """The twin of a plant, with the hypotheses that a configuration asks for; each begins with a copy of the closure.
+
+    Raises:
+        ValueError: if the plant suspects nothing of a name that the configuration lists.
+    """
+    suspects = plant.suspects() if config.which == "automatic" else {}
+    unknown = [name for name in config.names if name not in suspects]
+    if unknown:
+        raise ValueError(
+            f"hypotheses.names: plant {plant.name!r} does not suspect {', '.join(unknown)}; choose among "
+            f"{', '.join(suspects) or '(nothing)'}, or give a TwinEnsemble of your own."
+        )
+    taken = {name: suspect for name, suspect in suspects.items() if not config.names or name in config.names}
+    if not taken:
+        return DigitalTwin(plant, closure, engine=engine, compiled=compiled)
+    device = next((w.device for w in closure.parameters()), torch.device("cpu"))
+    closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in taken.items()}
+    return TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
+
+
+def extended(suspect: Plant, closure: nn.Module) -> nn.Module:
+    """A closure of the twin with the parameters of a suspect beside it.
+
+    Raises:
+        ValueError: if the suspect is no :class:`Extension`, so that nobody knows what its closure is.
+    """
+    if not isinstance(suspect, Extension):
+        raise ValueError(
+            f"suspect {type(suspect).__name__} of plant {suspect.name!r} is no Extension; give a TwinEnsemble with its "
+            "closure instead."
+        )
+    return suspect.extended(closure)
+
+
+def make_assimilation(twin: DigitalTwin, config: AssimilationConfig, hypotheses: HypothesesConfig) -> Assimilation:
+    """Step 4 for a twin, or for an ensemble of them."""
+    if isinstance(twin, TwinEnsemble):
+        return EnsembleAssimilation(twin, config, hypotheses)
+    return Assimilation(twin, config)
