@@ -63,6 +63,9 @@ class Dashboard:
         self._writer.add_scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
         for event in ("swap", "clone"):
             self._writer.add_scalar(f"switch/{event}", float(record.get("event") == event), step)
+        for key in record:
+            if key.startswith(("hypothesis/", "misfit/")):
+                self._writer.add_scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
         for name, seconds in record["seconds"].items():
             self._writer.add_scalar(f"seconds/{name}", seconds, step)
 

@@ -190,7 +190,7 @@ class ReinforcementTwinning:
             records[-len(processes) :], processes, self.config.realisations, self.generator
         )
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
-        return merged(fit, self.assimilation.report())
+        return merged(fit, findings(**self.assimilation.report()))
 
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""

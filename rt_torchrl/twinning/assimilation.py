@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -23,7 +22,6 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
-from rt_torchrl.twinning.findings import findings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,9 +223,9 @@ class Assimilation:
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
 
-    def report(self) -> TensorDict:
-        """What the last update has found beside J_p; of one twin, nothing."""
-        return findings()
+    def report(self) -> dict[str, float]:
+        """What the last update has found beside J_p, by name; of one twin, nothing."""
+        return {}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""

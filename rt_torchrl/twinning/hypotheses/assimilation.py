@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
@@ -16,7 +15,6 @@ from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.exogenous import ExogenousProcess
-from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
@@ -118,10 +116,10 @@ class EnsembleAssimilation(Assimilation):
         self.ensemble.weights = weighed(self.misfits, self.hypotheses)
         return found
 
-    def report(self) -> TensorDict:
+    def report(self) -> dict[str, float]:
         """The weight and the misfit of every hypothesis."""
         shares = {f"hypothesis/{name}": self.ensemble.weights.get(name, 0.0) for name in self.ensemble.twins}
-        return findings(**shares, **{f"misfit/{name}": value for name, value in self.misfits.items()})
+        return shares | {f"misfit/{name}": value for name, value in self.misfits.items()}
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
