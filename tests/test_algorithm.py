@@ -20,7 +20,7 @@ from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.referees import RefereeConfig
 
-STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "plan", "switch_policies"]
+STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "examine", "plan", "switch_policies"]
 
 
 def twinning(plant=None, *, seed=0, env_seed=0, closure=None, **options):
@@ -57,7 +57,7 @@ def scripted(found, live, idle):
 
 
 @pytest.mark.parametrize(
-    "arm, expected", [("twinning", STEPS), ("model_free", STEPS[:2]), ("model_based", [STEPS[0], *STEPS[2:5]])]
+    "arm, expected", [("twinning", STEPS), ("model_free", STEPS[:2]), ("model_based", [STEPS[0], *STEPS[2:6]])]
 )
 def test_steps_come_in_order(arm, expected):
     found, calls = twinning(arm=arm), []

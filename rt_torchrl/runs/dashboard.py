@@ -33,6 +33,8 @@ TAGS = {
     "solve_max": "predictive control/longest solve (ms)",
     "late_solves": "predictive control/late solves",
     "diverged_solves": "predictive control/solves whose model diverged",
+    "paired_difference": "twin/log of the real cost over the twin's, same policy and inputs",
+    "alarm": "twin/alarm: the twin is wrong where it matters",
     "weight_change": "switch/relative weight change of the idle policy",
     "distillation_error": "switch/RMS action error of a distilled clone, share of range",
     "distillation_cost_ratio": "switch/J_a of a distilled clone over that of the live policy (twin)",

@@ -16,6 +16,7 @@ WORDS = {
     "update_model_free": "model-free update",
     "fit_exogenous": "fitting the input",
     "assimilate": "assimilating",
+    "examine": "examining the twin",
     "plan": "planning",
     "switch_policies": "comparing policies",
 }
@@ -39,7 +40,7 @@ class Progress:
         self._bar = tqdm(total=total, initial=done, unit="episode", dynamic_ncols=True)
         self._interval = ON_TERMINAL if sys.stderr.isatty() else IN_FILE
         self._costs, self._doing, self._since = "", "starting", time.perf_counter()
-        self._compiling, self._ended = False, threading.Event()
+        self._compiling, self._alarm, self._ended = False, False, threading.Event()
         self._thread = threading.Thread(target=self._keep_moving, daemon=True)
 
     def __enter__(self) -> "Progress":
@@ -62,8 +63,13 @@ class Progress:
         self._show()
 
     def episode(self, record: dict[str, Any]) -> None:
-        """Count an episode and show its costs."""
+        """Count an episode and show its costs; write when the twin's predictions begin or cease to be wrong."""
         self._costs = progress(record)
+        alarm = bool(record.get("alarm", self._alarm))
+        if alarm != self._alarm:
+            found = record.get("warning", "the twin's predictions hold again")
+            self.write(f"episode {record['episode'] + 1}: {found}")
+        self._alarm = alarm
         self._bar.update()
         self._show()
 

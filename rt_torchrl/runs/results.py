@@ -80,6 +80,7 @@ def summarise(
         "unseen": {"episodes": len(unseen.initial_state)}
         | {name: mean_with_confidence(values) for name, values in means.items()}
         | results(unseen, judged),
+        "cost_of_learning": cost_of_learning(episodes),
         "live": live,
         "better": better,
         "better_chosen_on": chosen_on,
@@ -147,6 +148,12 @@ def closure_errors(
     laws = {"found": algorithm.twin.closure, "start": start}
     features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
     return {name: rms_error(law, true, features).tolist() for name, law in laws.items()}
+
+
+def cost_of_learning(episodes: list[dict[str, Any]]) -> dict[str, float]:
+    """What the real system has paid: sum and largest of the J_a of all real episodes, with that of the start."""
+    costs = [record[key] for record in episodes for key in ("start_cost", "real_cost") if key in record]
+    return {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
 
 
 def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:

@@ -39,6 +39,9 @@ def results_table(metrics: dict[str, Any]) -> str:
             f"  {f'J_a {name}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
         )
     lines += merit_lines(unseen)
+    paid = found["cost_of_learning"]
+    least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
+    lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += closure_lines(found["closure"])
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))

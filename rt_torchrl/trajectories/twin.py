@@ -85,6 +85,10 @@ class DigitalTwin:
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""
 
+    def explanation(self) -> str:
+        """What the twin says about itself that may explain a wrong prediction; a twin that is alone says nothing."""
+        return ""
+
     def _planning(self, policy: nn.Module) -> Rollout:
         """The rollout of a policy under the closure held constant, kept as long as both are the same."""
         for planned in self._planned:

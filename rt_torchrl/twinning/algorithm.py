@@ -16,7 +16,6 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -24,6 +23,7 @@ from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
+from rt_torchrl.twinning.evidence.examination import Examination
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
@@ -73,9 +73,8 @@ class ReinforcementTwinning:
         referee: Referee | None = None,
         first: Start | None = None,
     ):
-        self.env, self.twin, self.config, self.generator = env, twin, config, generator
+        self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        self.first = first
         acting: Role = "model_free" if first is None else first.live
         acting = acting if config.arm == "twinning" else config.arm
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
@@ -91,6 +90,7 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual)
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
@@ -118,7 +118,8 @@ class ReinforcementTwinning:
         steps = [self.start] if self.first is not None and not self.episodes_done else []
         steps += [self.interact]
         steps += [self.update_model_free] if arm != "model_based" else []
-        steps += [self.fit_exogenous, self.assimilate, self.plan] if arm != "model_free" else []
+        on_twin = [self.fit_exogenous, self.assimilate, self.examine, self.plan]
+        steps += on_twin if arm != "model_free" else []
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
             safe_point()
@@ -156,7 +157,8 @@ class ReinforcementTwinning:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
         flight = self._flown(self.policies[live], strength=strength)
-        self.track_record.append(flight.record, live, flight.cost.item())
+        explored = self.actor.strength * self.config.exploration.spread
+        self.track_record.append(flight.record, live, flight.cost.item(), explored)
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
         flew = self.policies[live]
         return report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
@@ -192,6 +194,10 @@ class ReinforcementTwinning:
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
         return merged(fit, findings(**self.assimilation.report()))
 
+    def examine(self) -> TensorDict:
+        """Compare what the latest real episodes cost with what the present twin says of them."""
+        return self.examination.examine()
+
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""
         count = self.config.planner.realisations or self.config.realisations
@@ -199,7 +205,7 @@ class ReinforcementTwinning:
         judgement = Judgement(
             incumbent=lambda episodes: self.virtual_costs(episodes, ("model_based",))["model_based"],
             worse=self.referee.worse,
-            require_sound_twin=self.require_sound_twin,
+            require_sound_twin=lambda episodes: self.track_record.require_sound_twin(self.virtual, episodes),
         )
         return self.planning.plan(planned_on, judged_on, judgement)
 
@@ -217,6 +223,7 @@ class ReinforcementTwinning:
             idle_weight_change=change.item(),
             real_costs=self.track_record.real_costs,
             predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
+            beliefs=lambda: self.examination.beliefs(self.policies, self.short_term[-1]),
         )
         event = self.referee.decide(evidence)
         diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]
@@ -232,20 +239,8 @@ class ReinforcementTwinning:
         """
         costs = {role: self.virtual.cost(self.policies[role], episodes) for role in roles}
         if not all(cost.isfinite() for cost in costs.values()):
-            self.require_sound_twin(episodes)
+            self.track_record.require_sound_twin(self.virtual, episodes)
         return costs
-
-    def require_sound_twin(self, episodes: Scenario) -> None:
-        """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.
-
-        Raises:
-            DivergenceError: if it does.
-        """
-        if not self.virtual.cost(self.track_record.policy_flown(), episodes).isfinite():
-            raise DivergenceError(
-                f"plant {self.twin.plant.name!r} diverged on its twin with the weights that have just flown on the "
-                f"real system; the closure is {type(self.twin.closure).__name__}."
-            )
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
         """Clone the live policy into the idle one, unless the referee finds the clone worse than what it replaces.

@@ -40,20 +40,25 @@ class EarlierClosure:
         Where the sensors' noise is larger than the effect of the closure, even the closure that replays the records
         best may diverge in other flights, and the real system cannot wait.
 
-        Raises:
-            DivergenceError: if the twin diverges under these weights with the earlier closure too.
+        Where it diverges with the earlier closure too, the step is left out: the twin lacks something that the real
+        system has, and the real system goes on.
         """
         state, policy = self.generator.get_state(), copy.deepcopy(self.model_based.state_dict())
         try:
             return step()
         except DivergenceError as error:
-            if self._closure is None:
-                raise
             refused = f"closure refused: {error}"
         self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
-        self.twin.closure.load_state_dict(self._closure)
+        if self._closure is not None:
+            self.twin.closure.load_state_dict(self._closure)
         self._closure = None
         self.twin.retreat()
         self.generator.set_state(state)
         self.planner.restart()
-        return merged(step(), findings(refused, closure_refused=1.0))
+        try:
+            return merged(step(), findings(refused, closure_refused=1.0))
+        except DivergenceError as error:
+            self.model_based.load_state_dict(policy)
+            self.planner.restart()
+            left_out = findings(refused, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
+            return left_out.set_non_tensor("warning", f"the twin diverges under a policy that has flown: {error}")

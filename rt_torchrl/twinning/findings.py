@@ -37,7 +37,7 @@ class EpisodeReport(TensorDict):
             lines.append(f"twin: J_p {self['J_p']:.4g}, {self['J_p_before']:.4g} before assimilation")
         costs = [f"{key[4:]} {self[key]:.4g}" for key in ("J_a_model_based", "J_a_model_free") if key in self]
         lines += [f"J_a on the twin: {', '.join(costs)}"] if costs else []
-        lines += [f"{key}: {self[key]}" for key in ("event", "reason", "refusal") if key in self]
+        lines += [f"{key}: {self[key]}" for key in ("event", "warning", "reason", "refusal") if key in self]
         return "\n".join(lines)
 
 

@@ -78,6 +78,10 @@ class TwinEnsemble(DigitalTwin):
         """Name of the hypothesis with the greatest weight."""
         return max(self._shares, key=self._shares.__getitem__)
 
+    def explanation(self) -> str:
+        """The hypothesis that replays the records best."""
+        return f"{self.likeliest!r} explains the records best"
+
     def retreat(self) -> None:
         """Leave every hypothesis out for this episode: the policy that has just flown diverges under one."""
         self.weights = {ALONE: 1.0}

@@ -3,10 +3,12 @@
 from rt_torchrl.twinning.referees.decision_tree import DecisionTree
 from rt_torchrl.twinning.referees.referee import ROLES, Event, Evidence, Referee, RefereeConfig, RefereeName, Role
 from rt_torchrl.twinning.referees.trust_ratio import TrustRatio
+from rt_torchrl.twinning.referees.weight_of_evidence import WeightOfEvidence
 
-REFEREES: dict[RefereeName, type[DecisionTree] | type[TrustRatio]] = {
+REFEREES: dict[RefereeName, type[DecisionTree] | type[TrustRatio] | type[WeightOfEvidence]] = {
     "decision_tree": DecisionTree,
     "trust_ratio": TrustRatio,
+    "weight_of_evidence": WeightOfEvidence,
 }
 
 
@@ -24,5 +26,6 @@ __all__ = [
     "RefereeConfig",
     "Role",
     "TrustRatio",
+    "WeightOfEvidence",
     "make_referee",
 ]

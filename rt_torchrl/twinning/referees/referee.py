@@ -1,15 +1,18 @@
 """The protocol of a referee, which says in step 6 whether a policy is worse and who acts next, and its parameters."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from rt_torchrl.options import check_options
+from rt_torchrl.twinning.evidence.paired_differences import COMMON, LOCAL, Belief
 
 Role = Literal["model_free", "model_based"]
 Event = Literal["keep", "swap", "clone"]
-RefereeName = Literal["decision_tree", "trust_ratio"]
+RefereeName = Literal["decision_tree", "trust_ratio", "weight_of_evidence"]
+UNKNOWN = Belief(0.0, math.hypot(COMMON, LOCAL))
+"""Belief about a policy of which nothing is known."""
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 
 
@@ -18,13 +21,15 @@ class RefereeConfig:
     """Parameters of step 6.
 
     Args:
-        rule: rule of the referee: ``decision_tree``, as in the paper, or ``trust_ratio``, which believes the twin only
-            while the real cost follows the twin's predictions.
+        rule: rule of the referee: ``decision_tree``, as in the paper, ``trust_ratio``, which believes the twin only
+            while the real cost follows the twin's predictions, or ``weight_of_evidence``, which weighs what a change
+            may gain against what it may cost.
         patience: number P_π of episodes in a row that a reason to swap must outlast.
         clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
             a clone.
         tolerance: ratio T_J of the live policy's mean cost to the idle policy's above which the live policy is worse.
         stall: relative weight change T_w below which the idle policy has stalled.
+        trial_horizon: number of episodes over which a better policy pays for the trial in which it may be a worse one.
         band: least and greatest ratio of the real cost's change to the predicted change at which the twin is trusted.
     """
 
@@ -34,6 +39,7 @@ class RefereeConfig:
     tolerance: float = 1.0
     stall: float = 0.5
     band: tuple[float, float] = (0.0, 40.0)
+    trial_horizon: float = 5.0
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -43,6 +49,8 @@ class RefereeConfig:
         for argument in ("tolerance", "stall"):
             if not getattr(self, argument) > 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+        if not self.trial_horizon > 0:
+            raise ValueError(f"trial_horizon={self.trial_horizon} must be positive.")
         if not self.band[0] < self.band[1]:
             raise ValueError(f"band={self.band} of the trust ratio must have its least value first.")
 
@@ -58,6 +66,7 @@ class Evidence:
         real_costs: J_a of the latest real episodes, oldest first.
         predicted_costs: function that returns the costs of the same episodes on the present twin, flown with the same
             weights from the same states under the same inputs. It flies each episode, so it is called only if needed.
+        beliefs: function that returns the belief about log J_real − log J_twin of each policy.
 
     Raises:
         ValueError: if a cost or the weight change is not a number.
@@ -68,6 +77,7 @@ class Evidence:
     idle_weight_change: float
     real_costs: tuple[float, ...] = ()
     predicted_costs: Callable[[], tuple[float, ...]] = tuple
+    beliefs: Callable[[], Mapping[Role, Belief]] = lambda: dict.fromkeys(ROLES, UNKNOWN)
 
     def __post_init__(self) -> None:
         for argument in ("live_cost", "idle_cost", "idle_weight_change"):

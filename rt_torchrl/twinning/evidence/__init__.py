@@ -1,0 +1,1 @@
+"""What real episodes say about the twin's predictions."""

@@ -1,0 +1,139 @@
+"""What real episodes say about the twin: the belief about policies, the referee that weighs it, and the alarm."""
+
+import math
+import random
+
+import pytest
+import torch
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+from rt_torchrl.twinning.evidence.alarm import alarm
+from rt_torchrl.twinning.evidence.paired_differences import (
+    COMMON,
+    EXPLORED,
+    LARGEST,
+    LOCAL,
+    NOISE,
+    REACH,
+    Belief,
+    PairedDifferences,
+    difference,
+)
+from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
+
+
+def test_the_belief_is_that_of_a_gaussian_process():
+    generator = torch.Generator().manual_seed(0)
+    actions = 0.2 * torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    values = torch.randn(6, generator=generator, dtype=torch.float64)
+    exploration = torch.tensor([0.0, 0.1, 0.0, 0.02, 0.0, 0.3], dtype=torch.float64)
+    kernel = ConstantKernel(COMMON**2, "fixed") + ConstantKernel(LOCAL**2, "fixed") * RBF(REACH * 2.0, "fixed")
+    noise = NOISE**2 + (EXPLORED * exploration) ** 2
+    oracle = GaussianProcessRegressor(kernel, alpha=noise.numpy(), optimizer=None).fit(actions, values)
+    found = PairedDifferences(actions, values, exploration)
+    for other in 0.2 * torch.randn(5, 4, generator=generator, dtype=torch.float64):
+        mean, deviation = oracle.predict(other[None].numpy(), return_std=True)
+        assert found.belief(other) == pytest.approx((mean.item(), deviation.item()), rel=1e-9)
+
+
+def test_a_policy_that_flew_is_known_and_one_far_away_is_not():
+    flown = torch.zeros(3, 8, dtype=torch.float64)
+    found = PairedDifferences(flown, torch.full((3,), 1.5, dtype=torch.float64))
+    near, far = found.belief(flown[0]), found.belief(flown[0] + 1.0)
+    assert near.mean == pytest.approx(1.5, rel=0.02) and near.deviation < NOISE
+    assert abs(far.mean) < 0.1 and far.deviation > 0.9 * LOCAL
+
+
+def test_without_episodes_the_belief_is_the_prior():
+    found = PairedDifferences(torch.empty(0, 1, dtype=torch.float64), torch.empty(0, dtype=torch.float64))
+    assert found.belief(torch.zeros(8, dtype=torch.float64)) == (0.0, pytest.approx(math.hypot(COMMON, LOCAL)))
+
+
+def test_numbers_that_differ_are_refused():
+    with pytest.raises(ValueError, match="2 policies, 1 differences and 1 explorations"):
+        PairedDifferences(torch.zeros(2, 3, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "real, predicted, d",
+    [
+        (2.0, 1.0, math.log(2.0)),
+        (-1.0, -2.0, -math.log(2.0)),
+        (1.0, math.inf, LARGEST),
+        (1.0, 0.0, 0.0),
+        (1e9, 1.0, LARGEST),
+    ],
+)
+def test_paired_differences(real, predicted, d):
+    assert difference(real, predicted) == pytest.approx(d)
+
+
+def evidence(live, idle, beliefs):
+    roles = dict(zip(("model_based", "model_free"), beliefs, strict=True))
+    return Evidence(live_cost=live, idle_cost=idle, idle_weight_change=1.0, beliefs=lambda: roles)
+
+
+def decided(live, idle, beliefs):
+    """What the referee decides while the model-based policy is live."""
+    return make_referee(RefereeConfig(rule="weight_of_evidence"), "model_based").decide(evidence(live, idle, beliefs))
+
+
+KNOWN, UNKNOWN = Belief(0.0, 0.03), Belief(0.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    "live, idle, beliefs, event",
+    [
+        (10.0, 1.0, (KNOWN, UNKNOWN), "swap"),  # ten times better on the twin: one episode is enough
+        (1.0, 1.2, (KNOWN, UNKNOWN), "swap"),  # it may be better by half, over five episodes
+        (1.0, 1.2, (KNOWN, KNOWN), "keep"),
+        (1.0, 3.0, (KNOWN, UNKNOWN), "keep"),
+        (0.04, 0.11, (Belief(1.7, 0.03), Belief(0.0, 0.3)), "swap"),  # the twin says 0.04 of what costs 0.22
+        (1.0, math.inf, (KNOWN, KNOWN), "keep"),
+        (math.inf, 1.0, (KNOWN, KNOWN), "swap"),
+        (1.0, -1.0, (KNOWN, KNOWN), "swap"),
+        (-1.0, 1.0, (KNOWN, KNOWN), "keep"),
+    ],
+)
+def test_who_acts_follows_from_what_is_at_stake(live, idle, beliefs, event):
+    assert decided(live, idle, beliefs) == event
+
+
+def test_stakes_are_those_of_a_simulation():
+    from rt_torchrl.twinning.referees.weight_of_evidence import stakes
+
+    mean, deviation, draws = math.log(1.1), math.hypot(0.3, 0.05), random.Random(0)
+    ratios = [math.exp(draws.gauss(mean, deviation)) for _ in range(200_000)]
+    expected = [sum(max(0.0, sign * (1.0 - ratio)) for ratio in ratios) / len(ratios) for sign in (1.0, -1.0)]
+    beliefs = (Belief(0.0, 0.05), Belief(0.0, 0.3))
+    assert stakes(evidence(1.0, 1.1, beliefs), "model_based", "model_free") == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "differences, wrong",
+    [
+        ((), False),
+        ((2.0,), False),  # one episode may be chance
+        ((1.7, 1.8), True),
+        ((0.5, -0.5, 0.4, -0.3, 0.1), False),
+        ((0.02, 0.03, 0.02), False),  # off zero, but it does not matter
+        ((0.2, 0.15, 0.25, 0.2, 0.18), True),
+        ((3.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0), False),  # what is long ago no longer counts
+        ((-0.7, -0.69, -0.71), True),
+    ],
+)
+def test_the_alarm(differences, wrong):
+    assert (alarm(differences) is not None) == wrong
+
+
+def test_the_alarm_says_how_wrong_the_twin_is():
+    assert "the last 2 episodes cost 5.75 times as much as the twin says" in alarm((1.7, 1.8))
+    assert "cost 1/2.01 of what the twin says" in alarm((-0.7, -0.69, -0.71))
+
+
+def test_false_alarms_of_a_sound_twin_are_rare():
+    draws, alarms = random.Random(1), 0
+    for _ in range(2000):
+        alarms += alarm([draws.gauss(0.0, 0.05) for _ in range(5)]) is not None
+    assert alarms / 2000 < 0.05

@@ -1,0 +1,181 @@
+"""Several twins side by side: what each finds, how they are weighed, and what is planned on them."""
+
+import dataclasses
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+
+from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.earlier_closure import EarlierClosure
+from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, weighed
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
+
+LAG = 0.6
+ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
+
+
+class Suspecting(LinearQuadratic):
+    def suspects(self):
+        return {"late": DelayedActuator(self, "force", 0.2), "lags": LaggedActuator(self, "force", 0.2)}
+
+
+def recorded(plant, steps=100):
+    """A record of a plant under random commands, which hold for some intervals, as its sensors read it."""
+    generator = torch.Generator().manual_seed(5)
+    state = plant.draw_initial_state(1, generator)
+    exogenous = torch.zeros(1, steps, 1, dtype=torch.float64)
+    held = 4.0 * torch.rand(1, steps // 10, 1, generator=generator, dtype=torch.float64) - 2.0
+    flown = Rollout(plant, plant.closure)(state, exogenous, held.repeat_interleave(10, 1))
+    read = flown.states[0, :, : len(plant.readings)]
+    return Trajectory(read, flown.actions[0], exogenous[0]), flown.states[0]
+
+
+def ensemble(plant, **options):
+    closure = LinearClosure([[0.0, 0.0], [0.0, 0.0]])
+    config = HypothesesConfig(which="automatic", **options)
+    twin = make_twin(plant, closure, config)
+    return twin, make_assimilation(twin, ASSIMILATION, config)
+
+
+def fitted(real, plant, **options):
+    twin, assimilation = ensemble(plant, **options)
+    record, _ = recorded(real)
+    assimilation.update([record], (), 1, torch.Generator())
+    return twin, assimilation
+
+
+PLANT = Suspecting(horizon=10.0)
+
+
+def test_hidden_states_follow_from_what_was_read():
+    real = LaggedActuator(PLANT, "force", LAG)
+    record, states = recorded(real)
+    found = with_hidden_states(DigitalTwin(real, real.closure), record)
+    torch.testing.assert_close(found.states, states, rtol=1e-12, atol=1e-12)
+    assert with_hidden_states(DigitalTwin(PLANT, PLANT.closure), record) is record
+
+
+def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    assert twin.weights == {"lags": 1.0} and twin.likeliest == "lags"
+    assert twin.twins["lags"].closure.named_coefficients()["force_lag"].item() == pytest.approx(LAG, rel=1e-3)
+    torch.testing.assert_close(
+        twin.twins["lags"].closure.base.matrix, PLANT.closure.matrix, rtol=0.0, atol=2e-3, check_device=False
+    )
+    report = assimilation.report()
+    assert report["hypothesis/lags"] == 1.0 and report["misfit/lags"] < 1e-3 * report[f"misfit/{ALONE}"]
+    assert "'lags' explains the records best" in twin.explanation()
+
+
+def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():
+    twin, _ = fitted(PLANT, PLANT)
+    policy = LinearGain([[1.0, 1.0]])
+    generator = torch.Generator().manual_seed(0)
+    episodes = PLANT.draw_initial_state(4, generator), PLANT.draw_exogenous(4, generator)
+    alone = twin.twins[ALONE].cost(policy, *episodes)
+    torch.testing.assert_close(twin.cost(policy, *episodes), alone, rtol=0.01, atol=0.0)
+
+
+def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
+    twin, assimilation = ensemble(PLANT)
+    twin.weights = {ALONE: 1.0, "late": 3.0}
+    policy = LinearGain([[1.0, 1.0]])
+    generator = torch.Generator().manual_seed(0)
+    episodes = PLANT.draw_initial_state(4, generator), PLANT.draw_exogenous(4, generator)
+
+    def parts():
+        each = [twin.twins[name] for name in (ALONE, "late")]
+        return [one.cost(policy, one.plant.at_rest(episodes[0]), episodes[1]) for one in each]
+
+    def slope(cost):
+        return torch.autograd.grad(cost, policy.gain)[0]
+
+    mean = 0.25 * parts()[0] + 0.75 * parts()[1]
+    torch.testing.assert_close(twin.cost(policy, *episodes), mean)
+    torch.testing.assert_close(slope(twin.cost(policy, *episodes)), slope(0.25 * parts()[0] + 0.75 * parts()[1]))
+    twin.risk = 0.5
+    torch.testing.assert_close(twin.cost(policy, *episodes), 0.5 * mean + 0.5 * max(parts()))
+    assert isinstance(assimilation, EnsembleAssimilation)
+
+
+def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
+    twin, _ = ensemble(PLANT)
+    twin.weights = {"late": 0.9, ALONE: 0.1}
+    generator = torch.Generator().manual_seed(0)
+    state, exogenous = PLANT.draw_initial_state(2, generator), PLANT.draw_exogenous(2, generator)
+    flown = twin.control(LinearGain([[1.0, 1.0]]), state, exogenous)
+    late = twin.twins["late"]
+    expected = late.control(LinearGain([[1.0, 1.0]]), late.plant.at_rest(state), exogenous)
+    assert flown.states.shape == (2, PLANT.n_steps + 1, 2)
+    torch.testing.assert_close(flown.states, expected.states[..., :2])
+
+
+def test_weights_ask_for_evidence():
+    config = HypothesesConfig(which="automatic")
+    assert weighed({ALONE: 1.0, "lags": 0.95}, config) == {ALONE: pytest.approx(0.95**6)}
+    assert set(weighed({ALONE: 1.0, "lags": 0.8}, config)) == {ALONE, "lags"}
+    assert set(weighed({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}, config)) == {"lags", "late"}
+    assert set(weighed({ALONE: float("inf"), "lags": float("inf")}, config)) == {ALONE}
+    assert set(weighed({ALONE: 0.0, "lags": 0.0}, config)) == {ALONE}
+
+
+def test_a_twin_that_diverges_leaves_the_hypotheses_out():
+    twin, _ = ensemble(PLANT)
+    twin.weights = {"late": 1.0}
+    twin.retreat()
+    assert twin.weights == {ALONE: 1.0}
+    assert EarlierClosure.sound  # which calls it
+
+
+def test_the_state_is_kept():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    other, resumed = ensemble(PLANT)
+    resumed.load_state_dict(assimilation.state_dict())
+    assert other.weights == twin.weights and resumed.misfits == assimilation.misfits
+    for name, one in twin.twins.items():
+        if name != ALONE:
+            for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
+                assert torch.equal(mine, its)
+
+
+def test_hypotheses_are_chosen_by_name():
+    twin, _ = ensemble(PLANT, names=("late",))
+    assert list(twin.twins) == [ALONE, "late"]
+    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig())) is DigitalTwin
+    assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig(which="automatic"))) is DigitalTwin
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: ensemble(PLANT, names=("inflow",)), r"does not suspect inflow; choose among late, lags"),
+        (lambda: HypothesesConfig(names=("late",)), r"which='automatic'"),
+        (lambda: HypothesesConfig(prior=0.0), r"prior=0.0"),
+        (lambda: HypothesesConfig(risk=1.0), r"risk=1.0.*\[0, 1\)"),
+        (lambda: HypothesesConfig(segment=1), r"segment=1.*at least 2"),
+        (lambda: TwinEnsemble(PLANT, PLANT.closure, PLANT.suspects(), {}), r"equal names"),
+        (
+            lambda: TwinEnsemble(PLANT, PLANT.closure, {"x": LinearQuadratic(dt=0.2)}, {"x": PLANT.closure}),
+            r"hypothesis 'x' must extend the twin's plant",
+        ),
+    ],
+)
+def test_what_is_no_hypothesis_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_options_are_those_of_the_algorithm():
+    from rt_torchrl.twinning.config import TwinningConfig
+
+    changed = dataclasses.replace(TwinningConfig(), hypotheses=HypothesesConfig(which="automatic"))
+    assert TwinningConfig().hypotheses.which == "none" and changed.hypotheses.which == "automatic"
