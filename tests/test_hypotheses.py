@@ -13,7 +13,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
-from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, weighed
+from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, evidence
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -119,13 +119,36 @@ def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
     torch.testing.assert_close(flown.states, expected.states[..., :2])
 
 
-def test_weights_ask_for_evidence():
+def kept(misfits):
     config = HypothesesConfig(which="automatic")
-    assert weighed({ALONE: 1.0, "lags": 0.95}, config) == {ALONE: pytest.approx(0.95**6)}
-    assert set(weighed({ALONE: 1.0, "lags": 0.8}, config)) == {ALONE, "lags"}
-    assert set(weighed({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}, config)) == {"lags", "late"}
-    assert set(weighed({ALONE: float("inf"), "lags": float("inf")}, config)) == {ALONE}
-    assert set(weighed({ALONE: 0.0, "lags": 0.0}, config)) == {ALONE}
+    return {name for name, share in evidence(misfits, config).items() if share >= config.least}
+
+
+def test_weights_ask_for_evidence():
+    shares = evidence({ALONE: 1.0, "lags": 0.95}, HypothesesConfig(which="automatic"))
+    assert shares == {ALONE: 1.0, "lags": pytest.approx(0.05 / 0.95**6)}
+    assert kept({ALONE: 1.0, "lags": 0.95}) == {ALONE}
+    assert kept({ALONE: 1.0, "lags": 0.8}) == {ALONE, "lags"}
+    assert kept({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}) == {"lags", "late"}
+    assert kept({ALONE: float("inf"), "lags": float("inf")}) == {ALONE}
+    assert kept({ALONE: 0.0, "lags": 0.0}) == {ALONE}
+
+
+def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):
+    twin, assimilation = ensemble(PLANT)
+    late, (record, _), fitted_in = twin.twins["late"], recorded(PLANT), {"late": [], "lags": []}
+    for name, fit in assimilation.fits.items():
+
+        def update(*_, name=name):
+            fitted_in[name].append(done)
+            return 100.0 if name == "late" else 1.0
+
+        monkeypatch.setattr(fit, "update", update)
+    replayed = "rt_torchrl.twinning.hypotheses.assimilation.misfit"
+    monkeypatch.setattr(replayed, lambda one, *_: 100.0 if one is late else 1.0)
+    for done in range(20):  # noqa: B007  (the updates read it)
+        assimilation.update([record], (), 1, torch.Generator())
+    assert fitted_in == {"late": [0, 2, 5, 10, 19], "lags": list(range(20))}
 
 
 def test_a_twin_that_diverges_leaves_the_hypotheses_out():

@@ -25,6 +25,10 @@ FIRST_ROUNDS = 3
 """Rounds of the first fit; three take the inflow of a turbine from a misfit of 2000 to 2, one to 24."""
 SHORT_STEPS = 10
 """Levenberg-Marquardt steps over segments in a round."""
+HOPELESS = 1e-3
+"""Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
+LONGEST_PAUSE = 8
+"""Greatest number of episodes between two fits of a hopeless hypothesis."""
 FAR = 10.0
 """Ratio of misfits beyond which a stage has gone astray."""
 
@@ -48,7 +52,7 @@ class Fit:
             measured, method="levenberg_marquardt", initial="measured", segment=segment, iterations=SHORT_STEPS
         )
         self.stages = {"short": Assimilation(twin, short), "whole": Assimilation(twin, measured)}
-        self.fitted = False
+        self.fitted, self.waiting, self.pause = False, 0, 1
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
         """Fit the records, in more rounds the first time.
@@ -72,12 +76,25 @@ class Fit:
         self.fitted = True
         return least
 
+    def due(self) -> bool:
+        """Whether the fit is due, which a hopeless hypothesis is in ever fewer episodes."""
+        self.waiting -= 1
+        return self.waiting < 0
+
+    def rest(self, *, hopeless: bool) -> None:
+        """Wait twice as long as before until the next fit of a hopeless hypothesis, and not at all with another one."""
+        if not hopeless:
+            self.waiting, self.pause = 0, 1
+        elif self.waiting < 0:
+            self.waiting, self.pause = self.pause, min(2 * self.pause, LONGEST_PAUSE)
+
     def state_dict(self) -> dict[str, Any]:
         stages = {name: stage.state_dict() for name, stage in self.stages.items()}
-        return {"fitted": self.fitted, "closure": self.twin.closure.state_dict(), **stages}
+        counters = {"fitted": self.fitted, "waiting": self.waiting, "pause": self.pause}
+        return counters | {"closure": self.twin.closure.state_dict(), **stages}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.fitted = state["fitted"]
+        self.fitted, self.waiting, self.pause = state["fitted"], state["waiting"], state["pause"]
         self.twin.closure.load_state_dict(state["closure"])
         for name, stage in self.stages.items():
             stage.load_state_dict(state[name])
@@ -112,9 +129,16 @@ class EnsembleAssimilation(Assimilation):
         """As :meth:`Assimilation.update`, whose report is that of the twin alone."""
         found = super().update(records, processes, count, generator)
         alone = misfit(self.ensemble.twins[ALONE], records, self.segment)
-        self.misfits = {ALONE: alone} | {name: fit.update(records, generator) for name, fit in self.fits.items()}
-        self.ensemble.weights = weighed(self.misfits, self.hypotheses)
+        misfits = {name: self._misfit(fit, records, generator) for name, fit in self.fits.items()}
+        self.misfits = {ALONE: alone} | misfits
+        shares = evidence(self.misfits, self.hypotheses)
+        for name, fit in self.fits.items():
+            fit.rest(hopeless=shares[name] < HOPELESS)
+        self.ensemble.weights = {name: share for name, share in shares.items() if share >= self.hypotheses.least}
         return found
+
+    def _misfit(self, fit: "Fit", records: Sequence[Trajectory], generator: torch.Generator) -> float:
+        return fit.update(records, generator) if fit.due() else misfit(fit.twin, records, self.segment)
 
     def report(self) -> dict[str, float]:
         """The weight and the misfit of every hypothesis."""
@@ -148,15 +172,15 @@ def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> fl
     return identification_cost(twin.plant, flown, measured).mean().item()
 
 
-def weighed(misfits: dict[str, float], config: HypothesesConfig) -> dict[str, float]:
-    """Weights of the hypotheses that are planned on; the twin alone if none replays the records."""
+def evidence(misfits: dict[str, float], config: HypothesesConfig) -> dict[str, float]:
+    """Weights of all hypotheses as shares of the greatest one; the twin alone has all if none replays the records."""
     least = min(misfits.values())
     if not least < float("inf"):
-        return {ALONE: 1.0}
+        return {name: float(name == ALONE) for name in misfits}
     tiny = 1e-300  # a misfit of zero is perfect, as is another one
-    shares = {
+    weights = {
         name: (1.0 if name == ALONE else config.prior) * ((least + tiny) / (value + tiny)) ** config.sharpness
         for name, value in misfits.items()
     }
-    greatest = max(shares.values())
-    return {name: share for name, share in shares.items() if share >= config.least * greatest}
+    greatest = max(weights.values())
+    return {name: weight / greatest for name, weight in weights.items()}
