@@ -18,9 +18,13 @@ from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
+
+BLOWN_UP = 1e3
+"""Observation, which is of order one in a sound flight, beyond which a twin has blown up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +97,19 @@ class Distillation:
 
     @torch.no_grad()
     def _flown(self, teacher: nn.Module, policy: nn.Module, episodes: Scenario) -> tuple[Tensor, Tensor]:
-        """Observations of virtual episodes that a policy flies, and what the teacher does there."""
-        flown = self.twin.control(policy, *episodes)
+        """Observations of virtual episodes that a policy flies, and what the teacher does there, where both are sound.
+
+        A twin that lacks dynamics of the real system may blow up in a flight, and says nothing of what comes after.
+        """
+        try:
+            observations, actions = self._all_flown(teacher, policy, self.twin.control(policy, *episodes))
+        except DivergenceError:
+            plant, like = self.twin.plant, episodes.initial_state
+            return like.new_empty(0, len(plant.observations)), like.new_empty(0, len(plant.actions))
+        sound = (observations.abs() <= BLOWN_UP).all(-1) & actions.isfinite().all(-1)
+        return observations[sound], actions[sound]
+
+    def _all_flown(self, teacher: nn.Module, policy: nn.Module, flown: Trajectory) -> tuple[Tensor, Tensor]:
         if not isinstance(teacher, StateFeedback):
             return self._asked(teacher, self._observed(flown))
         if policy is teacher:
