@@ -26,7 +26,9 @@ VALIDATION_SEED = 2_000_000
 class UnseenEpisodes:
     """Real episodes with initial states and disturbances that no training has drawn.
 
-    The true closure is the plant's own; assign :attr:`closure` for a system that has worn.
+    The true closure is the plant's own; assign :attr:`closure` for a system that has worn. Controllers that are flown
+    beside policies are made for :attr:`physics`, the plant itself; assign the plant that is known of a system with
+    states that no sensor reads.
 
     Args:
         plant: the real system in simulation.
@@ -50,6 +52,7 @@ class UnseenEpisodes:
         generator = torch.Generator(device=device).manual_seed(seed)
         self.plant, self._compiled = plant, compiled
         self.closure: nn.Module | None = plant.closure
+        self.physics = plant
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
 
@@ -97,7 +100,7 @@ class UnseenEpisodes:
                 f"law={type(law).__name__} can only be flown on a real system; give a ClassicalController of plant "
                 f"{self.plant.name!r}."
             )
-        return law.fly(self.initial_state, self.exogenous, self.closure)
+        return law.fly(self.initial_state, self.exogenous, self.closure, plant=self.plant)
 
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
@@ -134,14 +137,17 @@ class UnseenEpisodes:
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
+        The twin begins with what sensors read, and is compared with it.
+
         Args:
             physics: physics of the twin, which need not be that of the real system.
             closure: closure of the twin.
             flown: the episodes as flown on the real system.
         """
         rollout = Rollout(physics, closure, compiled=self._compiled)
-        replayed = rollout(flown.states[:, 0], flown.exogenous, flown.actions)
-        return identification_cost(self.plant, replayed, flown.states)
+        measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
+        replayed = rollout(measured[:, 0], flown.exogenous, flown.actions)
+        return identification_cost(physics, replayed, measured)
 
 
 class Judged(NamedTuple):
