@@ -122,3 +122,16 @@ def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch
     monkeypatch.setattr(found.referee, "worse", lambda cost, than: True)
     report = found.episode()
     assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
+
+
+def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record():
+    found = twinning()
+    found.episode()
+    first = found.assimilation._first
+    with torch.no_grad():
+        for weight in found.twin.closure.parameters():
+            weight.fill_(1e3)
+    report = found.episode()
+    assert report["J_p_before"].isinf() and report["J_p"].isfinite()
+    assert all(weight.abs().max() < 10.0 for weight in found.twin.closure.parameters())
+    assert all(weight.isfinite().all() for weight in first.values())

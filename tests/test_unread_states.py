@@ -1,14 +1,16 @@
 """Everything that flies a real system with states that no sensor reads, and a twin that does not know them."""
 
+import math
+
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD
 
 from rt_torchrl import export_c, load_run
 from rt_torchrl.baselines.acting import ActingController
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum, mean_with_confidence
 from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
 from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
@@ -168,3 +170,15 @@ def test_a_safety_layer_and_a_wall_clock_see_readings_alone(tmp_path):
 def test_a_twin_that_holds_what_no_sensor_reads_is_refused(make, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         make(tmp_path)
+
+
+def test_a_twin_that_diverges_on_some_episodes_is_infinitely_wrong_there_alone():
+    unseen = UnseenEpisodes(BASE, 3)
+    flown = unseen.fly(LinearGain([[0.3, 0.3]]))
+    closure = LinearClosure([[0.0, 0.0], [0.0, 0.0]])
+    wild = flown._replace(exogenous=torch.stack([flown.exogenous[0], 1e308 * flown.exogenous[1], flown.exogenous[2]]))
+    found = unseen.identification_costs(BASE, closure, wild)
+    assert found.isinf().tolist() == [False, True, False]
+    assert mean_with_confidence(found) == {"mean": math.inf, "confidence_interval": [math.inf, math.inf]}
+    sound = unseen.identification_costs(BASE, closure, flown)
+    torch.testing.assert_close(found[[0, 2]], sound[[0, 2]])
