@@ -29,9 +29,8 @@ from rt_torchrl import (
 from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.unknown import SYSTEMS, unknown
+from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
 from rt_torchrl.envs.cryogenic_tank.valves import NarrowOnOff, OnOffValve, PIValve
-from rt_torchrl.plants.extensions.catalogue import require_systems
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -137,7 +136,7 @@ class Config(RunConfig):
         super().__post_init__()
         CryogenicTank.chosen(self.observe)
         self.cost()
-        require_systems(self.unknown, SYSTEMS)
+        require_unknown(self.unknown)
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         planned = self.start == "mpc" or self.twinning.planner.method == "receding_horizon"

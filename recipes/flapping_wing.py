@@ -28,8 +28,7 @@ from rt_torchrl.envs.flapping_wing.costs import TrackingCost, require_rate
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.flapping_wing.unknown import SYSTEMS, unknown
-from rt_torchrl.plants.extensions.catalogue import require_systems
+from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -147,7 +146,7 @@ class Config(RunConfig):
             raise ValueError(f"mean_wind={self.mean_wind} m/s must lie within ±{STORM:g} m/s.")
         FlappingWing.chosen(self.observe)
         self.cost()
-        require_systems(self.unknown, SYSTEMS)
+        require_unknown(self.unknown)
         if self.unknown and self.model_error:
             raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         require_rate(self.stroke_plane_rate)

@@ -16,7 +16,6 @@ from rt_torchrl import check_options, main_of
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.wind_turbine import unknown as turbines
-from rt_torchrl.plants.extensions.catalogue import require_systems
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.room import Room, room_table, write_into
 from rt_torchrl.study.scheduling import side_by_side
@@ -26,7 +25,7 @@ from rt_torchrl.study.yardsticks import Yardstick, oracle
 if TYPE_CHECKING:
     from rt_torchrl.study.task import Task
 
-SYSTEMS = {"wind_turbine": turbines.SYSTEMS, "flapping_wing": drones.SYSTEMS, "cryogenic_tank": tanks.SYSTEMS}
+CATALOGUES = {"wind_turbine": turbines, "flapping_wing": drones, "cryogenic_tank": tanks}
 POLICY: dict[str, tuple[str, ...]] = {
     "wind_turbine": ("--policy", "scheduled"),
     "flapping_wing": ("--policy", "paper"),
@@ -83,11 +82,11 @@ class Config:
         if self.task == "hop" and self.plant != "flapping_wing":
             raise ValueError(f"task='hop' is a task of the drone; the plant is {self.plant}.")
         for system in self.systems:
-            require_systems(names(system), SYSTEMS[self.plant])
+            CATALOGUES[self.plant].require_unknown(names(system))
 
     def rows(self) -> tuple[str, ...]:
         """The systems of the table, in its order."""
-        return self.systems or ("nothing", *SYSTEMS[self.plant])
+        return self.systems or ("nothing", *CATALOGUES[self.plant].SYSTEMS)
 
     @property
     def title(self) -> str:

@@ -32,9 +32,8 @@ from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
-from rt_torchrl.envs.wind_turbine.unknown import SYSTEMS, unknown
+from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
 from rt_torchrl.envs.wind_turbine.wear import worn_table
-from rt_torchrl.plants.extensions.catalogue import require_systems
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -139,7 +138,7 @@ class Config(RunConfig):
         if self.task == "paper" and self.engineering != EngineeringCost():
             raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
-        require_systems(self.unknown, SYSTEMS)
+        require_unknown(self.unknown)
         if self.unknown and (self.model_error or self.real == "rosco"):
             other = "model_error" if self.model_error else "real='rosco'"
             raise ValueError(f"unknown={self.unknown} does not go with {other}, another real system; give one of them.")

@@ -6,7 +6,7 @@ from functools import partial
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.two_zones import TwoZones
 from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.catalogue import System, combined
+from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.plants.plant import Plant
 
@@ -57,6 +57,15 @@ SYSTEMS: Mapping[str, System] = {
     "all": {"mixture": two_zones, "valve": slow_valve, "pressure sensor": partial(misread, offset=5e3)},
 }
 """What the real tank has beside its twin, by the names of ``--unknown``."""
+
+
+def require_unknown(names: Sequence[str]) -> None:
+    """Refuse names that do not exist, or change the same part.
+
+    Raises:
+        ValueError: if there are such names.
+    """
+    require_systems(names, SYSTEMS)
 
 
 def unknown(plant: CryogenicTank, names: Sequence[str]) -> Plant:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.plants.extensions.catalogue import System, combined
+from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
 from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
@@ -96,6 +96,15 @@ SYSTEMS: Mapping[str, System] = {
     },
 }
 """What the real drone has beside its twin, by the names of ``--unknown``."""
+
+
+def require_unknown(names: Sequence[str]) -> None:
+    """Refuse names that do not exist, or change the same part.
+
+    Raises:
+        ValueError: if there are such names.
+    """
+    require_systems(names, SYSTEMS)
 
 
 def unknown(plant: FlappingWing, names: Sequence[str]) -> Plant:

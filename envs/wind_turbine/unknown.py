@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
 from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.extensions.catalogue import System, combined
+from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
 from rt_torchrl.plants.extensions.scaled_coefficients import ScaledCoefficients
@@ -70,6 +70,15 @@ SYSTEMS: Mapping[str, System] = {
     },
 }
 """What the real turbine has beside its twin, by the names of ``--unknown``."""
+
+
+def require_unknown(names: Sequence[str]) -> None:
+    """Refuse names that do not exist, or change the same part.
+
+    Raises:
+        ValueError: if there are such names.
+    """
+    require_systems(names, SYSTEMS)
 
 
 def unknown(plant: WindTurbine, names: Sequence[str]) -> Plant:

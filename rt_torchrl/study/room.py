@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rt_torchrl.atomic_file import write_atomically
-from rt_torchrl.study.tables import table
 
 LEAST = 0.03
 """Gap below which a system is no evidence for or against a method."""
@@ -59,6 +58,8 @@ class Room:
 
 def room_table(rows: Sequence[Room]) -> str:
     """The table of several systems, as Markdown."""
+    from rt_torchrl.study.tables import table  # here, because the help of a recipe need not wait for Matplotlib
+
     return table(HEADER, [row.cells() for row in rows])
 
 
