@@ -135,3 +135,20 @@ def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record():
     assert report["J_p_before"].isinf() and report["J_p"].isfinite()
     assert all(weight.abs().max() < 10.0 for weight in found.twin.closure.parameters())
     assert all(weight.isfinite().all() for weight in first.values())
+
+
+def test_a_twin_goes_back_to_its_first_closure_if_the_earlier_one_diverges_too(monkeypatch):
+    found = twinning()
+    first = weights(found.twin.closure).clone()
+    found.episode()
+    unsound(found, monkeypatch, {1})
+    kept = found.earlier.remember
+
+    def remembered_unsound():
+        kept()
+        found.earlier._closure = {name: torch.full_like(w, 1e300) for name, w in found.earlier._closure.items()}
+
+    monkeypatch.setattr(found.earlier, "remember", remembered_unsound)
+    report = found.episode()
+    assert report["closure_refused"] == 1.0
+    assert torch.equal(weights(found.twin.closure), first)

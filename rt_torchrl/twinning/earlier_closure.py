@@ -27,33 +27,39 @@ class EarlierClosure:
     def __init__(self, twin: DigitalTwin, model_based: nn.Module, planner: Planner, generator: torch.Generator):
         self.twin, self.model_based, self.planner, self.generator = twin, model_based, planner, generator
         self._closure: dict[str, Any] | None = None
+        self._first = copy.deepcopy(twin.closure.state_dict())
 
     def remember(self) -> None:
         """Keep the present closure."""
         self._closure = copy.deepcopy(self.twin.closure.state_dict())
 
     def sound(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode.
+        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode, then the first.
 
         The weights that have just flown did not diverge on the real system. If the twin diverges with them, the closure
         must be wrong. Any other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure.
         Where the sensors' noise is larger than the effect of the closure, even the closure that replays the records
-        best may diverge in other flights, and the real system cannot wait.
+        best may diverge in other flights, and the real system cannot wait. A twin without the dynamics of the real
+        system bends every closure that is fitted, but not the one that it began with.
 
         Raises:
-            DivergenceError: if the twin diverges under these weights with the earlier closure too.
+            DivergenceError: if the twin diverges under these weights with the first closure too.
         """
         state, policy = self.generator.get_state(), copy.deepcopy(self.model_based.state_dict())
         try:
             return step()
         except DivergenceError as error:
-            if self._closure is None:
-                raise
-            refused = f"closure refused: {error}"
-        self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
-        self.twin.closure.load_state_dict(self._closure)
-        self._closure = None
-        self.twin.retreat()
-        self.generator.set_state(state)
-        self.planner.restart()
-        return merged(step(), findings(refused, closure_refused=1.0))
+            found = error
+        refused = f"closure refused: {found}"
+        for closure in filter(None, (self._closure, self._first)):
+            self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
+            self.twin.closure.load_state_dict(closure)
+            self._closure = None
+            self.twin.retreat()
+            self.generator.set_state(state)
+            self.planner.restart()
+            try:
+                return merged(step(), findings(refused, closure_refused=1.0))
+            except DivergenceError as error:
+                found = error
+        raise found
