@@ -155,9 +155,10 @@ def row(config: Config, system: str) -> Room:
 
 def command(config: Config) -> str:
     """The command line that makes the table."""
-    options = f"--seeds {config.seeds} --episodes {config.episodes}"
-    options += " --task hop" if config.task == "hop" else ""
-    return " ".join(["uv run recipes/unknown.py", config.plant, *config.systems, options])
+    usual = Config(plant=config.plant)
+    changed = {name: getattr(config, name) for name in ("task", "seeds", "episodes", "unseen", "starts", "iterations")}
+    options = [f"--{name} {value}" for name, value in changed.items() if value != getattr(usual, name)]
+    return " ".join(["uv run recipes/unknown.py", config.plant, *config.systems, *options])
 
 
 def main(config: Config) -> None:
