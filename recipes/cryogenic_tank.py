@@ -19,6 +19,7 @@ from rt_torchrl import (
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
+    Plant,
     PredictiveConfig,
     RefereeConfig,
     RunConfig,
@@ -28,6 +29,7 @@ from rt_torchrl import (
 from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
 from rt_torchrl.envs.cryogenic_tank.valves import NarrowOnOff, OnOffValve, PIValve
 
 if TYPE_CHECKING:
@@ -107,6 +109,8 @@ class Config(RunConfig):
         noise: standard deviation of the sensors, as a share of what they read; with noise, the default of
             twinning.assimilation.initial is estimated.
         model_error: foul the heat exchanger, so that its U_HX falls by 2 % from episode to episode.
+        unknown: what the real system has beside its twin, one or more of bias_5, bias_15, bias_minus_15, drift_10,
+            drift_25 (of the pressure sensor), valve_lag, two_zones and all; docs/unknown_systems.md describes them.
     """
 
     paper: bool = False
@@ -124,6 +128,7 @@ class Config(RunConfig):
     wall: Literal["explicit", "exponential"] = "explicit"
     wall_heat_capacity: float = 500e3
     model_error: bool = False
+    unknown: tuple[str, ...] = ()
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
 
@@ -131,6 +136,9 @@ class Config(RunConfig):
         super().__post_init__()
         CryogenicTank.chosen(self.observe)
         self.cost()
+        require_unknown(self.unknown)
+        if self.unknown and self.model_error:
+            raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         planned = self.start == "mpc" or self.twinning.planner.method == "receding_horizon"
         if planned and self.command != "duty":
             raise ValueError(
@@ -148,7 +156,15 @@ class Config(RunConfig):
             return Config(paper=True, start="random", command="drop", end_weight=0.0, twinning=twinning)
         return Config(twinning=self.suited(twinning))
 
-    def plant(self) -> CryogenicTank:
+    def plant(self) -> Plant:
+        return unknown(self.tank(), self.unknown)
+
+    def believed(self) -> CryogenicTank | None:
+        """The physics of a twin that does not know what the real tank has beside them."""
+        return self.tank() if self.unknown else None
+
+    def tank(self) -> CryogenicTank:
+        """The tank as its twin knows it."""
         return CryogenicTank(
             dt=self.dt,
             horizon=self.horizon,
@@ -194,7 +210,14 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 def main(config: Config) -> None:
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    Run(config, config.plant(), plant_figures=plant_figures, baselines=VALVES, first=PIValve).train()
+    Run(
+        config,
+        config.plant(),
+        believed=config.believed(),
+        plant_figures=plant_figures,
+        baselines=VALVES,
+        first=PIValve,
+    ).train()
 
 
 if __name__ == "__main__":

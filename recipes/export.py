@@ -106,7 +106,7 @@ def main(config: Config) -> None:
 
 def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) -> str:
     """Write one file, and say how it agrees."""
-    role, plant = config.name or f"{run.plant.name}_{config.role}", run.plant
+    role, plant = config.name or f"{run.plant.name}_{config.role}", run.physics
     name = {"policy": role, "controller": f"{role}_controller", "twin": f"{config.name or plant.name}_twin"}[what]
     path = output / f"{name}.{kind}"
     if what == "policy":

@@ -17,6 +17,7 @@ from rt_torchrl import (
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
+    Plant,
     PredictiveConfig,
     RefereeConfig,
     RunConfig,
@@ -27,6 +28,7 @@ from rt_torchrl.envs.flapping_wing.costs import TrackingCost, require_rate
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,6 +88,8 @@ OBSERVED = {"paper": "paper", "mlp": "measured+wind"}
 """What each kind of policy observes by default."""
 MASS, BELIEVED = 3e-3, 2.25e-3
 """Mass of the body [kg], and the mass that the twin believes with ``--model-error``."""
+TARGETS = {"paper": (5.0, 5.0), "hop": (1.0, 1.0)}
+"""Target (x_f, z_f) of each task [m]."""
 STORM = 120.0
 """Wind speed above all that has been measured near the ground [m/s]."""
 
@@ -101,6 +105,7 @@ class Config(RunConfig):
         observe: what the policies observe, by names of sets and of measurements: paper or errors (of position and
             speed), wind (these and the headwind), phase (these and the phase of the wing beat), measured+wind (all of
             these), or names such as headwind; by default measured+wind for mlp, and else paper.
+        task: where the drone flies to: paper (5 m forwards and upwards), or hop (1 m forwards and upwards).
         dt: control interval [s].
         horizon: length of an episode T_o [s].
         mean_wind: mean headwind [m/s].
@@ -111,6 +116,8 @@ class Config(RunConfig):
         stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; by default there is none, and the angle may
             flip within a wing beat.
         model_error: let the twin believe in a body of 2.25 g, while the real one is 33 % heavier.
+        unknown: what the real system has beside its twin, one or more of plane_4.4, plane_6.3, plane_12.6 (slow stroke
+            planes), delay, sag, gust, lift_lag, all_1 and all_2; docs/unknown_systems.md describes them.
     """
 
     paper: bool = False
@@ -118,6 +125,7 @@ class Config(RunConfig):
     hidden: tuple[int, ...] = (16, 16)
     start: str = "controller"
     closure: Literal["paper", "mlp"] = "paper"
+    task: Literal["paper", "hop"] = "paper"
     dt: float = 5e-4
     horizon: float = 5.0
     mean_wind: float = 1.0
@@ -128,6 +136,7 @@ class Config(RunConfig):
     tilt: float = 0.0
     stroke_plane_rate: float | None = None
     model_error: bool = False
+    unknown: tuple[str, ...] = ()
     unseen: int = 100
     twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
 
@@ -137,6 +146,9 @@ class Config(RunConfig):
             raise ValueError(f"mean_wind={self.mean_wind} m/s must lie within ±{STORM:g} m/s.")
         FlappingWing.chosen(self.observe)
         self.cost()
+        require_unknown(self.unknown)
+        if self.unknown and self.model_error:
+            raise ValueError(f"unknown={self.unknown} does not go with model_error, another real system; give one.")
         require_rate(self.stroke_plane_rate)
         if not 0.0 <= self.wind_deviation <= STORM:
             raise ValueError(f"wind_deviation={self.wind_deviation} m/s must lie in [0, {STORM:g}].")
@@ -147,12 +159,17 @@ class Config(RunConfig):
             return Config(paper=True, policy="paper", start="random", twinning=twinning)
         return Config(twinning=self.suited(twinning))
 
-    def plant(self, mass: float = MASS) -> FlappingWing:
+    def plant(self) -> Plant:
+        return unknown(self.drone(MASS), self.unknown)
+
+    def drone(self, mass: float) -> FlappingWing:
+        """The drone as its twin knows it, with a body of this mass [kg]."""
         wind = GaussianGust(mean=self.mean_wind, std=self.wind_deviation)
         return FlappingWing(
             dt=self.dt,
             horizon=self.horizon,
             wind=wind,
+            target=TARGETS[self.task],
             cost=self.cost(),
             mass=mass,
             stroke_plane_rate=self.stroke_plane_rate,
@@ -167,8 +184,10 @@ class Config(RunConfig):
         return LimitConfig(starts={"PD": TrimmedPD}, window=self.twinning.planner.receding_horizon)
 
     def believed(self) -> FlappingWing | None:
-        """The physics of a twin that is wrong about them; None if it is right."""
-        return self.plant(BELIEVED) if self.model_error else None
+        """The physics of a twin that is wrong about them, or does not know all; None if it is right."""
+        if self.unknown:
+            return self.drone(MASS)
+        return self.drone(BELIEVED) if self.model_error else None
 
 
 def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:

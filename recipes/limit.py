@@ -124,6 +124,7 @@ def contenders(
 ) -> Iterator[tuple[str, Contender]]:
     """The clairvoyant optimum and all controllers, as they are found."""
     episodes = UnseenEpisodes(plant, config.episodes, seed=config.seed)
+    episodes.physics = plant if run is None else run.physics
     starts = flown_starts(episodes, known)
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts
     yield "clairvoyant", limit(episodes, chosen, hold=config.hold or known.hold, config=config.descent)
@@ -135,9 +136,11 @@ def contenders(
         return
     window = fitting(known.window, plant)
     foreseen = forecasts(plant, episodes.exogenous, window.horizon)
-    for model, closure in {"exact": None, **({} if run is None else {"fitted": run.closure})}.items():
+    models = {"exact": (plant, episodes.known_closure())}
+    models |= {} if run is None else {"fitted": (run.physics, run.closure)}
+    for title, model in models.items():
         for name in config.mpc:
-            yield f"MPC, {model}, {name}", receding(episodes, window, foreseen[name], closure)
+            yield f"MPC, {title}, {name}", receding(episodes, *model, window, foreseen[name])
 
 
 def header(best: Contender) -> str:

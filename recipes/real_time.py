@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from rt_torchrl import check_options, load_run, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.runs.run_config import plant_of
+from rt_torchrl.runs.run_config import physics_of, plant_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +57,10 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     make_folder("folder", config.folder)
     run = load_run(config.run)
-    plant = plant_of(run.config if config.seconds is None else dataclasses.replace(run.config, horizon=config.seconds))
-    policy = controller(run, plant, config.deadline)
-    found = rehearsed(policy, run, plant, seed=config.seed, log=config.folder / "safety.jsonl")
+    options = run.config if config.seconds is None else dataclasses.replace(run.config, horizon=config.seconds)
+    plant, physics = plant_of(options), physics_of(options)
+    policy = controller(run, physics, config.deadline)
+    found = rehearsed(policy, run, plant, physics, seed=config.seed, log=config.folder / "safety.jsonl")
     path = write_results(config.folder / "real_time.json", {"config": config, **found})
     for name, value in found.items():
         print(f"{name.replace('_', ' '):<24}{value:.6g}")

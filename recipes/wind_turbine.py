@@ -19,6 +19,7 @@ from rt_torchrl import (
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
+    Plant,
     PredictiveConfig,
     RunConfig,
     TwinningConfig,
@@ -31,6 +32,7 @@ from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
+from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
 from rt_torchrl.envs.wind_turbine.wear import worn_table
 
 if TYPE_CHECKING:
@@ -103,6 +105,8 @@ class Config(RunConfig):
         turbulence: turbulence intensity σ/U [-].
         wind_files: TurbSim files (.hh or .bts) from which the wind is drawn instead.
         model_error: wear the rotor from the middle of the training on, with 10 % less lift and 50 % more drag.
+        unknown: what the real system has beside its twin, one or more of anemometer_low, anemometer_high, torque_loss,
+            inflow, pitch and all; docs/unknown_systems.md describes them.
         real: real system: simulation of the plant, or rosco for the simulator of NREL's ROSCO toolbox. With rosco,
             policies are judged in that simulator and compared with ROSCO's controller; this needs the extra rosco.
     """
@@ -121,6 +125,7 @@ class Config(RunConfig):
     turbulence: float = 0.16
     wind_files: tuple[Path, ...] = ()
     model_error: bool = False
+    unknown: tuple[str, ...] = ()
     real: Literal["simulation", "rosco"] = "simulation"
     twinning: TwinningConfig = field(default_factory=lambda: CONVERGED)
 
@@ -133,6 +138,10 @@ class Config(RunConfig):
         if self.task == "paper" and self.engineering != EngineeringCost():
             raise ValueError("engineering.* are weights of the task engineering; give --task engineering, too.")
         WindTurbine.chosen(self.observe)
+        require_unknown(self.unknown)
+        if self.unknown and (self.model_error or self.real == "rosco"):
+            other = "model_error" if self.model_error else "real='rosco'"
+            raise ValueError(f"unknown={self.unknown} does not go with {other}, another real system; give one of them.")
         other = self.model_free_policy
         if not self.observe and "scheduled" in (self.policy, other) and other not in ("same", self.policy, "mlp"):
             raise ValueError(
@@ -147,7 +156,15 @@ class Config(RunConfig):
             return Config(paper=True, policy="paper", start="random", twinning=twinning)
         return Config(twinning=self.suited(twinning))
 
-    def plant(self) -> WindTurbine:
+    def plant(self) -> Plant:
+        return unknown(self.turbine(), self.unknown)
+
+    def believed(self) -> WindTurbine | None:
+        """The physics of a twin that does not know what the real turbine has beside them."""
+        return self.turbine() if self.unknown else None
+
+    def turbine(self) -> WindTurbine:
+        """The turbine as its twin knows it."""
         wind = KaimalWind(mean=self.mean_wind, intensity=self.turbulence)
         if self.wind_files:
             wind = RecordedWind(records=[self.wind_of(path) for path in self.wind_files])
@@ -198,7 +215,8 @@ def main(config: Config) -> None:
     if config.real == "rosco":
         env = rosco_turbine(plant, seed=config.seed, device=require_device(config.device))
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
-    Run(config, plant, plant_figures=plant_figures, first=JonkmanController, **system).train()
+    believed = config.believed()
+    Run(config, plant, believed=believed, plant_figures=plant_figures, first=JonkmanController, **system).train()
 
 
 if __name__ == "__main__":

@@ -138,7 +138,9 @@ def test_the_hooks_are_installed(clone):
     assert (clone / ".git" / "hooks" / "pre-commit").exists()
 
 
-@pytest.mark.parametrize("command", [command for command in commands() if "recipes/study.py" in command])
+@pytest.mark.parametrize(
+    "command", [command for command in commands() if re.search(r"recipes/(study|unknown).py", command)]
+)
 def test_a_printed_study_begins(command, clone, tmp_path):
     if "--extra ray" in command:
         pytest.importorskip("ray", reason="the study's Ray cluster needs the extra ray")

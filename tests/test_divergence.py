@@ -125,3 +125,33 @@ def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch
     monkeypatch.setattr(found.referee, "worse", lambda cost, than: True)
     report = found.episode()
     assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
+
+
+def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record():
+    found = twinning()
+    found.episode()
+    first = found.assimilation._first
+    with torch.no_grad():
+        for weight in found.twin.closure.parameters():
+            weight.fill_(1e3)
+    report = found.episode()
+    assert report["J_p_before"].isinf() and report["J_p"].isfinite()
+    assert all(weight.abs().max() < 10.0 for weight in found.twin.closure.parameters())
+    assert all(weight.isfinite().all() for weight in first.values())
+
+
+def test_a_twin_goes_back_to_its_first_closure_if_the_earlier_one_diverges_too(monkeypatch):
+    found = twinning()
+    first = weights(found.twin.closure).clone()
+    found.episode()
+    unsound(found, monkeypatch, {1})
+    kept = found.earlier.remember
+
+    def remembered_unsound():
+        kept()
+        found.earlier._closure = {name: torch.full_like(w, 1e300) for name, w in found.earlier._closure.items()}
+
+    monkeypatch.setattr(found.earlier, "remember", remembered_unsound)
+    report = found.episode()
+    assert report["closure_refused"] == 1.0
+    assert torch.equal(weights(found.twin.closure), first)

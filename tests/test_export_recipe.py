@@ -14,7 +14,7 @@ from rt_torchrl import load_run
 from rt_torchrl.export import c_compiler
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run import Run
-from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_config import RunConfig, physics_of
 from rt_torchrl.runs.settings import config_of, settings_of
 
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -32,7 +32,7 @@ def recipe(name):
 def leave_run(folder, name, **options):
     """Write the files of a run as Run.train writes them, with random weights."""
     config = config_class_of(RECIPES / f"{name}.py")(seed=3, log_dir=folder, **options)
-    plant, generator = config.plant(), torch.Generator().manual_seed(7)
+    plant, generator = physics_of(config), torch.Generator().manual_seed(7)
     policies, closure = config.make_policies(plant, generator), config.make_closure(plant, generator)
     parts = {**config.acting_policies(policies, plant, closure), "closure": closure}
     with torch.no_grad():

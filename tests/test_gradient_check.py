@@ -27,8 +27,8 @@ def test_weights_that_are_frozen_are_left_out(held):
     for part in held.split(" and "):
         getattr(closure, part).requires_grad_(False)
     # The continuous adjoint differs by the order of its step: 1e-4 for 0.1 s times the 1/120 of the local error.
-    assert 0.0 < engine_gap(closure, policy, UnseenEpisodes(plant, 2)) < 1e-5
+    assert 0.0 < engine_gap(plant, closure, policy, UnseenEpisodes(plant, 2)) < 1e-5
     policy.requires_grad_(False)
     closure.requires_grad_(False)
     with pytest.raises(ValueError, match="closure TwoParts and policy LinearGain have no weight that is trained"):
-        engine_gap(closure, policy, UnseenEpisodes(plant, 2))
+        engine_gap(plant, closure, policy, UnseenEpisodes(plant, 2))

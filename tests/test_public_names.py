@@ -29,6 +29,7 @@ ROOMS_OF = {
     "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
     "study.py": {"study", "runs"},
+    "unknown.py": {"study", "runs"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""
 

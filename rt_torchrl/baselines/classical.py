@@ -80,17 +80,18 @@ class ClassicalController(nn.Module, ABC):
         *,
         plant: Plant | None = None,
     ) -> Trajectory:
-        """Episodes under this controller.
+        """Episodes under this controller, which acts on what sensors read.
 
         Args:
             initial_state: initial states of the episodes.
             exogenous: exogenous inputs.
             closure: closure of the system; None for that of its plant.
-            plant: physics of the system, such as a twin's; None for the controller's own plant.
+            plant: physics of the system, such as a twin's, or a real one that has more states than sensors read; None
+                for the controller's own plant.
         """
         plant = self.plant if plant is None else plant
         loop = RememberingInterval(plant, plant.closure if closure is None else closure, self)
-        start = torch.cat([initial_state, self.first_memory(initial_state)], -1)
+        start = torch.cat([initial_state, self.first_memory(initial_state[..., : len(plant.readings)])], -1)
         drive = drive_of(plant, exogenous, None)
         carries = torch.cat([start.unsqueeze(0), self._engine.end_states(loop, start, drive)])
         states = carries[..., : len(plant.states)].transpose(0, 1)

@@ -69,7 +69,7 @@ class PlantContractError(ValueError):
 
 
 def check_plant(
-    plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int = 0, traced: bool = True
+    plant: Plant, *, episodes: int = 4, steps: int = 50, seed: int = 0, traced: bool = True, trained: bool = True
 ) -> ContractReport:
     """Find all violations of the :class:`Plant` contract at once, not the first one alone.
 
@@ -87,6 +87,8 @@ def check_plant(
         seed: seed of the draws and of the random commands.
         traced: whether the methods are also traced, into one graph and for the engine ``native``. Tracing takes
             seconds, and methods that jaxtyping checks at run time cannot become one graph.
+        trained: whether a twin of this plant trains its closure, so that each weight must matter on the flights; False
+            for a real system whose twin is another plant.
 
     Returns:
         The checks that were made; the function prints nothing.
@@ -103,7 +105,7 @@ def check_plant(
     found = list(signals(plant)) or list(attempt(draws, plant, seed)) + list(attempt(modules, plant, seed))
     checks = ON_FLIGHTS if traced else {name: check for name, check in ON_FLIGHTS.items() if check is not tracing}
     steps = min(steps, plant.n_steps)
-    found = found or _on_flights(plant, episodes, steps, seed, checks.values())
+    found = found or _on_flights(plant, episodes, steps, seed, checks.values(), trained=trained)
     if found:
         raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
     reason = untraceable(Calls.at_the_start(plant, episodes, seed)) if traced else None
@@ -116,7 +118,9 @@ def _on_cpu(plant: Plant) -> Plant:
     return plant if all(tensor.device.type == "cpu" for tensor in tensors) else copy.deepcopy(plant).cpu()
 
 
-def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iterable[Check]) -> list[str]:
+def _on_flights(
+    plant: Plant, episodes: int, steps: int, seed: int, checks: Iterable[Check], *, trained: bool
+) -> list[str]:
     """The violations that need states to be found; an early violation ends the search."""
     calls = Calls.at_the_start(plant, episodes, seed)
     found = [*attempt(methods, calls), *attempt(stability, calls)]
@@ -126,6 +130,8 @@ def _on_flights(plant: Plant, episodes: int, steps: int, seed: int, checks: Iter
         calls = Calls.in_flight(plant, episodes, steps, seed)
     except FloatingPointError as error:
         return [f"step: {error}"]
+    if not trained:
+        calls.closure.requires_grad_(False)
     return [text for check in checks for text in attempt(check, calls)]
 
 

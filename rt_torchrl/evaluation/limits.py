@@ -100,7 +100,7 @@ def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Flo
     """The commands of the controllers, some of which rest at the end."""
     starts = {}
     for name, kind in config.starts.items():
-        flown = episodes.fly_baseline(kind(episodes.plant)).actions
+        flown = episodes.fly_baseline(kind(episodes.physics)).actions
         if name in config.resting:
             starts[f"{name}, resting"] = resting_at_the_end(episodes, flown)
         else:
@@ -156,8 +156,8 @@ def evidence(found: Clairvoyant) -> dict[str, Any]:
 
 def classical(episodes: UnseenEpisodes, kind: type[ClassicalController], *, calls: int = 50) -> Contender:
     """A classical controller with its default gains; ``calls`` is the number of actions that are timed."""
-    controller = kind(episodes.plant)
-    flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1]
+    controller = kind(episodes.physics)
+    flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1, : len(episodes.plant.readings)]
     memory = controller.first_memory(state)
     return judged(episodes, flown, timed(lambda: controller.act(state, memory), calls))
 
@@ -188,12 +188,12 @@ def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
 
 
 def receding(
-    episodes: UnseenEpisodes, config: RecedingHorizonConfig, forecast: Forecast, closure: nn.Module | None = None
+    episodes: UnseenEpisodes, model: Plant, closure: nn.Module, config: RecedingHorizonConfig, forecast: Forecast
 ) -> Contender:
-    """Model predictive control, on the exact model or on one with the closure that is given."""
+    """Model predictive control on a model with a closure, such as those of the system, or those of a twin."""
     exact = episodes.known_closure()
-    controller = RecedingHorizon(episodes.plant, closure or exact, config, forecast=forecast)
-    flown = controller.fly(episodes.initial_state, episodes.exogenous, exact)
+    controller = RecedingHorizon(model, closure, config, forecast=forecast)
+    flown = controller.fly(episodes.initial_state, episodes.exogenous, exact, plant=episodes.plant)
     batch, solves = len(episodes.initial_state), controller.solves
     milliseconds = in_milliseconds([solve.seconds for solve in solves[batch:]])  # the first solves trace the programs
     gradients = statistics.median(solve.gradients for solve in solves)
@@ -204,7 +204,7 @@ def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
     """Model predictive control on the exact model, with its own forecast; see :func:`receding`."""
     window = fitting(window, episodes.plant)
     known = forecasts(episodes.plant, episodes.exogenous, window.horizon)
-    return receding(episodes, window, known[window.forecast])
+    return receding(episodes, episodes.plant, episodes.known_closure(), window, known[window.forecast])
 
 
 def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: float) -> dict[str, Forecast]:

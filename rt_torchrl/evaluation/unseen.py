@@ -13,7 +13,7 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 
@@ -26,7 +26,9 @@ VALIDATION_SEED = 2_000_000
 class UnseenEpisodes:
     """Real episodes with initial states and disturbances that no training has drawn.
 
-    The true closure is the plant's own; assign :attr:`closure` for a system that has worn.
+    The true closure is the plant's own; assign :attr:`closure` for a system that has worn. Controllers that are flown
+    beside policies are made for :attr:`physics`, the plant itself; assign the plant that is known of a system with
+    states that no sensor reads.
 
     Args:
         plant: the real system in simulation.
@@ -50,6 +52,7 @@ class UnseenEpisodes:
         generator = torch.Generator(device=device).manual_seed(seed)
         self.plant, self._compiled = plant, compiled
         self.closure: nn.Module | None = plant.closure
+        self.physics = plant
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
 
@@ -97,7 +100,7 @@ class UnseenEpisodes:
                 f"law={type(law).__name__} can only be flown on a real system; give a ClassicalController of plant "
                 f"{self.plant.name!r}."
             )
-        return law.fly(self.initial_state, self.exogenous, self.closure)
+        return law.fly(self.initial_state, self.exogenous, self.closure, plant=self.plant)
 
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
@@ -134,14 +137,26 @@ class UnseenEpisodes:
     def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
+        The twin begins with what sensors read, and is compared with it. J_p is infinite where the twin diverges.
+
         Args:
             physics: physics of the twin, which need not be that of the real system.
             closure: closure of the twin.
             flown: the episodes as flown on the real system.
         """
         rollout = Rollout(physics, closure, compiled=self._compiled)
-        replayed = rollout(flown.states[:, 0], flown.exogenous, flown.actions)
-        return identification_cost(self.plant, replayed, flown.states)
+        measured = physics.at_rest(flown.states[..., : len(self.plant.readings)])
+
+        def costs(some: slice) -> Float[Tensor, " some"]:
+            try:
+                replayed = rollout(measured[some, 0], flown.exogenous[some], flown.actions[some])
+            except DivergenceError:
+                count = len(measured[some])
+                each = [slice(k, k + 1) for k in range(*some.indices(len(measured)))]
+                return torch.cat([costs(one) for one in each]) if count > 1 else measured.new_full((1,), torch.inf)
+            return identification_cost(physics, replayed, measured[some])
+
+        return costs(slice(len(measured)))
 
 
 class Judged(NamedTuple):
@@ -251,12 +266,15 @@ def exact_optimum(
 
 
 def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:
-    """Mean and percentile-bootstrap confidence interval (2000 resamples), as ``metrics.json`` holds them."""
+    """Mean and percentile-bootstrap confidence interval (2000 resamples), as ``metrics.json`` holds them.
+
+    Of values that are not all finite, the mean and both ends of the interval are not finite either.
+    """
     from scipy.stats import bootstrap  # here, because it takes a second to load and only results need it
 
     numbers = values.detach().cpu().numpy().astype(np.float64)
     mean = float(numbers.mean())
-    if np.ptp(numbers) == 0.0:
+    if not np.isfinite(numbers).all() or np.ptp(numbers) == 0.0:
         return {"mean": mean, "confidence_interval": [mean, mean]}
     interval = bootstrap(
         (numbers,), np.mean, n_resamples=2000, confidence_level=level, method="percentile", rng=np.random.default_rng(0)

@@ -239,7 +239,8 @@ class RecedingHorizon:
         state, states, actions = initial_state, [initial_state.unsqueeze(1)], []
         for k in range(0, exogenous.shape[1], self.period):
             t, inputs = k * self.plant.dt, exogenous[:, k : k + self.period]
-            command = self.plan(t, state, exogenous[:, k])[:, : inputs.shape[1]]
+            read = state[:, : len(self.plant.states)]  # the system may have more than the model knows
+            command = self.plan(t, read, exogenous[:, k])[:, : inputs.shape[1]]
             flown = system(state, inputs, command, start=t)
             states.append(flown.states[:, 1:])
             actions.append(flown.actions)

@@ -22,6 +22,7 @@ class LoadedRun:
     Args:
         config: options of the run, as they were asked for.
         plant: the real system in simulation, newly made.
+        physics: physics of the twin, which policies are made for; the plant itself unless the twin is wrong about it.
         policies: trained policies by role: ``model_based`` and ``model_free``. Model predictive control in the place of
             ``model_based`` plans on ``closure``.
         closure: trained closure of the twin.
@@ -29,6 +30,7 @@ class LoadedRun:
 
     config: RunConfig
     plant: Plant
+    physics: Plant
     policies: dict[str, nn.Module]
     closure: nn.Module
 
@@ -66,13 +68,14 @@ def load_run(
     config_class = class_of(folder, settings) if recipe is None else config_class_of(recipe)
     weights = _read_weights(folder)
     config, plant = _rebuilt(folder, settings, config_class, plant)
-    policies, closure = _parts(config, plant)
+    physics = config.believed() or plant
+    policies, closure = _parts(config, physics)
     for role, part in {**policies, "closure": closure}.items():
         try:
             part.load_state_dict(weights[role])
         except (RuntimeError, KeyError) as error:
             raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
-    return LoadedRun(config=config, plant=plant, closure=closure, policies=policies)
+    return LoadedRun(config=config, plant=plant, physics=physics, closure=closure, policies=policies)
 
 
 def _rebuilt(
@@ -109,12 +112,12 @@ def config_class_of(recipe: Path | str | type[RunConfig]) -> type[RunConfig]:
     return load_recipe(Path(recipe)).Config
 
 
-def _parts(config: RunConfig, plant: Plant) -> tuple[dict[str, nn.Module], nn.Module]:
+def _parts(config: RunConfig, physics: Plant) -> tuple[dict[str, nn.Module], nn.Module]:
     """Policies and closure of a run before their training."""
     generator = torch.Generator().manual_seed(config.seed)
-    policies = config.make_policies(plant, generator)
-    closure = config.make_closure(plant, generator)
-    return dict(config.acting_policies(policies, config.believed() or plant, closure).items()), closure
+    policies = config.make_policies(physics, generator)
+    closure = config.make_closure(physics, generator)
+    return dict(config.acting_policies(policies, physics, closure).items()), closure
 
 
 def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:

@@ -23,30 +23,33 @@ SHARE = 0.8
 """Share of the time between two plans that a solve may take by default; the rest is for what comes around it."""
 
 
-def controller(run: LoadedRun, plant: Plant, deadline: float | None) -> PredictiveControl:
+def controller(run: LoadedRun, physics: Plant, deadline: float | None) -> PredictiveControl:
     """Model predictive control with a deadline, on the closure of a training.
 
     Args:
         run: the training; if model predictive control acted in it, its forecast is taken too.
-        plant: plant of the rehearsal.
+        physics: physics of the twin, with the horizon of the rehearsal.
         deadline: longest wall-clock time of a solve [s]; None for 0.8 of the time between two plans.
     """
     options = run.config.twinning.planner.receding_horizon
-    period = options.period or options.hold or plant.dt
+    period = options.period or options.hold or physics.dt
     options = dataclasses.replace(options, deadline=SHARE * period if deadline is None else deadline)
-    found, acted = PredictiveControl(run.config.believed() or plant, run.closure, options), run.policy("model_based")
+    found, acted = PredictiveControl(physics, run.closure, options), run.policy("model_based")
     if isinstance(acted, PredictiveControl):
         found.load_state_dict(acted.state_dict())
     return found
 
 
-def rehearsed(policy: PredictiveControl, run: LoadedRun, plant: Plant, *, seed: int, log: Path) -> dict[str, float]:
+def rehearsed(
+    policy: PredictiveControl, run: LoadedRun, plant: Plant, physics: Plant, *, seed: int, log: Path
+) -> dict[str, float]:
     """Fly an episode in real time, behind a safety layer.
 
     Args:
         policy: the controller.
         run: the training whose model-free policy is the fallback of the safety layer.
         plant: plant that is simulated, with its own closure.
+        physics: physics of the twin, which reads the sensors and judges by them.
         seed: seed of the episode.
         log: file of the safety layer's events, which is written anew.
 
@@ -57,17 +60,17 @@ def rehearsed(policy: PredictiveControl, run: LoadedRun, plant: Plant, *, seed: 
     clock = WallClock(plant)
     # An observation comes at the end of its interval; half an interval later the machine has stopped to answer.
     limits = SafetyConfig(interval=plant.dt, deadline=1.5 * plant.dt, log=log)
-    guarded = SafetyLayer(clock.environment(), limits, fallback=Fallback(plant, run))
+    guarded = SafetyLayer(clock.environment(), limits, fallback=Fallback(physics, run))
     state, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
     system = RealSystem(
-        guarded, plant, state=state, exogenous=exogenous, applied=applied, closure=plant.closure, seed=seed
+        guarded, physics, state=state, exogenous=exogenous, applied=applied, closure=plant.closure, seed=seed
     )
-    actor = LivePolicy(plant, policy, ExplorationConfig(), generator=torch.Generator())
+    actor = LivePolicy(physics, policy, ExplorationConfig(), generator=torch.Generator())
     actor.begin(policy, strength=0.0)
     gc.collect()
     gc.freeze()  # a collection of all objects that the libraries have made would stop an action
     try:
-        episode = EpisodeCollector(system, actor, plant).rollout()
+        episode = EpisodeCollector(system, actor, physics).rollout()
     finally:
         gc.unfreeze()
         system.close()

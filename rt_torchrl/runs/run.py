@@ -14,10 +14,9 @@ from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.contract.check import check_plant
-from rt_torchrl.evaluation.baseline import Baseline, RealController
+from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.gradient_check import engine_gap
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, untrained_costs
+from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
@@ -26,12 +25,12 @@ from rt_torchrl.runs import checkpoint, reference, results
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.progress import Progress
+from rt_torchrl.runs.real_side import judged_on, physics_known, require_simulation, simulated
 from rt_torchrl.runs.results_table import results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
 from rt_torchrl.runs.run_start import start_of
 from rt_torchrl.runs.tensor_file import save_tensors
-from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -58,7 +57,8 @@ class Run:
         env: the real system, if it is not a plant in simulation. Policies are judged on ``plant`` with ``env.closure``.
             If that closure is not known, they are judged on real episodes: at most four times ``unseen`` (both policies
             before and after the training, clones once), and one for each of the ``untrained`` random starts.
-        believed: physics of the twin, if it differs from that of the real system; None if it does not.
+        believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real
+            system; None if it does not.
         plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
             unknown closure, a :class:`RealController`.
@@ -93,18 +93,22 @@ class Run:
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
         require_simulation(config, plant, env, baselines)
-        for physics in filter(None, (plant, believed)):
-            check_plant(physics, steps=CHECKED_STEPS, traced=False)
-        self._start = start_of(config, plant, believed, first)
+        physics = physics_known(plant, believed)
+        for one in filter(None, (plant, believed)):
+            check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
+        self._start = start_of(config, physics, first)
         if config.threads:
             torch.set_num_threads(config.threads)
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:
             system = simulated(plant, config, device=device, compiled=compiled) if env is None else env
-            self._make_algorithm(plant, system, believed or plant, device=device, compiled=compiled)
+            self._make_algorithm(system, physics, device=device, compiled=compiled)
             self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
-            self.baselines = {name: law(plant, compiled=compiled).to(device) for name, law in (baselines or {}).items()}
+            self.unseen.physics = physics
+            self.baselines = {
+                name: law(physics, compiled=compiled).to(device) for name, law in (baselines or {}).items()
+            }
             self.episodes: list[dict[str, Any]] = []
             if self._held.resumes():
                 self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
@@ -112,14 +116,12 @@ class Run:
             self._held.release()
             raise
 
-    def _make_algorithm(
-        self, plant: Plant, env: EnvBase, physics: Plant, *, device: torch.device, compiled: bool
-    ) -> None:
+    def _make_algorithm(self, env: EnvBase, physics: Plant, *, device: torch.device, compiled: bool) -> None:
         config = self.config
         generator = torch.Generator(device=device).manual_seed(config.seed)
-        self.make_policy = functools.partial(config.make_policy, plant)
-        policies = {role: policy.to(device) for role, policy in config.make_policies(plant, generator).items()}
-        closure = config.make_closure(plant, generator).to(device)
+        self.make_policy = functools.partial(config.make_policy, physics)
+        policies = {role: policy.to(device) for role, policy in config.make_policies(physics, generator).items()}
+        closure = config.make_closure(physics, generator).to(device)
         policies = config.acting_policies(policies, physics, closure)
         self.algorithm = ReinforcementTwinning(
             env,
@@ -164,7 +166,8 @@ class Run:
             bar.doing("checking the gradient")
             # Model predictive control has no weights of its own whose gradient could be checked.
             checked: Role = "model_free" if self.config.twinning.planner.method == "receding_horizon" else "model_based"
-            gap = engine_gap(self.initial_closure, self.initial_policies[checked], self.unseen)
+            physics = self.algorithm.twin.plant
+            gap = engine_gap(physics, self.initial_closure, self.initial_policies[checked], self.unseen)
             dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
             self._all_episodes(dashboard, bar)
             if not self.episodes:
@@ -257,42 +260,3 @@ class Run:
         dashboard.figures(drawn, len(self.episodes) - 1)
         if self.animate:
             self.animate(snapshot, self.folder / "figures" / "animation.gif")
-
-
-def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:
-    """The real system in simulation, with the sensors and the wear of the configuration."""
-    wear = config.wear(plant)
-    return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, noise=config.noise, wear=wear)
-
-
-def judged_on(
-    plant: Plant, env: RealSystem | None, count: int, *, device: torch.device, compiled: bool
-) -> UnseenEpisodes:
-    """The unseen episodes: on the plant, or on the real system itself if its closure is not known."""
-    if env is None or env.closure is not None:
-        return UnseenEpisodes(plant, count, compiled=compiled, device=device)
-    return RealEpisodes(env, count, device=device)
-
-
-def require_simulation(
-    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
-) -> None:
-    """Refuse options that only a plant in simulation can carry out, and controllers that need the other kind of system.
-
-    Raises:
-        ValueError: if there is such an option or controller; it names it.
-    """
-    if env is not None and (config.noise or config.wear(plant) is not None):
-        raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
-    real = [name for name, law in (baselines or {}).items() if issubclass(law, RealController)]
-    on_the_plant = [name for name in baselines or {} if name not in real]
-    if real and (env is None or env.closure is not None):
-        raise ValueError(
-            f"baselines {real} can only be flown on a real system, and this run judges on the plant in simulation. "
-            "Give ClassicalController classes, or a RealSystem without its closure."
-        )
-    if env is not None and env.closure is None and (config.reference or on_the_plant):
-        raise ValueError(
-            f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "
-            "and the real system's is not known; leave them out, or give the RealSystem its closure."
-        )

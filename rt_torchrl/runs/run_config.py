@@ -207,7 +207,8 @@ class RunConfig:
     def believed(self) -> Plant | None:
         """The physics of a twin that is wrong about them; None if it has those of the real system.
 
-        Override this method for a twin that is wrong, and give :class:`Run` what it returns.
+        Override this method for a twin that is wrong, or does not know all states of the real system, and give
+        :class:`Run` what it returns.
         """
         return None
 
@@ -275,3 +276,8 @@ def plant_of(config: RunConfig) -> Plant:
             f"{type(config).__qualname__} has no method plant() that makes the plant from its options; write one."
         )
     return config.plant()
+
+
+def physics_of(config: RunConfig) -> Plant:
+    """The physics of the twin, by which policies and controllers are made: what is believed, or the real system's."""
+    return config.believed() or plant_of(config)

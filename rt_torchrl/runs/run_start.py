@@ -30,15 +30,12 @@ MakesStart = Callable[[Plant, nn.Module], Start | None]
 """Function of the twin's physics and closure, both on their device, that makes the start."""
 
 
-def start_of(
-    config: RunConfig, plant: Plant, believed: Plant | None, controller: type[ClassicalController] | None
-) -> MakesStart:
+def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalController] | None) -> MakesStart:
     """Read and check what ``config.start`` names. A resumed run has begun already, so that nothing is read for it.
 
     Args:
         config: options of the run.
-        plant: plant of the run.
-        believed: physics of the twin, if they are others.
+        plant: physics of the twin, for which policies and controllers are made.
         controller: class of the classical controller that the real system has had so far, if it has had one.
 
     Returns:
@@ -63,7 +60,7 @@ def start_of(
     if path.is_dir():
         return _of_run(path, config, plant)
     if path.suffix in READERS and path.is_file():
-        return _of_log(path, config, believed or plant)
+        return _of_log(path, config, plant)
     raise ValueError(
         f"start={name!r} is none of {', '.join(STARTS)}, and there is no such run folder or log; a log ends in "
         f"{' or '.join(READERS)}."
@@ -77,7 +74,7 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
     kind = type(config)
     run = load_run(folder, kind, plant=None if issubclass(kind, MakesPlant) else plant)
     for what in ("observations", "actions"):
-        its, ours = (_described(getattr(each, what)) for each in (run.plant, plant))
+        its, ours = (_described(getattr(each, what)) for each in (run.physics, plant))
         if its != ours:
             raise ValueError(
                 f"start={str(folder)!r} is a run whose {what} are {', '.join(map(str, its))}; here they are "

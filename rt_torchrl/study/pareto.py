@@ -15,7 +15,7 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.results_file import write_results
-from rt_torchrl.runs.run_config import RunConfig, plant_of
+from rt_torchrl.runs.run_config import RunConfig, physics_of, plant_of
 from rt_torchrl.study.yardsticks import TRAINING_SEED, Options, configured
 
 
@@ -90,10 +90,10 @@ def _points(configs: dict[float, RunConfig], effort: Effort) -> Iterator[Point]:
 def optimum(config: RunConfig, plant: Plant, start: nn.Module | None, effort: Effort) -> Optimum:
     """The best policy of the configuration, from random weights or from those of ``start``."""
     met = UnseenEpisodes(plant, effort.planned_on, seed=TRAINING_SEED)
-    first = start is None
+    first, physics = start is None, physics_of(config)
 
     def make(generator: torch.Generator) -> nn.Module:
-        return config.make_policy(plant, generator) if start is None else copy.deepcopy(start)
+        return config.make_policy(physics, generator) if start is None else copy.deepcopy(start)
 
     return exact_optimum(
         met,
@@ -108,9 +108,9 @@ def optimum(config: RunConfig, plant: Plant, start: nn.Module | None, effort: Ef
 
 def classical_point(recipe: Path, options: Options, kind: type[ClassicalController], *, unseen: int) -> Point:
     """A classical controller, with its default gains, on the same unseen episodes."""
-    plant = plant_of(configured(recipe, options))
-    episodes = UnseenEpisodes(plant, unseen)
-    return point(episodes.judge(episodes.fly_baseline(kind(plant))), None)
+    config = configured(recipe, options)
+    episodes = UnseenEpisodes(plant_of(config), unseen)
+    return point(episodes.judge(episodes.fly_baseline(kind(physics_of(config)))), None)
 
 
 def point(judged: Judged, weight: float | None) -> Point:

@@ -25,7 +25,7 @@ from rt_torchrl.evaluation.limits import (
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.runs.run_config import RunConfig, plant_of
+from rt_torchrl.runs.run_config import RunConfig, physics_of, plant_of
 from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -84,7 +84,7 @@ def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iteratio
     """
     config = configured(recipe, options)
     episodes = unseen_episodes(plant_of(config), unseen)
-    make_policy = partial(config.make_policy, episodes.plant)
+    make_policy = partial(config.make_policy, physics_of(config))
     best = exact_optimum(episodes, make_policy, starts=starts, iterations=iterations, polish=polish)
     found = episodes.judge(episodes.fly(best.policy))
     return {"costs": found.control_costs.tolist(), "J_a_of_each_start": best.costs} | found.statistics()
@@ -113,9 +113,10 @@ def classical(
         ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`; ``changed`` holds
         ``costs`` and statistics on the system with model error.
     """
-    plant = plant_of(configured(recipe, options))
+    config = configured(recipe, options)
+    plant = plant_of(config)
     judged = unseen_episodes(plant, unseen)
-    controller = tuned(kind, plant, episodes=episodes, evaluations=evaluations)
+    controller = tuned(kind, physics_of(config), episodes=episodes, evaluations=evaluations)
     found = {"gains": controller.named_gains()} | record(judged, controller)
     judged.closure = changed_closure(plant, recipe, options) or plant.closure
     return found | {"changed": record(judged, controller)}
@@ -153,8 +154,9 @@ def cost_along_gain(
     Returns:
         ``name`` and ``unit`` of the gain, its ``values`` and mean ``costs``.
     """
-    plant = plant_of(configured(recipe, options))
-    judged, controller = unseen_episodes(plant, unseen), kind(plant, compiled=missing_for_compilation() is None)
+    config = configured(recipe, options)
+    judged = unseen_episodes(plant_of(config), unseen)
+    controller = kind(physics_of(config), compiled=missing_for_compilation() is None)
     values, costs = [kind.default_gains[0] * multiple for multiple in multiples], []
     for value in values:
         controller.log_gains[0] = math.log(value)
@@ -182,7 +184,7 @@ def cost_over_episodes(
     """
     config, costs = configured(recipe, options), []
     plant = plant_of(config)
-    make_policy = partial(config.make_policy, plant)
+    make_policy = partial(config.make_policy, physics_of(config))
     judged, met = unseen_episodes(plant, unseen), unseen_episodes(plant, max(counts), seed=TRAINING_SEED)
     for count in counts:
         best = exact_optimum(met, make_policy, starts=1, iterations=iterations, few=count, polish=0)
@@ -244,7 +246,9 @@ def first_episodes(recipe: Path, options: Options, *, unseen: int, count: int) -
     config = configured(recipe, options)
     if (known := config.limit()) is None:
         raise ValueError(f"recipe={recipe} does not say how the limit is computed; override RunConfig.limit().")
-    return unseen_episodes(plant_of(config), unseen).first(count), known
+    episodes = unseen_episodes(plant_of(config), unseen).first(count)
+    episodes.physics = physics_of(config)
+    return episodes, known
 
 
 def contender_of(found: Contender) -> dict[str, Any]:

@@ -117,7 +117,8 @@ class FlightCollector:
         drive = drive_of(plant, exogenous, torch.cat([noise, factors[:, :-1]], -1))
         start = initial_state
         if law is not None:
-            start = torch.cat([start, law.first_memory(start * factors[:, 0])], -1)
+            felt = (start * factors[:, 0])[..., : len(plant.readings)]
+            start = torch.cat([start, law.first_memory(felt)], -1)
         interval = (ExploringInterval if law is None else ExploringController)(plant, closure, self.actor)
         ends = self._engine.end_states(interval, start, drive)
         carries = torch.cat([start.unsqueeze(0), ends])

@@ -52,9 +52,9 @@ class RealSystem(EnvBase):
 
     Raises:
         ValueError: if ``env`` is not a TorchRL environment or is a batch of systems, an entry is missing or misshapen,
-            a constant input is not finite, the environment's range of an action does not contain the plant's, or its
-            time limit is shorter than the plant's horizon; in a step, if an entry that is read is not reported, or the
-            episode ends before the horizon.
+            a constant input is not finite, the plant has states that no sensor reads, the environment's range of an
+            action does not contain the plant's, or its time limit is shorter than the plant's horizon; in a step, if an
+            entry that is read is not reported, or the episode ends before the horizon.
     """
 
     observation_spec: Composite
@@ -76,6 +76,9 @@ class RealSystem(EnvBase):
             raise ValueError(f"env is a {type(env).__name__}; wrap it first, such as torchrl.envs.GymWrapper(env).")
         if env.batch_size not in (torch.Size([]), torch.Size([1])):
             raise ValueError(f"batch_size={tuple(env.batch_size)} of the environment must be () or (1,): one system.")
+        if plant.unread:
+            hidden = ", ".join(state.name for state in plant.states[-plant.unread :])
+            raise ValueError(f"no sensor reads {hidden} of plant {plant.name!r}; give a plant without extensions.")
         super().__init__(device=torch.device(device), batch_size=torch.Size([1]))
         self.env, self.plant, self.closure = env, plant.to(device), closure
         self._state, self._applied, self._actuation = state, applied, actuation or Actuation()

@@ -46,7 +46,7 @@ class WallClock:
             seed: seed of the first episode; each later one adds 1.
         """
         plant = self.plant
-        sizes = {"state": len(plant.states), "exogenous": len(plant.inputs), "applied": len(plant.actions)}
+        sizes = {"state": len(plant.readings), "exogenous": len(plant.inputs), "applied": len(plant.actions)}
         return CallingSimulator(self.simulate, {"time": 1, **sizes}, plant.actions, seed=seed)
 
     @torch.no_grad()
@@ -78,5 +78,5 @@ class WallClock:
         controller(self._report(end, state, exogenous[:, -1], applied))
 
     def _report(self, t: Tensor, state: Tensor, exogenous: Tensor, applied: Tensor) -> dict[str, np.ndarray]:
-        parts = {"state": state[0], "exogenous": exogenous[0], "applied": applied[0]}
+        parts = {"state": state[0, : len(self.plant.readings)], "exogenous": exogenous[0], "applied": applied[0]}
         return {"time": t.numpy()} | {name: part.numpy() for name, part in parts.items()}

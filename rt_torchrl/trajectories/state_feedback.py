@@ -29,7 +29,7 @@ class StateFeedback(Protocol):
 
         Args:
             t: start of the interval, in the episode [s].
-            state: measured states.
+            state: states that sensors read.
             exogenous: measured exogenous inputs of the interval.
         """
 
@@ -79,8 +79,8 @@ class RememberingInterval(Interval):
         self, carry: Float[Tensor, "batch n_c"], drive_command: Float[Tensor, "batch n"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command and the new memory; a subclass may read the drive's command, of any width."""
-        n_s = len(self.plant.states)
-        command, memory = self.policy.respond(carry[..., :n_s], carry[..., n_s:])
+        read, memory = carry[..., : len(self.plant.readings)], carry[..., len(self.plant.states) :]
+        command, memory = self.policy.respond(read, memory)
         return command, memory
 
     def command(self, state: Tensor, drive: Drive) -> Tensor:

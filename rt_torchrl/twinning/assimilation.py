@@ -1,5 +1,7 @@
 """Step 4: the closure is trained until the twin replays the record."""
 
+import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -101,6 +103,7 @@ class Assimilation:
         self.second_order = LevenbergMarquardt(twin.closure)
         self._start = self._weights().detach().clone()
         self._stiffness = self._prior_stiffness()
+        self._first = copy.deepcopy(twin.closure.state_dict())
 
     def update(
         self,
@@ -119,6 +122,10 @@ class Assimilation:
 
         Returns:
             J_p of the whole records before and after, without the prior, and the descent's gradient and iterations.
+            J_p before is infinite if the twin diverges on the records; the fit then begins anew from the first closure.
+
+        Raises:
+            DivergenceError: if the twin diverges under the first closure, too.
         """
         whole = batch_of(records)
         if self.config.inputs == "realisations":
@@ -127,10 +134,23 @@ class Assimilation:
             start = whole.start.repeat_interleave(count, 0) if isinstance(whole.start, Tensor) else whole.start
             whole = Trajectory(states, actions, self.twin.plant.with_previews(sampled), start)
         if not self.config.segment:
-            return self._descend(whole)
+            return self._descend_anew(whole)
         before = self._cost_of(whole)
-        found = self._descend(whole.segments(self.config.segment, self.twin.plant.dt))
+        found = self._descend_anew(whole.segments(self.config.segment, self.twin.plant.dt))
         return found._replace(start=before, best=self._cost_of(whole))
+
+    def _descend_anew(self, replayed: Trajectory) -> Descended:
+        """Descend from the present closure, or from the first one if the twin diverges under the present one.
+
+        A twin without the dynamics of the real system bends its closure to the records, and the next record may lead to
+        where the bent closure makes no sense.
+        """
+        try:
+            return self._descend(replayed)
+        except FloatingPointError:
+            self.twin.closure.load_state_dict(self._first)
+            self.descent.restart()
+            return self._descend(replayed)._replace(start=math.inf)
 
     def _descend(self, replayed: Trajectory) -> Descended:
         def equations() -> NormalEquations:

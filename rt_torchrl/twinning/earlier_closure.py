@@ -27,38 +27,40 @@ class EarlierClosure:
     def __init__(self, twin: DigitalTwin, model_based: nn.Module, planner: Planner, generator: torch.Generator):
         self.twin, self.model_based, self.planner, self.generator = twin, model_based, planner, generator
         self._closure: dict[str, Any] | None = None
+        self._first = copy.deepcopy(twin.closure.state_dict())
 
     def remember(self) -> None:
         """Keep the present closure."""
         self._closure = copy.deepcopy(self.twin.closure.state_dict())
 
     def sound(self, step: Callable[[], TensorDict]) -> TensorDict:
-        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode.
+        """Take step 5 or 6; if the twin diverges in it, repeat it with the closure of the last episode, then the first.
 
         The weights that have just flown did not diverge on the real system. If the twin diverges with them, the closure
         must be wrong. Any other policy may diverge on a sound twin, and loses. Note: the paper keeps every closure.
         Where the sensors' noise is larger than the effect of the closure, even the closure that replays the records
-        best may diverge in other flights, and the real system cannot wait.
+        best may diverge in other flights, and the real system cannot wait. A twin without the dynamics of the real
+        system bends every closure that is fitted, but not the one that it began with.
 
-        Where it diverges with the earlier closure too, the step is left out: the twin lacks something that the real
-        system has, and the real system goes on.
+        Where it diverges with the first closure too, the step is left out: the real system goes on.
         """
         state, policy = self.generator.get_state(), copy.deepcopy(self.model_based.state_dict())
         try:
             return step()
         except DivergenceError as error:
-            refused = f"closure refused: {error}"
-        self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
-        if self._closure is not None:
-            self.twin.closure.load_state_dict(self._closure)
-        self._closure = None
-        self.twin.retreat()
-        self.generator.set_state(state)
-        self.planner.restart()
-        try:
-            return merged(step(), findings(refused, closure_refused=1.0))
-        except DivergenceError as error:
-            self.model_based.load_state_dict(policy)
+            found = error
+        refused = f"closure refused: {found}"
+        for closure in filter(None, (self._closure, self._first)):
+            self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
+            self.twin.closure.load_state_dict(closure)
+            self._closure = None
+            self.twin.retreat()
+            self.generator.set_state(state)
             self.planner.restart()
-            left_out = findings(refused, f"step left out: {error}", closure_refused=1.0, alarm=1.0)
-            return left_out.set_non_tensor("warning", f"the twin diverges under a policy that has flown: {error}")
+            try:
+                return merged(step(), findings(refused, closure_refused=1.0))
+            except DivergenceError as error:
+                found = error
+        self.model_based.load_state_dict(policy)
+        left_out = findings(refused, f"step left out: {found}", closure_refused=1.0, alarm=1.0)
+        return left_out.set_non_tensor("warning", f"the twin diverges under a policy that has flown: {found}")

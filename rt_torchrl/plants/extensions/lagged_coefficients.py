@@ -1,5 +1,7 @@
 """A force that follows the flow with a lag: the coefficients of the closure are filtered."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -28,8 +30,8 @@ class _Lagging(nn.Module):
         now = self.closure(features)
         if now.shape != self._held.shape:
             raise ValueError(
-                f"the closure gives coefficients of shape {tuple(now.shape)} where {tuple(self._held.shape)} lag; only "
-                "a closure that is evaluated once for each state can lag."
+                f"the closure gives coefficients of shape {tuple(now.shape)} where {tuple(self._held.shape)} lag; say "
+                "by elements at how many places of each state the plant evaluates its closure."
             )
         self.said.append(now)
         return now + (self._held - now) * self._share
@@ -44,26 +46,47 @@ class LaggedCoefficients(Extension):
     g. A short τ makes the plant that is extended.
 
     Args:
-        base: the plant, which evaluates its closure once for each state.
+        base: the plant.
         time_constant: τ of the true system [s].
-        start: coefficients c at the start of an episode.
+        start: coefficients c at the start of an episode, of all places in turn.
+        elements: shape of the places at which the plant evaluates its closure in one call for each state, such as the
+            blade elements of a wing; by default it is evaluated once for each state.
         guess: τ that a twin begins with [s]; None for ``time_constant``.
 
     Raises:
-        ValueError: if a time constant is not positive and finite, or the base is an extension.
+        ValueError: if a time constant is not positive and finite, ``start`` does not hold as many coefficients for each
+            place, or the base is an extension.
     """
 
     initial: Tensor
 
-    def __init__(self, base: Plant, time_constant: float, start: tuple[float, ...], *, guess: float | None = None):
+    def __init__(
+        self,
+        base: Plant,
+        time_constant: float,
+        start: tuple[float, ...],
+        *,
+        elements: tuple[int, ...] = (),
+        guess: float | None = None,
+    ):
         if isinstance(base, Extension):
             raise ValueError(
                 "LaggedCoefficients changes the closure of the plant itself; extend its result, not its base."
             )
+        places = math.prod(elements)
+        if not start or len(start) % places:
+            raise ValueError(
+                f"start holds {len(start)} coefficients; it must hold as many for each of {places} places."
+            )
         hidden = [Signal(symbol=f"c_{k}", name=f"lagged_coefficient_{k}", unit="-") for k in range(len(start))]
         super().__init__(base, hidden, self._coefficients(time_constant).requires_grad_(False))
         self._guess = self._coefficients(time_constant if guess is None else guess)
+        self._shape = (*elements, len(start) // places)
         self.register_buffer("initial", torch.tensor(start, dtype=torch.float64))
+
+    def _at_places(self, held: Float[Tensor, "*batch n"]) -> Float[Tensor, "..."]:
+        """The hidden states in the shape of what the closure gives."""
+        return held.reshape(*held.shape[:-1], *self._shape)
 
     def _coefficients(self, time_constant: float) -> ActuatorCoefficients:
         return ActuatorCoefficients({"force_lag": "s"}, {"force_lag": "time constant of the force"}, [time_constant])
@@ -80,9 +103,10 @@ class LaggedCoefficients(Extension):
         closure: nn.Module,
     ) -> Float[Tensor, "*batch n_s"]:
         base, held = self.split(state)
-        lagging = _Lagging(self.of_base(closure), held, torch.ones_like(held[..., :1]))
+        lagging = _Lagging(self.of_base(closure), self._at_places(held), torch.ones_like(self.initial[0]))
         field = self.base.vector_field(t, base, action, exogenous, lagging)
-        return torch.cat([field, (lagging.said[0] - held) / closure.get_submodule("own")()[0]], -1)
+        said = lagging.said[0].reshape(held.shape)
+        return torch.cat([field, (said - held) / closure.get_submodule("own")()[0]], -1)
 
     def advance(
         self,
@@ -95,9 +119,9 @@ class LaggedCoefficients(Extension):
         base, held = self.split(state)
         steps = self.dt / closure.get_submodule("own")()[0]
         left = torch.exp(-steps)
-        lagging = _Lagging(self.of_base(closure), held, (1.0 - left) / steps)
+        lagging = _Lagging(self.of_base(closure), self._at_places(held), (1.0 - left) / steps)
         end = self.base.advance(t, base, applied, exogenous, lagging)
-        mean = torch.stack(lagging.said).mean(0)
+        mean = torch.stack(lagging.said).mean(0).reshape(held.shape)
         return torch.cat([end, mean + (held - mean) * left], -1)
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n"]:

@@ -1,0 +1,181 @@
+"""How much room there is on real systems that their twin does not know: planned policies against the optimum."""
+
+import json
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+
+from tyro.conf import Positional
+
+from rt_torchrl import check_options, main_of
+from rt_torchrl.envs.cryogenic_tank import unknown as tanks
+from rt_torchrl.envs.flapping_wing import unknown as drones
+from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.study.room import Room, room_table, write_into
+from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.training import Training
+from rt_torchrl.study.yardsticks import Yardstick, oracle
+
+if TYPE_CHECKING:
+    from rt_torchrl.study.task import Task
+
+CATALOGUES = {"wind_turbine": turbines, "flapping_wing": drones, "cryogenic_tank": tanks}
+POLICY: dict[str, tuple[str, ...]] = {
+    "wind_turbine": ("--policy", "scheduled"),
+    "flapping_wing": ("--policy", "paper"),
+    "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
+}
+"""Policies of few weights, whose optimum exact gradients find."""
+UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "cryogenic_tank": 50}
+"""Number of unseen episodes that judge a plant by default."""
+HOPS = 192
+"""Number of unseen episodes of the short hop, a few of which cost ten times as much as the others."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Plan on the fitted twin of a real system that it does not know, and compare with the optimum on the true system.
+
+    A training of the model-based half alone makes a few rounds of record, fit and plan. The folder keeps finished
+    results, so that the same command goes on where it was interrupted.
+
+    Args:
+        plant: wind_turbine, flapping_wing or cryogenic_tank.
+        systems: what the real system has beside its twin, as names of --unknown of the plant's recipe; a plus combines
+            names, such as inflow+pitch; nothing is the system as its twin knows it. By default that and all systems.
+        task: task of the drone, paper or hop.
+        seeds: number of trainings of each system.
+        episodes: number of rounds of record, fit and plan.
+        unseen: number of unseen episodes that judge everything; by default 50, or 100 of the drone, and 192 hops.
+        starts: number of random starts of the search for the optimum.
+        iterations: number of gradients of each start on ten episodes; a third as many follow on all.
+        jobs: number of trainings side by side.
+        folder: folder of the runs and of the results, room.json and room.md of each plant and task.
+        page: page in which the table is written, too.
+    """
+
+    plant: Annotated[Literal["wind_turbine", "flapping_wing", "cryogenic_tank"], Positional]
+    systems: Annotated[tuple[str, ...], Positional] = ()
+    task: Literal["paper", "hop"] = "paper"
+    seeds: int = 3
+    episodes: int = 3
+    unseen: int | None = None
+    starts: int = 3
+    iterations: int = 60
+    jobs: int = 1
+    folder: Path = Path("runs/unknown")
+    page: Path | None = None
+
+    def __post_init__(self):
+        check_options(self)
+        for argument, least in (("seeds", 1), ("episodes", 1), ("starts", 1), ("iterations", 1), ("jobs", 1)):
+            if getattr(self, argument) < least:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
+        if self.unseen is not None and self.unseen < 2:
+            raise ValueError(f"unseen={self.unseen} must be at least 2.")
+        if self.task == "hop" and self.plant != "flapping_wing":
+            raise ValueError(f"task='hop' is a task of the drone; the plant is {self.plant}.")
+        for system in self.systems:
+            CATALOGUES[self.plant].require_unknown(names(system))
+
+    def rows(self) -> tuple[str, ...]:
+        """The systems of the table, in its order."""
+        return self.systems or ("nothing", *CATALOGUES[self.plant].SYSTEMS)
+
+    @property
+    def title(self) -> str:
+        """Name of the table."""
+        return f"{self.plant}, {self.task}"
+
+    @property
+    def kept(self) -> Path:
+        """Folder of the plant and its task."""
+        return self.folder / f"{self.plant}_{self.task}"
+
+    def options(self, system: str) -> tuple[str, ...]:
+        """Options of the recipe."""
+        judged = HOPS if self.task == "hop" else UNSEEN[self.plant]
+        found = (*POLICY[self.plant], "--unseen", str(self.unseen or judged))
+        found += ("--task", "hop") if self.task == "hop" else ()
+        return (*found, "--unknown", *names(system)) if names(system) else found
+
+    def trainings(self, system: str) -> list[Training]:
+        """A training of the model-based half for each seed."""
+        return [
+            Training(
+                recipe=self.recipe,
+                arm="model_based",
+                seed=seed,
+                variant="nominal",
+                folder=self.kept / system / f"seed-{seed}",
+                episodes=self.episodes,
+                options=self.options(system),
+            )
+            for seed in range(self.seeds)
+        ]
+
+    def optimum(self, system: str) -> Yardstick:
+        """The best policy of the class on the true system."""
+        effort = {"starts": self.starts, "iterations": self.iterations, "polish": self.iterations // 3}
+        options = self.options(system)
+        judged = int(options[options.index("--unseen") + 1])
+        compute = partial(oracle, self.recipe, options, unseen=judged, **effort)
+        return Yardstick(self.kept / system / "oracle.json", compute)
+
+    @property
+    def recipe(self) -> Path:
+        """The recipe of the plant."""
+        return Path(__file__).with_name(f"{self.plant}.py")
+
+
+def names(system: str) -> tuple[str, ...]:
+    """Names of ``--unknown`` of a system."""
+    return () if system == "nothing" else tuple(system.split("+"))
+
+
+def row(config: Config, system: str) -> Room:
+    """The costs on a system, of what is kept."""
+    found = [training.metrics() for training in config.trainings(system)]
+    unseen = [metrics["summary"]["unseen"] for metrics in found]
+    baselines = {name: judged["J_a"]["mean"] for name, judged in unseen[0]["baselines"].items()}
+    return Room(
+        system=" + ".join(names(system)),
+        oracle=config.optimum(system).run()["J_a"]["mean"],
+        planned=[judged["J_a_model_based"]["mean"] for judged in unseen],
+        said=[metrics["episodes"][-1]["J_a_plan"] for metrics in found],
+        classical=baselines,
+    )
+
+
+def command(config: Config) -> str:
+    """The command line that makes the table."""
+    usual = Config(plant=config.plant)
+    changed = {name: getattr(config, name) for name in ("task", "seeds", "episodes", "unseen", "starts", "iterations")}
+    options = [f"--{name} {value}" for name, value in changed.items() if value != getattr(usual, name)]
+    return " ".join(["uv run recipes/unknown.py", config.plant, *config.systems, *options])
+
+
+def main(config: Config) -> None:
+    make_folder("folder", config.kept)
+    tasks: list[Task] = [
+        task for system in config.rows() for task in (config.optimum(system), *config.trainings(system))
+    ]
+    side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
+    rows = [row(config, system) for system in config.rows()]
+    shown = room_table(rows)
+    write_results(config.kept / "room.json", {"config": config, "rows": [vars(one) | {"gap": one.gap} for one in rows]})
+    (config.kept / "room.md").write_text(f"`{command(config)}`\n\n{shown}\n", encoding="utf-8")
+    if config.page is not None:
+        write_into(config.page, config.title, f"`{command(config)}`\n\n{shown}")
+    print(shown)
+    print(f"results in {config.kept / 'room.json'}: {json.dumps({one.system or 'nothing': one.gap for one in rows})}")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,195 @@
+"""Real systems that their twin does not know: their names, their parts, and how recipes take them."""
+
+import math
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from test_export_recipe import RECIPES, leave_run
+from test_extensions import DT, flight
+
+from rt_torchrl import check_plant, load_run
+from rt_torchrl.envs.cryogenic_tank import unknown as tanks
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.two_zones import TwoZones
+from rt_torchrl.envs.flapping_wing import unknown as drones
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
+from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
+from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
+from rt_torchrl.plants.extensions.scaled_coefficients import ScaledCoefficients
+from rt_torchrl.plants.extensions.unread_input import UnreadInput
+from rt_torchrl.runs.loaded_run import config_class_of
+from rt_torchrl.trajectories.rollout import Rollout
+
+KNOWN = {
+    "wind_turbine": (turbines, lambda: WindTurbine(horizon=20.0, observe=("scheduled",))),
+    "flapping_wing": (drones, lambda: FlappingWing(horizon=0.1, target=(1.0, 1.0))),
+    "cryogenic_tank": (tanks, lambda: CryogenicTank(horizon=3000.0, command="duty")),
+}
+
+
+def flown(plant, state, exogenous, command):
+    return Rollout(plant, plant.closure)(state, exogenous, command).states
+
+
+@pytest.mark.parametrize(("plant", "name"), [(plant, name) for plant in KNOWN for name in KNOWN[plant][0].SYSTEMS])
+def test_every_system_fulfils_the_contract_and_reads_what_its_twin_knows(plant, name):
+    systems, make = KNOWN[plant]
+    base = make()
+    system = systems.unknown(base, (name,))
+    check_plant(system, steps=5, traced=False, trained=False)
+    assert system.readings == base.states and system.name == plant
+    assert set(systems.SYSTEMS[name]) <= set(systems.PARTS)
+
+
+def test_a_scaled_actuator_does_a_share_of_what_it_is_asked_for():
+    base = LinearQuadratic()
+    plant = ScaledActuator(base, "force", 0.8)
+    state, exogenous, command = flight(plant)
+    expected = flown(base, state, exogenous, 0.8 * command)
+    torch.testing.assert_close(flown(plant, state, exogenous, command), expected, rtol=1e-12, atol=1e-12)
+    costs = Rollout(plant, plant.closure).costs(state, exogenous, command)
+    torch.testing.assert_close(costs, Rollout(base, base.closure).costs(state, exogenous, 0.8 * command))
+
+
+def test_scaled_coefficients_are_those_of_a_scaled_closure():
+    base = LinearQuadratic()
+    plant = ScaledCoefficients(base, 0.5)
+    state, exogenous, command = flight(plant)
+    half = LinearClosure(0.5 * torch.tensor(base.true_closure, dtype=torch.float64))
+    expected = Rollout(base, half)(state, exogenous, command).states
+    torch.testing.assert_close(flown(plant, state, exogenous, command), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_an_unread_input_is_a_sum_of_harmonics_with_its_deviation():
+    base = LinearQuadratic()
+    plant = UnreadInput(base, "disturbance", 0.5, (0.7, 3.0))
+    state, exogenous, command = flight(plant)
+    t = DT * torch.arange(command.shape[1], dtype=torch.float64)
+    p, q = state[:, 2:4, None], state[:, 4:, None]
+    turn = torch.tensor([[0.7], [3.0]], dtype=torch.float64) * t
+    unread = (p * turn.cos() - q * turn.sin()).sum(1)
+    expected = flown(base, state[:, :2], exogenous + unread.unsqueeze(-1), command)
+    torch.testing.assert_close(flown(plant, state, exogenous, command)[..., :2], expected, rtol=1e-10, atol=1e-10)
+    drawn = plant.draw_initial_state(20_000, torch.Generator().manual_seed(0))[:, 2:4].sum(-1)
+    assert drawn.std().item() == pytest.approx(0.5, rel=0.02)
+    assert not plant.at_rest(state[:, :2])[:, 2:].any()
+
+
+def test_the_lift_of_fast_blade_elements_is_that_of_the_drone():
+    base = FlappingWing(horizon=0.1)
+    plant = LaggedCoefficients(base, 1e-9, (0.0, 0.0) * base.span_nodes, elements=(base.span_nodes,))
+    state, exogenous, _ = flight(base, steps=200)
+    command = torch.tensor([80.0, -10.0], dtype=torch.float64).expand(2, 200, 2)
+    found = flown(plant, plant.at_rest(state), exogenous, command)[..., :4]
+    torch.testing.assert_close(found, flown(base, state, exogenous, command), rtol=1e-4, atol=1e-7)
+
+
+def test_the_torque_of_a_rotor_that_keeps_its_speed_follows_exponentially():
+    base = WindTurbine(inertia=1e15)
+    plant = LaggedTorque(base, 10.0)
+    state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
+    n, wind = 60, 13.0
+    exogenous = torch.full((1, n, 1), wind, dtype=torch.float64)
+    torques = flown(plant, state, exogenous, state[:, None, 4:6].expand(1, n, 2))[0, :, -1]
+    steady = base.aerodynamic_torque(state[:, 0], state[:, 5], torch.tensor([wind]).double(), base.closure)
+    t = base.dt * torch.arange(n + 1, dtype=torch.float64)
+    expected = steady + (torques[0] - steady) * torch.exp(-t / 10.0)
+    torch.testing.assert_close(torques, expected, rtol=1e-6, atol=0.0)
+    assert torques[0] < 0.9 * steady
+
+
+def test_a_rotor_turns_in_the_wind_and_its_filter_in_what_the_anemometer_reads():
+    base = WindTurbine()
+    plant = MisreadWind(base, 0.9, cutoff=2.0 * math.pi * base.filter_frequency)
+    generators = [torch.Generator().manual_seed(2) for _ in range(2)]
+    state, true = plant.draw_initial_state(2, generators[0]), base.draw_initial_state(2, generators[1])
+    read, wind = plant.draw_exogenous(2, generators[0])[:, :40], base.draw_exogenous(2, generators[1])[:, :40]
+    torch.testing.assert_close(read, 0.9 * wind)
+    command = true[:, None, 4:6].expand(2, 40, 2)
+    found, expected = flown(plant, state, read, command), flown(base, true, wind, command)
+    torch.testing.assert_close(found[..., :2], expected[..., :2], rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(found[..., 2], 0.9 * expected[..., 2], rtol=1e-12, atol=0.0)
+
+
+def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixes():
+    base = CryogenicTank(horizon=30_000.0)
+    plant, n = TwoZones(base, 2.0, 5 * 3600.0), 1000
+    generator = torch.Generator().manual_seed(0)
+    state = plant.draw_initial_state(1, generator)
+    exogenous, command = plant.draw_exogenous(1, generator), torch.zeros(1, n, 1, dtype=torch.float64)
+    stirred = flown(base, state[:, :3], exogenous, command)[0]
+    found = flown(plant, state, exogenous, command)[0]
+    torch.testing.assert_close(found[:, :2], stirred[:, :2], rtol=1e-12, atol=0.0)
+    # The convolution of the stirred pressure with the kernel of the mixing, by the rule of the midpoint.
+    age = base.dt * (torch.arange(n, dtype=torch.float64).flip(0) + 0.5)
+    middle = 0.5 * (stirred[1:, 2] + stirred[:-1, 2])
+    kernel = torch.exp(-age / plant.mixing_time) * base.dt / plant.mixing_time
+    mixed = (kernel * middle).sum() + state[0, 2] * math.exp(-n * base.dt / plant.mixing_time)
+    surface = stirred[-1, 2] + (stirred[-1, 2] - mixed)
+    assert found[-1, 2].item() == pytest.approx(surface.item(), abs=1.0)
+    assert surface - stirred[-1, 2] > 1e3
+    first = (found[1:3, 2] - found[:2, 2]) / (stirred[1:3, 2] - stirred[:2, 2])
+    torch.testing.assert_close(first, torch.full_like(first, 2.0), rtol=5e-3, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ScaledActuator(LinearQuadratic(), "force", 0.0), "gain=0.0 of force must be positive"),
+        (lambda: UnreadInput(LinearQuadratic(), "wind", 1.0, (1.0,)), "name='wind' is no input.*disturbance"),
+        (lambda: UnreadInput(LinearQuadratic(), "disturbance", 1.0, ()), r"frequencies=\(\) .* must be positive"),
+        (lambda: ScaledCoefficients(LinearQuadratic(), 0.0), "gain=0.0 of the coefficients"),
+        (lambda: ScaledCoefficients(LaggedActuator(LinearQuadratic(), "force", 1.0), 0.5), "closure of the plant"),
+        (lambda: LaggedCoefficients(LinearQuadratic(), 1.0, (0.0,), elements=(2,)), "each of 2 places"),
+        (lambda: LaggedTorque(WindTurbine(), 0.0), "time_constant=0.0 s of the torque"),
+        (lambda: MisreadWind(WindTurbine(), 0.0, cutoff=0.25), "gain=0.0 of the anemometer"),
+        (lambda: TwoZones(CryogenicTank(), 0.5, 1.0), "ratio=0.5 of the zones must be at least 1"),
+        (lambda: turbines.unknown(WindTurbine(), ("ptich",)), "ptich does not exist; choose anemometer_low"),
+        (lambda: tanks.unknown(CryogenicTank(), ("bias_5", "drift_10")), "bias_5 and drift_10 both change the press"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("plant", "options", "message"),
+    [
+        ("wind_turbine", {"unknown": ("gust",)}, "gust does not exist"),
+        ("wind_turbine", {"unknown": ("pitch",), "model_error": True}, "does not go with model_error"),
+        ("wind_turbine", {"unknown": ("pitch",), "real": "rosco"}, "does not go with real='rosco'"),
+        ("flapping_wing", {"unknown": ("sag",), "model_error": True}, "does not go with model_error"),
+        ("cryogenic_tank", {"unknown": ("bias_5",), "model_error": True}, "does not go with model_error"),
+        ("flapping_wing", {"task": "leap"}, "task='leap' does not exist; choose paper or hop"),
+    ],
+)
+def test_options_that_do_not_go_with_an_unknown_system_are_refused(plant, options, message):
+    with pytest.raises(ValueError, match=message):
+        config_class_of(RECIPES / f"{plant}.py")(**options)
+
+
+def test_several_systems_combine_in_the_order_of_their_parts():
+    config = config_class_of(RECIPES / "wind_turbine.py")(unknown=("pitch", "inflow"), policy="scheduled")
+    hidden = [state.name for state in config.plant().states if state not in config.plant().readings]
+    assert hidden[0] == "lagged_torque" and hidden[1] == "resonant_blade_pitch"
+    assert config.believed().states == config.plant().readings
+
+
+def test_the_hop_has_its_target():
+    config = config_class_of(RECIPES / "flapping_wing.py")(task="hop", unknown=("plane_6.3",))
+    assert config.believed().target.tolist() == [1.0, 1.0] and config.plant().base.target.tolist() == [1.0, 1.0]
+
+
+def test_the_policies_of_an_unknown_system_are_made_for_what_the_twin_knows(tmp_path):
+    config, parts = leave_run(tmp_path, "wind_turbine", policy="scheduled", unknown=("pitch",))
+    run = load_run(tmp_path)
+    assert run.physics.states == run.plant.readings and run.plant.unread == 4
+    assert type(run.closure) is type(config.believed().make_closure(torch.Generator()))
+    assert torch.equal(run.policy("model_based").weights, parts["model_based"].weights)
