@@ -27,6 +27,7 @@ from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
+from rt_torchrl.twinning.improvement import Improvement, require_own_policies
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
@@ -71,24 +72,21 @@ class ReinforcementTwinning:
         referee: Referee | None = None,
         first: nn.Module | None = None,
     ):
-        self.env, self.twin, self.config, self.generator = env, twin, config, generator
+        self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        self.first = first
         planned = config.arm == "model_based" or (first is not None and config.arm == "twinning")
         acting: Role = "model_based" if planned else "model_free"
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, acting)
-        trained: dict[Role, Learner | Planner] = {"model_free": self.learner, "model_based": self.planner}
-        for role, part in trained.items():
-            if part.policy is not self.policies[role]:
-                raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
+        require_own_policies(self.policies, {"model_free": self.learner, "model_based": self.planner})
         share_critic(self.learner, model_based)
         self.assimilation = Assimilation(twin, config.assimilation)
         self.short_term = ShortTermMemory(config.records)
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.improvement = Improvement(self.learner, self.virtual, config)
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
@@ -142,11 +140,13 @@ class ReinforcementTwinning:
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
-        flight = self._flown(self.policies[live], strength=strength)
+        acting = self.actor.exploring(self.policies[live], self.episodes_done)
+        self.improvement.adopt(acting)
+        flight = self._flown(acting, strength=strength)
         self.track_record.append(flight.record, live, flight.cost.item())
+        self.improvement.flown(acting, flight.cost.item())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
-        flew = self.policies[live]
-        return report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
+        return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
 
     def _flown(self, policy: nn.Module, *, strength: float) -> Flight:
         """An episode on the real system, which both memories hold; of those that :func:`fly` refuses, none does."""
@@ -158,7 +158,7 @@ class ReinforcementTwinning:
     def update_model_free(self) -> TensorDict:
         """Step 2: the learner improves π_mf."""
         self._earlier_weights = {role: weight_vector(policy) for role, policy in self.policies.items()}
-        return self.learner.update()
+        return self.improvement.update()
 
     def fit_exogenous(self) -> TensorDict:
         """Step 3: fit a Gaussian process to the exogenous input of this episode."""
