@@ -44,7 +44,17 @@ from .twinning.assimilation import AssimilationConfig
 from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
-from .twinning.learners import DDPG, TD3, ActorCritic, Learner, LearnerConfig, LongTermMemoryConfig, TD3Config
+from .twinning.learners import (
+    DDPG,
+    TD3,
+    ActorCritic,
+    IncrementalTD3,
+    IncrementalTD3Config,
+    Learner,
+    LearnerConfig,
+    LongTermMemoryConfig,
+    TD3Config,
+)
 from .twinning.planners import (
     Planner,
     PlannerConfig,
@@ -101,6 +111,8 @@ __all__ = [
     "Held",
     "Identification",
     "IdentificationConfig",
+    "IncrementalTD3",
+    "IncrementalTD3Config",
     "Learner",
     "LearnerConfig",
     "LimitConfig",

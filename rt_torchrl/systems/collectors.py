@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
+from rt_torchrl.systems.redrawn_policy import RedrawnPolicy
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.rollout import drive_of, require_finite
@@ -25,14 +26,15 @@ class ExploringInterval(Interval):
         plant: physics of the real system.
         closure: the true closure.
         actor: the live policy with its noise.
+        policy: policy that acts, the actor's or one that stands in for it during a part of an episode.
     """
 
     policy: nn.Module
     low: Tensor
     high: Tensor
 
-    def __init__(self, plant: Plant, closure: nn.Module, actor: LivePolicy):
-        super().__init__(plant, closure, actor.policy)
+    def __init__(self, plant: Plant, closure: nn.Module, actor: LivePolicy, policy: nn.Module):
+        super().__init__(plant, closure, policy)
         self.register_buffer("low", actor.low)
         self.register_buffer("high", actor.high)
 
@@ -106,7 +108,8 @@ class FlightCollector:
         env = self.env
         policy = self.actor.policy
         law = policy if isinstance(policy, Remembering) else None
-        if isinstance(policy, StateFeedback) and law is None:
+        parts = policy.draw_parts() if isinstance(policy, RedrawnPolicy) else []
+        if isinstance(policy, StateFeedback) and law is None and not parts:
             return self._by_steps.rollout()
         pass_over(env)
         env.reset()
@@ -119,12 +122,15 @@ class FlightCollector:
         if law is not None:
             felt = (start * factors[:, 0])[..., : len(plant.readings)]
             start = torch.cat([start, law.first_memory(felt)], -1)
-        interval = (ExploringInterval if law is None else ExploringController)(plant, closure, self.actor)
-        ends = self._engine.end_states(interval, start, drive)
-        carries = torch.cat([start.unsqueeze(0), ends])
-        states = carries[..., : len(plant.states)]
+        kind = ExploringInterval if law is None else ExploringController
+        carries, commands = [start.unsqueeze(0)], []
+        for part, first, last in parts or [(policy, 0, n)]:
+            held, interval = part_of(drive, first, last), kind(plant, closure, self.actor, part)
+            ends = self._engine.end_states(interval, carries[-1][-1], held)
+            commands.append(interval.command(torch.cat([carries[-1][-1:], ends[:-1]]), held))
+            carries.append(ends)
+        states, command = torch.cat(carries)[..., : len(plant.states)], torch.cat(commands)
         require_finite(plant, states[1:], initial_state, [closure, policy])
-        command = interval.command(carries[:-1], drive)
         return flown(plant, states, command, drive, factors.transpose(0, 1)).transpose(0, 1)
 
 
@@ -154,6 +160,11 @@ def pass_over(env: EnvBase) -> None:
     """Make a simulation pass over one draw before an episode, also where it is behind a safety layer."""
     if hasattr(env, "pass_over"):
         env.pass_over()
+
+
+def part_of(drive: Drive, first: int, last: int) -> Drive:
+    """The drive of the control intervals ``first`` to ``last`` − 1."""
+    return Drive(*(values[first:last] for values in drive))
 
 
 def flown(

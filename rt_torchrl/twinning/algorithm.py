@@ -29,6 +29,7 @@ from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
+from rt_torchrl.twinning.own_policies import require_own_policies
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
@@ -80,10 +81,7 @@ class ReinforcementTwinning:
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, acting)
-        trained: dict[Role, Learner | Planner] = {"model_free": self.learner, "model_based": self.planner}
-        for role, part in trained.items():
-            if part.policy is not self.policies[role]:
-                raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
+        require_own_policies(self.policies, {"model_free": self.learner, "model_based": self.planner})
         share_critic(self.learner, model_based)
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses)
         self.short_term = ShortTermMemory(config.records)
@@ -91,7 +89,7 @@ class ReinforcementTwinning:
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
         self.examination = Examination(self.track_record, self.virtual)
-        self.learning = Learning(self.learner, self.virtual)
+        self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
@@ -156,12 +154,14 @@ class ReinforcementTwinning:
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
-        flight = self._flown(self.policies[live], strength=strength)
-        explored = self.actor.strength * self.config.exploration.spread
+        acting = self.actor.exploring(self.policies[live], self.episodes_done)
+        self.learning.adopt(acting)
+        flight = self._flown(acting, strength=strength)
+        explored = self.actor.strength * self.config.exploration.spread if acting is self.policies[live] else 1.0
         self.track_record.append(flight.record, live, flight.cost.item(), explored)
+        self.learning.flown(acting, flight.cost.item())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
-        flew = self.policies[live]
-        return report.update(findings(**flew.report()) if isinstance(flew, StateFeedback) else {})
+        return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
 
     def _flown(self, policy: nn.Module, *, strength: float) -> Flight:
         """An episode on the real system, which both memories hold; of those that :func:`fly` refuses, none does."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from torch import nn
 
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
@@ -20,14 +21,21 @@ class Learning:
     begins with a controller it explores little, and an actor that climbs the critic leaves those actions within one
     update. Plans and clones are judged on the twin, too.
 
+    A learner that learns from the twin has a method ``take_twin(twin)``. One that wants to know of the real episodes
+    that its policy flies has methods ``adopt()`` and ``flown(cost)``.
+
     Args:
         learner: learner of step 2.
         virtual: virtual episodes.
+        taught: whether a learner that learns from the twin gets it, as in the arm ``twinning``.
     """
 
-    def __init__(self, learner: Learner, virtual: VirtualEpisodes):
+    def __init__(self, learner: Learner, virtual: VirtualEpisodes, *, taught: bool):
         self.learner, self.virtual = learner, virtual
         self._before: dict[str, Any] = {}
+        take = getattr(learner, "take_twin", None)
+        if taught and take is not None:
+            take(virtual.twin)
 
     def update(self) -> TensorDict:
         """Update the policy; see :meth:`Learner.update`."""
@@ -46,6 +54,7 @@ class Learning:
             ``update_accepted``, and the reason if it is 0.
         """
         policy = self.learner.policy
+        self.adopt(policy)
         after, found = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
         policy.load_state_dict(self._before)
         earlier = self.virtual.cost(policy, judged_on).item()
@@ -55,3 +64,21 @@ class Learning:
             return findings(reason, update_accepted=0.0)
         policy.load_state_dict(after)
         return findings(update_accepted=1.0)
+
+    def adopt(self, acting: nn.Module) -> None:
+        """Tell the learner, if it wants to know, that its policy is to fly a real episode or is judged on the twin."""
+        self._tell("adopt", acting)
+
+    def flown(self, acted: nn.Module, cost: float) -> None:
+        """Tell the learner, if it wants to know, what its policy has cost in a real episode.
+
+        Args:
+            acted: module that has acted in the episode.
+            cost: J_a of the episode.
+        """
+        self._tell("flown", acted, cost)
+
+    def _tell(self, what: str, acting: nn.Module, *values: float) -> None:
+        told = getattr(self.learner, what, None)
+        if told is not None and acting is self.learner.policy:
+            told(*values)

@@ -1,0 +1,149 @@
+"""The latest real episodes, and the transitions between decisions that critics learn from."""
+
+import math
+from collections import deque
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from rt_torchrl.plants.increments import Increments
+
+SEEN = ("observation", "state", "exogenous")
+"""Entries of an episode that the critics see."""
+LEAST_SPREAD = 1e-6
+"""Least standard deviation of a feature as a share of its mean; one that varies less is constant."""
+LEAST_COST = 1e-12
+"""Least mean |reward| that can scale rewards."""
+PLACES = 4
+"""Number of transitions that begin within a decision, if it has as many control intervals."""
+
+
+class EpisodeMemory:
+    r"""Whole real episodes, from which transitions of decisions are made.
+
+    A decision lasts m control intervals; its action is the mean of those applied. The transition after n decisions is
+
+    .. math:: \Big(x_k, u_k, \sum_{j<nm}\gamma^jr_{k+j}, \gamma^{nm}, x_{k+nm}\Big)
+
+    The features x are observation, state and exogenous input, scaled by their mean and standard deviation over the
+    memory. The last nm intervals of an episode begin no transition, because critics bootstrap through its end.
+
+    Args:
+        capacity: number of episodes that are kept.
+        increments: scales of the actions.
+        intervals: number m of control intervals of a decision.
+        discount: discount factor γ per control interval.
+    """
+
+    def __init__(self, capacity: int, increments: Increments, *, intervals: int, discount: float):
+        self.increments, self.intervals, self.discount = increments, intervals, discount
+        self.episodes: deque[TensorDict] = deque(maxlen=capacity)
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def store(self, episode: TensorDictBase) -> None:
+        """Keep an episode of n_t control intervals."""
+        kept = episode.select(*SEEN, "action").clone()
+        kept["reward"] = episode["next", "reward"].clone()
+        self.episodes.append(kept)
+
+    def cost(self) -> float:
+        """The least mean |reward| of an episode, in units of which the critics see rewards."""
+        return max(LEAST_COST, min(episode["reward"].abs().mean().item() for episode in self.episodes))
+
+    def statistics(self) -> tuple[Float[Tensor, " n_x"], Float[Tensor, " n_x"]]:
+        """Mean and standard deviation of the features in all episodes; 1 for the latter of a constant."""
+        seen = torch.cat([features(episode) for episode in self.episodes])
+        mean, spread = seen.mean(0), seen.std(0)
+        return mean, torch.where(spread > LEAST_SPREAD * (LEAST_SPREAD + mean.abs()), spread, 1.0)
+
+    def transitions(self, decisions: int, *, recent: int, reward_scale: float) -> list[TensorDict]:
+        """Transitions of each episode, oldest first, with the control intervals ``place`` at which they begin.
+
+        Args:
+            decisions: number n of decisions of a transition.
+            recent: number of latest episodes with such transitions; those of the others are of one decision.
+            reward_scale: factor on the rewards.
+
+        Raises:
+            ValueError: if a transition is longer than an episode.
+        """
+        first, scales = len(self.episodes) - recent, self.statistics()
+        return [
+            self._transitions(episode, decisions if k >= first else 1, scales, reward_scale)
+            for k, episode in enumerate(self.episodes)
+        ]
+
+    def places(self, episode: TensorDictBase, intervals: int) -> Tensor:
+        """Control intervals at which transitions begin that last so many intervals.
+
+        Raises:
+            ValueError: if there are none.
+        """
+        if intervals >= len(episode):
+            raise ValueError(
+                f"{intervals} control intervals of a transition do not fit into an episode of {len(episode)}; lower "
+                "return_steps or the discount, or use a longer horizon."
+            )
+        stride = max(1, self.intervals // PLACES)
+        return torch.arange(0, len(episode) - intervals, stride, device=episode["reward"].device)
+
+    def _transitions(
+        self, episode: TensorDict, decisions: int, scales: tuple[Tensor, Tensor], reward_scale: float
+    ) -> TensorDict:
+        n = decisions * self.intervals
+        at = self.places(episode, n)
+        now, then = self.situation(episode, at, scales), self.situation(episode, at + n, scales)
+        rewards = windows(episode["reward"].squeeze(-1), self.discounts(n))[at]
+        then["reward"] = reward_scale * rewards.unsqueeze(-1)
+        then["discount"] = torch.full_like(then["reward"], self.discount**n)
+        now["action"] = self.taken(episode, at)
+        return TensorDict(now | {"next": then, "place": at}, batch_size=len(at), device=at.device)
+
+    def situation(self, episode: TensorDict, at: Tensor, scales: tuple[Tensor, Tensor]) -> dict[str, Any]:
+        """What policy and critics need of some control intervals: observation, centre of the increments, features."""
+        mean, spread = scales
+        seen = {"observation": episode["observation"][at], "centre": self.increments.centre(episode["state"][at])}
+        return seen | {"features": (features(episode)[at] - mean) / spread}
+
+    def taken(self, episode: TensorDict, at: Tensor) -> Float[Tensor, "n n_a"]:
+        """Increments of the decisions that begin at some control intervals."""
+        share = episode["reward"].new_full((self.intervals,), 1.0 / self.intervals)
+        action = torch.stack([windows(part, share)[at] for part in episode["action"].unbind(-1)], -1)
+        return self.increments.scaled(self.increments.centre(episode["state"][at]), action).clamp(-1.0, 1.0)
+
+    def discounts(self, n: int) -> Float[Tensor, " {n}"]:
+        """Discounts of n control intervals in a row."""
+        return self.discount ** torch.arange(n, dtype=torch.float64, device=self.increments.low.device)
+
+    def observations(self) -> Float[Tensor, "n n_o"]:
+        """Observations of all episodes."""
+        return torch.cat([episode["observation"] for episode in self.episodes])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"episodes": [episode.to_dict() for episode in self.episodes]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        device = self.increments.low.device
+        saved = [TensorDict(each, batch_size=len(each["reward"]), device=device) for each in state["episodes"]]
+        self.episodes.clear()
+        self.episodes.extend(saved)
+
+
+def features(episode: TensorDictBase) -> Float[Tensor, "n n_x"]:
+    """What the critics see, before it is scaled: observation, state and exogenous input."""
+    return torch.cat([episode[key] for key in SEEN], -1)
+
+
+def windows(values: Float[Tensor, " n"], weights: Float[Tensor, " m"]) -> Float[Tensor, " n_windows"]:
+    """Weighted sums of m values in a row, from every place on that has as many."""
+    return torch.nn.functional.conv1d(values.view(1, 1, -1), weights.view(1, 1, -1)).view(-1)
+
+
+def decision_intervals(discount: float, decisions: int) -> int:
+    """The number m of control intervals of a decision, of which ``decisions`` last 1/(1 − γ); at least 1."""
+    return max(1, math.floor(1.0 / ((1.0 - discount) * decisions) + 0.5))

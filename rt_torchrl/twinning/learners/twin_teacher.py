@@ -1,0 +1,137 @@
+r"""What a twin teaches critics: slopes of the return along real states, and transitions of the present policy."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.learners.episode_memory import EpisodeMemory, windows
+
+INSIDE = 1.0 - 1e-9
+"""Share of an increment at which a slope is taken; at the very limit of an actuator there are two."""
+
+
+class TwinTeacher:
+    """A twin with the policy that the critics judge.
+
+    Args:
+        twin: the digital twin, whose closure other steps train.
+        policy: policy π_mf.
+        memory: real episodes along which the twin teaches.
+    """
+
+    def __init__(self, twin: DigitalTwin, policy: nn.Module, memory: EpisodeMemory):
+        self.twin, self.policy, self.memory = twin, policy, memory
+
+    def slopes(self, episode: TensorDict) -> Float[Tensor, "n n_a"]:
+        r"""Slopes :math:`g_k = \partial J/\partial a_k` of the discounted sum of L_a by each applied action.
+
+        .. math::
+            g_k = L_a + \gamma\Phi_a^\top\lambda_{k+1}, \qquad
+            \lambda_k = L_s + \pi_s^\top L_a + \gamma(\Phi_s + \Phi_a\pi_s)^\top\lambda_{k+1}
+
+        They are taken along the real states, actions and inputs; after each action the policy acts. λ is zero at the
+        end of the episode.
+
+        Args:
+            episode: one of the memory's episodes, of n control intervals.
+        """
+        by_state, by_action, law, cost_by_state, cost_by_action = (part.numpy() for part in self._linearised(episode))
+        discount, costate = self.memory.discount, np.zeros(by_state.shape[-1])
+        found = np.empty_like(cost_by_action)
+        closed = by_state + by_action @ law
+        held = cost_by_state + np.einsum("na,nas->ns", cost_by_action, law)
+        for k in reversed(range(len(found))):
+            found[k] = cost_by_action[k] + discount * (costate @ by_action[k])
+            costate = held[k] + discount * (costate @ closed[k])
+        return torch.from_numpy(found)
+
+    def _linearised(self, episode: TensorDict) -> tuple[Tensor, ...]:
+        """Φ_s, Φ_a, π_s, L_s and L_a at every control interval."""
+        plant, increments = self.twin.plant, self.memory.increments
+        t = plant.dt * torch.arange(len(episode), dtype=torch.float64)
+        exogenous = episode["exogenous"]
+        with torch.enable_grad():
+            state = episode["state"].clone().requires_grad_()
+            action = episode["action"].clone().requires_grad_()
+            centre = increments.centre(episode["state"])
+            end = plant.step(t, state, centre + INSIDE * (action - centre), exogenous, self.twin.closure).state
+            cost = plant.running_cost(t, state, action, exogenous)
+            acted = plant.actuate(state, self.policy(plant.observe(t, state, exogenous)))
+            by_both = jacobian(end, (state, action))
+            (law,) = jacobian(acted, (state,))
+            costs = jacobian(cost.unsqueeze(-1), (state, action))
+        return *by_both, law, *(part.squeeze(1) for part in costs)
+
+    def decision_slopes(self, episode: TensorDict, at: Tensor, reward_scale: float) -> Float[Tensor, "n n_a"]:
+        """Slopes dq/du of the values by the increments of decisions.
+
+        Args:
+            episode: one of the memory's episodes.
+            at: control intervals at which the decisions begin.
+            reward_scale: factor on the rewards.
+        """
+        slopes, weights = self.slopes(episode), self.memory.discounts(self.memory.intervals)
+        sums = torch.stack([windows(part, weights)[at] for part in slopes.unbind(-1)], -1)
+        return -reward_scale * self.memory.increments.scale * sums
+
+    @torch.no_grad()
+    def transitions(self, count: int, decisions: int, *, reward_scale: float, generator: torch.Generator) -> TensorDict:
+        """Virtual transitions from real states: the recorded decision, and then the present policy.
+
+        Args:
+            count: number of transitions.
+            decisions: number n of decisions of each.
+            reward_scale: factor on the rewards.
+            generator: source of the draws of states.
+
+        Raises:
+            DivergenceError: if the twin diverges.
+        """
+        memory, m = self.memory, self.memory.intervals
+        share, n = -(-count // len(memory)), decisions * m
+        scales, parts = memory.statistics(), []
+        for episode in memory.episodes:
+            places = memory.places(episode, n)
+            drawn = torch.randint(len(places), (share,), generator=generator, device=generator.device)
+            at = places[drawn]
+            now = memory.situation(episode, at, scales) | {"action": memory.taken(episode, at), "place": at}
+            now["next"] = self._flown(episode, at, n, scales, reward_scale)
+            parts.append(TensorDict(now, batch_size=share, device=at.device))
+        return torch.cat(parts)[:count]
+
+    def _flown(
+        self, episode: TensorDict, at: Tensor, n: int, scales: tuple[Tensor, Tensor], reward_scale: float
+    ) -> dict[str, Tensor]:
+        plant, memory, m = self.twin.plant, self.memory, self.memory.intervals
+        ahead = at.unsqueeze(-1) + torch.arange(n, device=at.device)
+        exogenous, start = episode["exogenous"][ahead], plant.dt * at.double()
+        first = self.twin.replay(episode["state"][at], exogenous[:, :m], episode["action"][ahead[:, :m]], start=start)
+        states, actions = first.states, first.actions
+        if n > m:
+            after = self.twin.control(self.policy, states[:, -1], exogenous[:, m:], start=start + m * plant.dt)
+            states, actions = torch.cat([states, after.states[:, 1:]], 1), torch.cat([actions, after.actions], 1)
+        t = plant.dt * ahead.double()
+        rewards = -plant.running_cost(t, states[:, :-1], actions, exogenous) @ memory.discounts(n)
+        end = TensorDict({"state": states[:, -1], "exogenous": episode["exogenous"][at + n]}, batch_size=len(at))
+        end["observation"] = plant.observe(plant.dt * (at + n).double(), end["state"], end["exogenous"])
+        end["reward"] = rewards.unsqueeze(-1)  # its device and length say where the features are computed
+        found = memory.situation(end, torch.arange(len(at), device=at.device), scales)
+        discount = torch.full_like(end["reward"], memory.discount**n)
+        return found | {"reward": reward_scale * end["reward"], "discount": discount}
+
+
+def jacobian(
+    outputs: Float[Tensor, "n n_y"], inputs: tuple[Float[Tensor, "n _"], ...]
+) -> tuple[Float[Tensor, "n n_y _"], ...]:
+    """Derivatives of each output by the inputs of its row; zero for an input that it does not depend on."""
+    rows = []
+    for output in outputs.unbind(-1):
+        if not output.requires_grad:
+            rows.append(tuple(torch.zeros_like(x) for x in inputs))
+            continue
+        found = torch.autograd.grad(output.sum(), inputs, retain_graph=True, allow_unused=True)
+        rows.append(tuple(torch.zeros_like(x) if g is None else g for x, g in zip(inputs, found, strict=True)))
+    return tuple(torch.stack(parts, 1).detach() for parts in zip(*rows, strict=True))
