@@ -5,10 +5,16 @@ import random
 
 import pytest
 import torch
+from linear_quadratic import LinearGain, LinearQuadratic
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from test_algorithm import twinning
 
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.evidence.alarm import alarm
+from rt_torchrl.twinning.evidence.examination import RealJudge
 from rt_torchrl.twinning.evidence.paired_differences import (
     COMMON,
     EXPLORED,
@@ -21,6 +27,8 @@ from rt_torchrl.twinning.evidence.paired_differences import (
     difference,
 )
 from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
+from rt_torchrl.twinning.track_record import Differences
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 def test_the_belief_is_that_of_a_gaussian_process():
@@ -137,3 +145,57 @@ def test_false_alarms_of_a_sound_twin_are_rare():
     for _ in range(2000):
         alarms += alarm([draws.gauss(0.0, 0.05) for _ in range(5)]) is not None
     assert alarms / 2000 < 0.05
+
+
+class ByGain(VirtualEpisodes):
+    """Virtual episodes on which a policy costs its gain; the twin knows nothing else."""
+
+    def __init__(self, plant):
+        self.twin = DigitalTwin(plant, plant.closure)
+
+    def cost(self, policy, episodes):
+        return policy.gain.detach().sum()
+
+
+def judge_of(gains, differences):
+    plant = LinearQuadratic(horizon=2.0)
+    generator = torch.Generator().manual_seed(0)
+    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    flown = Rollout(plant, plant.closure, LinearGain([[1.0, 1.0]]))(state, exogenous)
+    record = Trajectory(flown.states[0], flown.actions[0], exogenous[0])
+    found = Differences([LinearGain([[gain, 0.0]]) for gain in gains], differences, [0.0] * len(gains))
+    return RealJudge(found, found.learned(plant, record), ByGain(plant), record)
+
+
+def test_a_policy_that_cost_more_than_the_twin_said_is_expected_to_cost_it_again():
+    judge = judge_of([4.0, 4.0], [1.0, 1.0])
+    assert judge.expected(LinearGain([[4.0, 0.0]]), 4.0) == pytest.approx(4.0 * math.e, rel=0.03)
+    assert judge.expected(LinearGain([[4.0, 0.0]]), -4.0) == -4.0
+
+
+def test_weights_are_recalled_that_are_expected_to_cost_less():
+    """The twin says 2 of the present policy, which cost e² times as much, and 4 of an earlier one, which cost it."""
+    judge = judge_of([4.0, 2.0], [0.0, 2.0])
+    episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
+    recalled = judge.recalled(LinearGain([[2.0, 0.0]]), episodes)
+    assert recalled["gain"].tolist() == [[4.0, 0.0]]
+    assert judge.recalled(LinearGain([[4.0, 0.0]]), episodes) is None
+    assert judge_of([], []).recalled(LinearGain([[2.0, 0.0]]), episodes) is None
+
+
+@pytest.mark.parametrize("rule", ["decision_tree", "weight_of_evidence"])
+def test_a_training_goes_back_to_what_was_better_in_reality(rule):
+    """The twin's plans cost ten times as much on the real system, which the referee's evidence shows."""
+    found = twinning(arm="model_based", referee=RefereeConfig(rule=rule))
+    fly, costs = found._flown, []
+
+    def flown(policy, *, strength):
+        flight = fly(policy, strength=strength)
+        rewards = flight.transitions["next", "reward"]
+        flight.transitions["next", "reward"] = rewards * (1.0 if not costs else 10.0)
+        costs.append(flight.cost)
+        return flight
+
+    found._flown = flown
+    recalled = [found.episode()["recalled"].item() for _ in range(3)]
+    assert any(recalled) == (rule == "weight_of_evidence")

@@ -69,5 +69,5 @@ def test_the_tank_refuses_it_with_a_half_open_valve():
     module = recipe("cryogenic_tank")
     planner = dataclasses.replace(module.CONVERGED.planner, method="receding_horizon")
     twinning = dataclasses.replace(module.CONVERGED, planner=planner)
-    with pytest.raises(ValueError, match="command='drop' does not go with method='receding_horizon'.*Use command duty"):
+    with pytest.raises(ValueError, match="command='drop' does not go with start='mpc' or method=.*Use command duty"):
         module.Config(command="drop", twinning=twinning)

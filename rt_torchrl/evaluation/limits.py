@@ -48,7 +48,7 @@ class LimitConfig:
     hold: int = 1
     window: PredictiveConfig | None = None
     descent: BoundedDescentConfig = field(
-        default_factory=lambda: BoundedDescentConfig(iterations=3000, tolerance=1e-11)
+        default_factory=lambda: BoundedDescentConfig(iterations=3000, tolerance=1e-13)
     )
 
 

@@ -5,12 +5,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.evidence.examination import RealJudge
+from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.planners import Planner
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -23,11 +24,17 @@ class Judgement(NamedTuple):
         worse: function that says whether the first of two mean J_a is worse than the second one.
         require_sound_twin: function that refuses a twin that diverges in these episodes with the weights that have just
             flown, by an error.
+        evidence: judge of what policies cost on the real system; None judges by the twin alone.
     """
 
     incumbent: Callable[[Scenario], Tensor]
     worse: Callable[[float, float], bool]
     require_sound_twin: Callable[[Scenario], None]
+    evidence: RealJudge | None = None
+
+    def expected(self, policy: nn.Module, cost: float) -> float:
+        """The cost by which a policy is judged: on the real system if there is evidence, else on the twin."""
+        return cost if self.evidence is None else self.evidence.expected(policy, cost)
 
 
 class Planning:
@@ -60,7 +67,15 @@ class Planning:
         Raises:
             DivergenceError: if the twin diverges with the weights that have just flown.
         """
-        found = self._from_the_present(planned_on, judged_on, judgement)
+        policy, recalled = self.planner.policy, None
+        if judgement.evidence is not None and not isinstance(policy, StateFeedback):
+            recalled = judgement.evidence.recalled(policy, judged_on)
+        if recalled is not None:
+            policy.load_state_dict(recalled)
+            self.planner.restart()
+        found = merged(
+            self._from_the_present(planned_on, judged_on, judgement), findings(recalled=float(recalled is not None))
+        )
         while self.others:
             other = self._from_others(self.others.pop(), planned_on, judged_on)
             found = found if other is None else other
@@ -91,7 +106,7 @@ class Planning:
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         judged = not isinstance(policy, StateFeedback)
-        incumbent = judgement.incumbent(judged_on).item() if judged else 0.0
+        incumbent = judgement.expected(policy, judgement.incumbent(judged_on).item()) if judged else 0.0
         try:
             found = self.planner.plan(planned_on)
         except FloatingPointError as error:
@@ -99,7 +114,8 @@ class Planning:
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
-        accepted = not judged or not judgement.worse(self.virtual.cost(policy, judged_on).item(), incumbent)
+        cost = judgement.expected(policy, self.virtual.cost(policy, judged_on).item()) if judged else 0.0
+        accepted = not judged or not judgement.worse(cost, incumbent)
         if not accepted:
             policy.load_state_dict(before)
             self.planner.refuse()

@@ -1,18 +1,24 @@
 """The examination of the twin by the real episodes: paired differences, beliefs about policies, and the alarm."""
 
+import copy
+import math
 from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
 from rt_torchrl.twinning.evidence.paired_differences import Belief, PairedDifferences
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.referees import Role
-from rt_torchrl.twinning.track_record import TrackRecord, shares
+from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+
+RECALLED_BELOW = 0.98
+"""Share of the present policy's expected cost below which earlier weights take its place."""
 
 
 class Examination:
@@ -43,9 +49,49 @@ class Examination:
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
 
+    def judge(self, record: Trajectory) -> "RealJudge":
+        """The judge of policies by the evidence so far; a record gives the observations in which they are compared."""
+        found = self.track_record.differences(self.virtual)
+        return RealJudge(found, found.learned(self.virtual.twin.plant, record), self.virtual, record)
+
     @torch.no_grad()
     def beliefs(self, policies: Mapping[Role, nn.Module], record: Trajectory) -> dict[Role, Belief]:
         """The belief about log J_real − log J_twin of each policy, compared in the observations of a record."""
-        plant = self.virtual.twin.plant
-        learned: PairedDifferences = self.track_record.differences(self.virtual).learned(plant, record)
-        return {role: learned.belief(shares(policy, plant, record)) for role, policy in policies.items()}
+        judge = self.judge(record)
+        return {role: judge.belief(policy) for role, policy in policies.items()}
+
+
+class RealJudge:
+    r"""Judges policies by what they are expected to cost on the real system, :math:`\hat J e^{m + s^2/2}`.
+
+    Args:
+        differences: paired differences of real episodes.
+        learned: the belief about all policies that follows from them.
+        virtual: virtual episodes, which give Ĵ.
+        record: record in whose observations policies are compared.
+    """
+
+    def __init__(
+        self, differences: Differences, learned: PairedDifferences, virtual: VirtualEpisodes, record: Trajectory
+    ):
+        self.differences, self.learned, self.virtual, self.record = differences, learned, virtual, record
+
+    @torch.no_grad()
+    def belief(self, policy: nn.Module) -> Belief:
+        """The belief about log J_real − log J_twin of a policy."""
+        return self.learned.belief(shares(policy, self.virtual.twin.plant, self.record))
+
+    def expected(self, policy: nn.Module, cost: float) -> float:
+        """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
+        mean, deviation = self.belief(policy)
+        return cost * math.exp(mean + 0.5 * deviation**2) if cost > 0.0 else cost
+
+    @torch.no_grad()
+    def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
+        """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""
+        flown = [one for one in self.differences.policies if same_architecture(one, policy)]
+        costs = [self.expected(one, self.virtual.cost(one, episodes).item()) for one in flown]
+        present = self.expected(policy, self.virtual.cost(policy, episodes).item())
+        if not costs or not min(costs) < RECALLED_BELOW * present:
+            return None
+        return copy.deepcopy(flown[costs.index(min(costs))].state_dict())
