@@ -32,6 +32,7 @@ POLICY: dict[str, tuple[str, ...]] = {
     "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
 }
 """Policies of few weights, whose optimum exact gradients find."""
+WITH_HYPOTHESES = ("--twinning.hypotheses.which", "automatic", "--twinning.referee.rule", "weight_of_evidence")
 UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "cryogenic_tank": 50}
 """Number of unseen episodes that judge a plant by default."""
 HOPS = 192
@@ -42,8 +43,9 @@ HOPS = 192
 class Config:
     """Plan on the fitted twin of a real system that it does not know, and compare with the optimum on the true system.
 
-    A training of the model-based half alone makes a few rounds of record, fit and plan. The folder keeps finished
-    results, so that the same command goes on where it was interrupted.
+    A training of the model-based half alone makes a few rounds of record, fit and plan; another one does so with
+    hypotheses about what the twin lacks, and a referee that weighs evidence. The folder keeps finished results, so that
+    the same command goes on where it was interrupted.
 
     Args:
         plant: wind_turbine, flapping_wing or cryogenic_tank.
@@ -53,6 +55,7 @@ class Config:
         seeds: number of trainings of each system.
         episodes: number of rounds of record, fit and plan.
         unseen: number of unseen episodes that judge everything; by default 50, or 100 of the drone, and 192 hops.
+        hypotheses: whether to train with hypotheses, too.
         starts: number of random starts of the search for the optimum.
         iterations: number of gradients of each start on ten episodes; a third as many follow on all.
         jobs: number of trainings side by side.
@@ -66,6 +69,7 @@ class Config:
     seeds: int = 3
     episodes: int = 3
     unseen: int | None = None
+    hypotheses: bool = True
     starts: int = 3
     iterations: int = 60
     jobs: int = 1
@@ -105,20 +109,26 @@ class Config:
         found += ("--task", "hop") if self.task == "hop" else ()
         return (*found, "--unknown", *names(system)) if names(system) else found
 
-    def trainings(self, system: str) -> list[Training]:
-        """A training of the model-based half for each seed."""
+    def trainings(self, system: str, *, helped: bool = False) -> list[Training]:
+        """A training of the model-based half for each seed, alone or with hypotheses."""
+        options, kind = (WITH_HYPOTHESES, "-hypotheses") if helped else ((), "")
         return [
             Training(
                 recipe=self.recipe,
                 arm="model_based",
                 seed=seed,
                 variant="nominal",
-                folder=self.kept / system / f"seed-{seed}",
+                folder=self.kept / system / f"seed-{seed}{kind}",
                 episodes=self.episodes,
-                options=self.options(system),
+                options=(*self.options(system), *options),
             )
             for seed in range(self.seeds)
         ]
+
+    def tasks(self, system: str) -> "list[Task]":
+        """All that a row needs."""
+        helped = self.trainings(system, helped=True) if self.hypotheses else []
+        return [self.optimum(system), *self.trainings(system), *helped]
 
     def optimum(self, system: str) -> Yardstick:
         """The best policy of the class on the true system."""
@@ -143,6 +153,11 @@ def row(config: Config, system: str) -> Room:
     """The costs on a system, of what is kept."""
     found = [training.metrics() for training in config.trainings(system)]
     unseen = [metrics["summary"]["unseen"] for metrics in found]
+    helped = (
+        [training.metrics()["summary"] for training in config.trainings(system, helped=True)]
+        if config.hypotheses
+        else []
+    )
     baselines = {name: judged["J_a"]["mean"] for name, judged in unseen[0]["baselines"].items()}
     return Room(
         system=" + ".join(names(system)),
@@ -150,6 +165,9 @@ def row(config: Config, system: str) -> Room:
         planned=[judged["J_a_model_based"]["mean"] for judged in unseen],
         said=[metrics["episodes"][-1]["J_a_plan"] for metrics in found],
         classical=baselines,
+        helped=[summary["unseen"]["J_a_model_based"]["mean"] for summary in helped],
+        paid=[metrics["summary"]["cost_of_learning"]["sum"] for metrics in found],
+        helped_paid=[summary["cost_of_learning"]["sum"] for summary in helped],
     )
 
 
@@ -158,14 +176,13 @@ def command(config: Config) -> str:
     usual = Config(plant=config.plant)
     changed = {name: getattr(config, name) for name in ("task", "seeds", "episodes", "unseen", "starts", "iterations")}
     options = [f"--{name} {value}" for name, value in changed.items() if value != getattr(usual, name)]
+    options += [] if config.hypotheses else ["--no-hypotheses"]
     return " ".join(["uv run recipes/unknown.py", config.plant, *config.systems, *options])
 
 
 def main(config: Config) -> None:
     make_folder("folder", config.kept)
-    tasks: list[Task] = [
-        task for system in config.rows() for task in (config.optimum(system), *config.trainings(system))
-    ]
+    tasks = [task for system in config.rows() for task in config.tasks(system)]
     side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
     rows = [row(config, system) for system in config.rows()]
     shown = room_table(rows)

@@ -1,5 +1,6 @@
 """The room between policies planned on a twin that does not know the real system, and the optimum on that system."""
 
+import dataclasses
 import json
 
 import pytest
@@ -11,6 +12,8 @@ from rt_torchrl.study.training import Training
 from rt_torchrl.study.yardsticks import Yardstick
 
 ROOMY = Room(system="pitch", oracle=0.05, planned=[0.2, 0.1, 0.3], said=[0.04, 0.05, 0.06], classical={"PD": 0.07})
+
+HELPED = dataclasses.replace(ROOMY, helped=[0.06, 0.055, 0.3], paid=[1.0, 2.0, 3.0], helped_paid=[0.5, 0.4, 0.6])
 
 
 def test_the_gap_is_that_of_the_median_over_the_least_cost_that_was_found():
@@ -57,20 +60,29 @@ def test_a_row_is_made_of_what_is_kept(tmp_path, monkeypatch):
     made = recipe("unknown")
     config = made.Config(plant="wind_turbine", systems=("pitch",), seeds=3, folder=tmp_path, page=tmp_path / "page.md")
     (tmp_path / "page.md").write_text("# Page\n")
-    costs = iter(ROOMY.planned)
 
     def metrics(training):
-        unseen = {"J_a_model_based": {"mean": next(costs)}, "baselines": {"PD": {"J_a": {"mean": 0.07}}}}
+        helped = training.folder.name.endswith("hypotheses")
+        assert helped == ("--twinning.hypotheses.which" in training.options)
+        costs, paid = (HELPED.helped, HELPED.helped_paid) if helped else (HELPED.planned, HELPED.paid)
+        unseen = {"J_a_model_based": {"mean": costs[training.seed]}, "baselines": {"PD": {"J_a": {"mean": 0.07}}}}
+        summary = {"unseen": unseen, "cost_of_learning": {"sum": paid[training.seed]}}
         said = ROOMY.said[training.seed]
-        return {"summary": {"unseen": unseen}, "episodes": [{"J_a_plan": 1.0}, {"J_a_plan": said}]}
+        return {"summary": summary, "episodes": [{"J_a_plan": 1.0}, {"J_a_plan": said}]}
 
     monkeypatch.setattr(Training, "metrics", metrics)
     monkeypatch.setattr(Yardstick, "run", lambda yardstick: {"J_a": {"mean": 0.05}})
     monkeypatch.setattr(made, "side_by_side", lambda batches, **options: None)
     made.main(config)
     kept = json.loads((config.kept / "room.json").read_text())["rows"]
-    assert kept == [vars(ROOMY) | {"gap": pytest.approx(3.0)}]
-    assert room_table([ROOMY]) in (tmp_path / "page.md").read_text()
+    assert kept == [vars(HELPED) | {"gap": pytest.approx(3.0)}]
+    assert room_table([HELPED]) in (tmp_path / "page.md").read_text()
+
+
+def test_a_row_with_hypotheses_says_what_they_are_worth():
+    cells = HELPED.cells()
+    assert cells[:7] == ROOMY.cells() and cells[7:] == ["0.06 (0.055 … 0.3)", "20.0 %", "2, 0.5"]
+    assert "with hypotheses" in room_table([HELPED]) and "with hypotheses" not in room_table([ROOMY])
 
 
 @pytest.mark.parametrize(
