@@ -107,6 +107,12 @@ class Extension(Plant):
         """The action that acts at the start of an interval, by which its cost is judged; by default the applied one."""
         return applied
 
+    def meeting(
+        self, hidden: Float[Tensor, "*batch n_x"], exogenous: Float[Tensor, "*#batch n_z"]
+    ) -> Float[Tensor, "*#batch n_z"]:
+        """The inputs that act on the plant in an interval; by default those that sensors read."""
+        return exogenous
+
     @abstractmethod
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n_x"]:
         """The hidden states at the start of an episode, from the states of the plant."""
@@ -137,7 +143,8 @@ class Extension(Plant):
         closure: nn.Module,
     ) -> Float[Tensor, "*batch n_s"]:
         base, hidden = self.split(state)
-        field = self.base.vector_field(t, base, self.acting(hidden, action), exogenous, self.of_base(closure))
+        acting, met = self.acting(hidden, action), self.meeting(hidden, exogenous)
+        field = self.base.vector_field(t, base, acting, met, self.of_base(closure))
         return torch.cat([field, self.rates(hidden, action, closure)], -1)
 
     def advance(
@@ -151,7 +158,8 @@ class Extension(Plant):
         """The plant's own scheme under the mean of the action that acts on it in this interval."""
         base, hidden = self.split(state)
         acting, end = self.respond(hidden, applied, closure)
-        return torch.cat([self.base.advance(t, base, acting, exogenous, self.of_base(closure)), end], -1)
+        met = self.meeting(hidden, exogenous)
+        return torch.cat([self.base.advance(t, base, acting, met, self.of_base(closure)), end], -1)
 
     def actuate(
         self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch n_a"]

@@ -61,36 +61,22 @@ class UnreadInput(Extension):
     def meeting(
         self, hidden: Float[Tensor, "*batch n_x"], exogenous: Float[Tensor, "*#batch n_z"]
     ) -> Float[Tensor, "*batch n_z"]:
-        """The inputs that act."""
+        """What sensors read and what they do not."""
         unread = hidden[..., : len(self.frequency)].sum(-1)
         met = exogenous + torch.zeros_like(hidden[..., :1])
         return replaced(met, self.place, met[..., self.place] + unread)
 
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
-        base, hidden = self.split(state)
-        field = self.base.vector_field(t, base, action, self.meeting(hidden, exogenous), closure)
+    def respond(
+        self, hidden: Float[Tensor, "*batch n_x"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module
+    ) -> tuple[Float[Tensor, "*batch n_a"], Float[Tensor, "*batch n_x"]]:
         p, q = hidden.split(len(self.frequency), -1)
-        return torch.cat([field, -self.frequency * q, self.frequency * p], -1)
+        return applied, torch.cat([self.cosine * p - self.sine * q, self.sine * p + self.cosine * q], -1)
 
-    def advance(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
-        base, hidden = self.split(state)
-        end = self.base.advance(t, base, applied, self.meeting(hidden, exogenous), closure)
+    def rates(
+        self, hidden: Float[Tensor, "*batch n_x"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module
+    ) -> Float[Tensor, "*batch n_x"]:
         p, q = hidden.split(len(self.frequency), -1)
-        return torch.cat([end, self.cosine * p - self.sine * q, self.sine * p + self.cosine * q], -1)
+        return torch.cat([-self.frequency * q, self.frequency * p], -1)
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n_x"]:
         """Nothing that is not read, which is the mean."""
