@@ -7,11 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.extensions.extension import OwnParameters
+
 RANGE = 30.0
 """Greatest factor by which a coefficient differs from the value that it begins with."""
 
 
-class ActuatorCoefficients(nn.Module):
+class ActuatorCoefficients(OwnParameters):
     r"""Positive coefficients of one extension, :math:`c = c_0\,30^{\tanh w}` with the weights w.
 
     An identification cannot lose a coefficient: beyond a factor of 30 a record no longer shows it, and an unbounded

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.extensions.extension import Extension, OwnParameters
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 
-class SensorErrors(nn.Module):
+class SensorErrors(OwnParameters):
     """Offset b_0 and drift ḃ of a sensor, as weights in units of a scale.
 
     Args:
@@ -24,7 +24,7 @@ class SensorErrors(nn.Module):
 
     def __init__(self, state: str, unit: str, scale: float, duration: float, values: tuple[float, float]):
         super().__init__()
-        self.scale, self.duration = scale, duration
+        self.scale, self.duration, self._arguments = scale, duration, (state, unit, scale, duration)
         self.names = {f"{state}_offset": unit, f"{state}_drift": f"{unit}/s"}
         self.meanings = {f"{state}_offset": "offset of the sensor", f"{state}_drift": "drift of the sensor"}
         self.weights = nn.Parameter(torch.tensor([values[0] / scale, values[1] * duration / scale]).double())
@@ -38,6 +38,10 @@ class SensorErrors(nn.Module):
         """The bias b(t)."""
         offset, drift = (self.scale * self.weights).unbind()
         return offset + drift * t / self.duration
+
+    def fresh(self) -> "SensorErrors":
+        """No offset and no drift, to be trained."""
+        return SensorErrors(*self._arguments, (0.0, 0.0))
 
 
 class BiasedSensor(Extension):
@@ -72,12 +76,10 @@ class BiasedSensor(Extension):
                 f"reading of {state}; a biased sensor needs a plant without controller_states."
             )
         self.place, self.state = names.index(state), state
-        self._arguments = (state, base.states[self.place].unit, scale, base.horizon)
-        signal = Signal(symbol="b", name=f"bias_of_{state}", unit=base.states[self.place].unit)
-        super().__init__(base, [signal], SensorErrors(*self._arguments, (offset, drift)).requires_grad_(False))
-
-    def make_own(self) -> nn.Module:
-        return SensorErrors(*self._arguments, (0.0, 0.0))
+        unit = base.states[self.place].unit
+        signal = Signal(symbol="b", name=f"bias_of_{state}", unit=unit)
+        errors = SensorErrors(state, unit, scale, base.horizon, (offset, drift))
+        super().__init__(base, [signal], errors.requires_grad_(False))
 
     def true(self, read: Float[Tensor, "*batch n_b"], bias: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch n_b"]:
         """States of the plant, from what the sensors read."""

@@ -1,6 +1,6 @@
 """A plant with additional dynamics, which no sensor reads."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -42,6 +42,14 @@ class ExtendedClosure(nn.Module):
         return self.base(features)
 
 
+class OwnParameters(nn.Module, ABC):
+    """The parameters of an extension."""
+
+    @abstractmethod
+    def fresh(self) -> nn.Module:
+        """Parameters with the values that a twin begins with, to be trained."""
+
+
 class Extension(Plant):
     r"""A plant whose inputs or outputs pass through additional dynamics with hidden states x.
 
@@ -54,7 +62,7 @@ class Extension(Plant):
     Args:
         base: the plant.
         hidden: signals of the hidden states x.
-        own: parameters w of the true system, which :meth:`make_own` gives a twin to begin with; None for none.
+        own: parameters w of the true system, with which a twin begins afresh; None for none.
 
     Raises:
         ValueError: if the plant overrides ``step`` as a whole, so that nothing can act between actuator and system, or
@@ -64,7 +72,7 @@ class Extension(Plant):
     name = "extension"  # until the plant gives its own
     own_scheme = True  # between samples the hidden states follow their exact solution, not the vector field
 
-    def __init__(self, base: Plant, hidden: Sequence[Signal], own: nn.Module | None = None):
+    def __init__(self, base: Plant, hidden: Sequence[Signal], own: OwnParameters | None = None):
         if type(base).step is not Plant.step:
             raise ValueError(
                 f"plant {base.name!r} overrides step(), so that nothing can act between its actuators and its system; "
@@ -79,7 +87,7 @@ class Extension(Plant):
         self.states, self.actions, self.inputs = (*base.states, *hidden), base.actions, base.inputs
         self.observations, self.observed, self.previews = base.observations, base.observed, base.previews
         self.controller_states = base.controller_states
-        self._parametric = own is not None
+        self._fresh = None if own is None else own.fresh
 
     # The additional dynamics
 
@@ -117,10 +125,6 @@ class Extension(Plant):
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n_x"]:
         """The hidden states at the start of an episode, from the states of the plant."""
 
-    def make_own(self) -> nn.Module:
-        """The parameters w that a twin begins with; extensions without parameters have none."""
-        return nn.Module()
-
     # The system
 
     def split(
@@ -132,7 +136,7 @@ class Extension(Plant):
 
     def of_base(self, closure: nn.Module) -> nn.Module:
         """The part of the closure that belongs to the plant."""
-        return closure.get_submodule("base") if self._parametric else closure
+        return closure if self._fresh is None else closure.get_submodule("base")
 
     def vector_field(
         self,
@@ -242,7 +246,7 @@ class Extension(Plant):
         return self._with_own(self.base.extended(closure) if isinstance(self.base, Extension) else closure)
 
     def _with_own(self, closure: nn.Module) -> nn.Module:
-        return ExtendedClosure(closure, self.make_own()) if self._parametric else closure
+        return ExtendedClosure(closure, self._fresh()) if self._fresh is not None else closure
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         return self.base.make_policy(generator)

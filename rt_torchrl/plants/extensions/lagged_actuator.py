@@ -22,25 +22,20 @@ class LaggedActuator(Extension):
         base: the plant.
         action: name of the action that lags.
         time_constant: τ of the true system, which a twin identifies [s].
-        guess: τ that a twin begins with [s]; None for ``time_constant``.
 
     Raises:
         ValueError: if there is no such action, or a time constant is not positive and finite.
     """
 
-    def __init__(self, base: Plant, action: str, time_constant: float, *, guess: float | None = None):
+    def __init__(self, base: Plant, action: str, time_constant: float):
         self.place, self.action = place_of(base, action), action
         signal = base.actions[self.place]
         hidden = Signal(symbol=signal.symbol + "'", name=f"lagged_{action}", unit=signal.unit)
         super().__init__(base, [hidden], self._coefficients(time_constant).requires_grad_(False))
-        self._guess = self._coefficients(time_constant if guess is None else guess)
 
     def _coefficients(self, time_constant: float) -> ActuatorCoefficients:
         name = f"{self.action}_lag"
         return ActuatorCoefficients({name: "s"}, {name: f"time constant of {self.action}"}, [time_constant])
-
-    def make_own(self) -> nn.Module:
-        return self._guess.fresh()
 
     def respond(
         self, hidden: Float[Tensor, "*batch 1"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module

@@ -51,7 +51,6 @@ class LaggedCoefficients(Extension):
         start: coefficients c at the start of an episode, of all places in turn.
         elements: shape of the places at which the plant evaluates its closure in one call for each state, such as the
             blade elements of a wing; by default it is evaluated once for each state.
-        guess: τ that a twin begins with [s]; None for ``time_constant``.
 
     Raises:
         ValueError: if a time constant is not positive and finite, ``start`` does not hold as many coefficients for each
@@ -67,7 +66,6 @@ class LaggedCoefficients(Extension):
         start: tuple[float, ...],
         *,
         elements: tuple[int, ...] = (),
-        guess: float | None = None,
     ):
         if isinstance(base, Extension):
             raise ValueError(
@@ -80,7 +78,6 @@ class LaggedCoefficients(Extension):
             )
         hidden = [Signal(symbol=f"c_{k}", name=f"lagged_coefficient_{k}", unit="-") for k in range(len(start))]
         super().__init__(base, hidden, self._coefficients(time_constant).requires_grad_(False))
-        self._guess = self._coefficients(time_constant if guess is None else guess)
         self._shape = (*elements, len(start) // places)
         self.register_buffer("initial", torch.tensor(start, dtype=torch.float64))
 
@@ -90,9 +87,6 @@ class LaggedCoefficients(Extension):
 
     def _coefficients(self, time_constant: float) -> ActuatorCoefficients:
         return ActuatorCoefficients({"force_lag": "s"}, {"force_lag": "time constant of the force"}, [time_constant])
-
-    def make_own(self) -> nn.Module:
-        return self._guess.fresh()
 
     def vector_field(
         self,

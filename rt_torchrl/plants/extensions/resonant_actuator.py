@@ -23,21 +23,17 @@ class ResonantActuator(Extension):
         action: name of the action.
         frequency: natural frequency ω of the true system [rad/s].
         damping: damping ratio ζ of the true system [-], in (0, 1).
-        guess: ω and ζ that a twin begins with; None for those of the true system.
 
     Raises:
         ValueError: if there is no such action, ω is not positive and finite, or ζ is out of its range.
     """
 
-    def __init__(
-        self, base: Plant, action: str, frequency: float, damping: float, *, guess: tuple[float, float] | None = None
-    ):
+    def __init__(self, base: Plant, action: str, frequency: float, damping: float):
         self.place, self.action = place_of(base, action), action
         signal = base.actions[self.place]
         position = Signal(symbol=signal.symbol + "'", name=f"resonant_{action}", unit=signal.unit)
         rate = Signal(symbol=rf"\dot{{{signal.symbol}}}'", name=f"rate_of_{action}", unit=f"{signal.unit}/s")
         super().__init__(base, [position, rate], self._coefficients(frequency, damping).requires_grad_(False))
-        self._guess = self._coefficients(*(guess or (frequency, damping)))
 
     def _coefficients(self, frequency: float, damping: float) -> ActuatorCoefficients:
         if not 0.0 < damping < 1.0:
@@ -45,9 +41,6 @@ class ResonantActuator(Extension):
         names = {f"{self.action}_frequency": "rad/s", f"{self.action}_damping_odds": "-"}
         meanings = dict(zip(names, (f"natural frequency of {self.action}", "zeta/(1 - zeta) of it"), strict=True))
         return ActuatorCoefficients(names, meanings, [frequency, damping / (1.0 - damping)])
-
-    def make_own(self) -> nn.Module:
-        return self._guess.fresh()
 
     def respond(
         self, hidden: Float[Tensor, "*batch 2"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module

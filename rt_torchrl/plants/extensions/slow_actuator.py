@@ -23,13 +23,12 @@ class SlowActuator(Extension):
         action: name of the action.
         delay: dead time D of the true system [s].
         stages: number n of lags.
-        guess: dead time that a twin begins with [s]; None for ``delay``.
 
     Raises:
         ValueError: if there is no such action, a dead time is not positive and finite, or there is no stage.
     """
 
-    def __init__(self, base: Plant, action: str, delay: float, *, stages: int = 6, guess: float | None = None):
+    def __init__(self, base: Plant, action: str, delay: float, *, stages: int = 6):
         if stages < 1:
             raise ValueError(f"stages={stages} of {action} must be at least 1.")
         self.place, self.action, self.stages = place_of(base, action), action, stages
@@ -39,14 +38,10 @@ class SlowActuator(Extension):
             for k in range(1, stages + 1)
         ]
         super().__init__(base, hidden, self._coefficients(delay).requires_grad_(False))
-        self._guess = self._coefficients(delay if guess is None else guess)
 
     def _coefficients(self, delay: float) -> ActuatorCoefficients:
         name = f"{self.action}_delay"
         return ActuatorCoefficients({name: "s"}, {name: f"dead time of {self.action}"}, [delay])
-
-    def make_own(self) -> nn.Module:
-        return self._guess.fresh()
 
     def respond(
         self, hidden: Float[Tensor, "*batch n"], applied: Float[Tensor, "*batch n_a"], closure: nn.Module
