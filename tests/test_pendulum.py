@@ -217,6 +217,7 @@ def require_quiet(done):
     assert not re.search(r"torch\.jit|CUDA_HOME|\[torchrl\]|Warning", done.stdout), done.stdout
 
 
+@pytest.mark.slow
 def test_the_recipe_trains_on_gymnasium(tmp_path):
     small = ["--episodes", "1", "--unseen", "2", "--horizon", "2.0", "--compiled", "False", "--figures-every", "0"]
     small += ["--twinning.learner.critic-iterations", "2", "--twinning.learner.actor-iterations", "2"]
