@@ -14,6 +14,7 @@ from rt_torchrl import (
     DescentConfig,
     ExogenousConfig,
     ExplorationConfig,
+    HypothesesConfig,
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
@@ -60,6 +61,7 @@ PAPER = TwinningConfig(
         iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
     ),
     referee=RefereeConfig(patience=4, clone_patience=4),
+    hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
     PAPER,
@@ -71,6 +73,7 @@ CONVERGED = dataclasses.replace(
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PREDICTIVE,
     ),
+    hypotheses=HypothesesConfig(),
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
-from rt_torchrl.twinning.evidence.paired_differences import Belief, PairedDifferences
+from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, Belief, PairedDifferences
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
@@ -24,6 +24,9 @@ RECALLED_BELOW = 0.98
 class Examination:
     """Compares what real episodes cost with what the twin says of them.
 
+    The attribute ``unexplained`` is the paired difference of the latest episode beyond two standard deviations of what
+    its exploration explains.
+
     Args:
         track_record: the real episodes.
         virtual: virtual episodes of the twin.
@@ -31,6 +34,7 @@ class Examination:
 
     def __init__(self, track_record: TrackRecord, virtual: VirtualEpisodes):
         self.track_record, self.virtual = track_record, virtual
+        self.unexplained = 0.0
 
     @torch.no_grad()
     def examine(self) -> TensorDict:
@@ -42,7 +46,9 @@ class Examination:
         """
         found = self.track_record.differences(self.virtual)
         if not found.values:
+            self.unexplained = 0.0
             return findings()
+        self.unexplained = abs(found.values[-1]) - 2.0 * EXPLORED * found.exploration[-1]
         quiet = [d for d, noise in zip(found.values, found.exploration, strict=True) if noise <= QUIET]
         said = alarm(quiet)
         explained = self.virtual.twin.explanation()
