@@ -143,6 +143,7 @@ class ReinforcementTwinning:
             self.virtual.learn(flight.record) if on_twin else None
         if on_twin:
             self.assimilate(records)
+            self.assimilation.explain(self.examination.replayed(records), records, self.generator)
             self.planning.remember() if "model_based" in pupils else None
         imitating = {role: self.policies[role] for role in pupils}
         found = self.cloning.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)

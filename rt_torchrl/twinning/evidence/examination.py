@@ -2,16 +2,17 @@
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
-from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, Belief, PairedDifferences
+from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
@@ -54,6 +55,20 @@ class Examination:
         explained = self.virtual.twin.explanation()
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
+
+    @torch.no_grad()
+    def replayed(self, records: Sequence[Trajectory]) -> float:
+        """Greatest size of the paired differences of records whose actions the twin replays.
+
+        It takes the place of ``examine`` where no policy can fly them again.
+        """
+        whole, twin = batch_of(records), self.virtual.twin
+        try:
+            flown = twin.replay(whole.states[:, 0], whole.exogenous, whole.actions, start=whole.start)
+        except DivergenceError:
+            return LARGEST
+        real, predicted = (control_cost(twin.plant, one).tolist() for one in (whole, flown))
+        return max(abs(difference(*pair)) for pair in zip(real, predicted, strict=True))
 
     def judge(self, record: Trajectory) -> "RealJudge":
         """The judge of policies by the evidence so far; a record gives the observations in which they are compared."""

@@ -14,8 +14,9 @@ class HypothesesConfig:
 
     Args:
         which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), or ``none`` for the twin alone.
-        call: paired difference of a real episode, \|log J − log Ĵ\| beyond what exploration explains, above which the
-            hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them always.
+        call: size of the paired difference log J − log Ĵ of a real episode, beyond what exploration explains, above
+            which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them
+            always.
         names: names of the suspects that are taken; all if there are none.
         prior: prior weight p_h of every addition, as a share of that of the twin alone. A small one asks for evidence
             before anything is added.
