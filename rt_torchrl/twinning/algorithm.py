@@ -197,10 +197,7 @@ class ReinforcementTwinning:
 
     def examine(self) -> TensorDict:
         """Compare what the latest real episodes cost with what the twin says of them, and seek an explanation."""
-        found = self.examination.examine()
-        if not self.assimilation.explain(self.examination.unexplained, list(self.short_term), self.generator):
-            return found
-        return merged(findings(**self.assimilation.report()), self.examination.examine())
+        return self.examination.explained(self.assimilation, list(self.short_term), self.generator)
 
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""

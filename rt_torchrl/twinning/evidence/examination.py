@@ -10,10 +10,11 @@ from torch import Tensor, nn
 
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
+from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
-from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -55,6 +56,15 @@ class Examination:
         explained = self.virtual.twin.explanation()
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
+
+    def explained(
+        self, assimilation: Assimilation, records: Sequence[Trajectory], generator: torch.Generator
+    ) -> TensorDict:
+        """As :meth:`examine`, once step 4 has sought what explains the difference."""
+        found = self.examine()
+        if not assimilation.explain(self.unexplained, records, generator):
+            return found
+        return merged(findings(**assimilation.report()), self.examine())
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory]) -> float:
