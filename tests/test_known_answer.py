@@ -8,7 +8,9 @@ from linear_quadratic import LinearGain
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import root
 
+from rt_torchrl import IncrementalTD3Config
 from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -20,6 +22,14 @@ SEEDS = 0, 1, 2
 EPISODES = 20
 # All else, prioritised replay among it, is the library's default; so is the recipe of the wind turbine.
 LEARNER = LearnerConfig(return_steps=10)
+# A decision lasts one control interval, because the policy decides in each.
+INCREMENTAL = LearnerConfig(
+    algorithm="incremental_td3",
+    critic_iterations=300,
+    actor_iterations=300,
+    discount=0.98,
+    incremental=IncrementalTD3Config(decisions=50),
+)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +83,7 @@ def test_the_learners_discount_leaves_room(answer):
     assert found.success and 0.0 < answer.excess(found.x) < 0.02
 
 
-def half_alone(gain, *, seed):
+def half_alone(gain, *, seed, learner):
     """The model-free half of the algorithm with both policies at a gain; its learner is chosen here."""
     plant = HiddenForce()
     return ReinforcementTwinning(
@@ -81,36 +91,38 @@ def half_alone(gain, *, seed):
         DigitalTwin(plant, plant.closure),
         model_free=LinearGain(gain),
         model_based=LinearGain(gain),
-        config=TwinningConfig(arm="model_free", learner=LEARNER),
+        config=TwinningConfig(arm="model_free", learner=learner, exploration=ExplorationConfig(least=0.2)),
         generator=torch.Generator().manual_seed(seed),
     )
 
 
-def excesses(answer, share, seed, episodes=EPISODES):
+def excesses(answer, share, seed, episodes=EPISODES, learner=INCREMENTAL):
     """J/J* − 1 in expectation after each episode of the half alone, started at a share of the optimal gain."""
-    found = half_alone(share * answer.gain, seed=seed)
+    found = half_alone(share * answer.gain, seed=seed, learner=learner)
     for _ in range(episodes):
         found.episode()
         yield answer.excess(found.policies["model_free"].gain.detach().numpy())
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="DDPG ruins its clones: J/J* = 1.18, 1.89, 2.02 after one episode of seeds 0, 1, 2, later unstable with 0",
+@pytest.mark.parametrize(
+    "episodes", [pytest.param(5, marks=pytest.mark.slow), pytest.param(EPISODES, marks=pytest.mark.nightly)]
 )
-@pytest.mark.parametrize("episodes", [2, pytest.param(EPISODES, marks=pytest.mark.slow)])
 def test_a_clone_of_the_optimum_stays_within_five_percent(answer, episodes):
     for seed in SEEDS:
         for episode, excess in enumerate(excesses(answer, 1.0, seed, episodes), start=1):
             assert excess < 0.05, f"seed {seed}, episode {episode}"
 
 
-@pytest.mark.slow
+def test_ddpg_ruins_a_clone_of_the_optimum(answer):
+    """The paper's learner, which this is compared with: J/J* = 1.18 after one episode of seed 0."""
+    assert next(excesses(answer, 1.0, 0, learner=LEARNER)) > 0.1
+
+
+@pytest.mark.nightly
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="DDPG drifts away with seed 0: J/J* = 2.57 after twenty episodes, from 1.29",
+    reason="incremental TD3 hardly moves: J/J* = 1.25 after twenty episodes of seed 0, from 1.29; DDPG drifts to 2.57",
 )
 def test_half_the_gain_comes_within_ten_percent(answer):
     for seed in SEEDS:
