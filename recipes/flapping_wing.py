@@ -85,9 +85,6 @@ NEURAL = dataclasses.replace(
     ),
 )
 """Configuration of the training with ``--closure mlp``."""
-GROWTH = 4
-"""Growth of the plans of the paper's policy: thirty gradients do not pass the valley of its cost, and a hundred and
-twenty on the first gusts end where another gust throws the drone away."""
 
 
 OBSERVED = {"paper": "paper", "mlp": "measured+wind"}
@@ -161,8 +158,6 @@ class Config(RunConfig):
 
     def defaults(self) -> "Config":
         twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
-        if self.policy == "paper" and twinning is CONVERGED:
-            twinning = dataclasses.replace(twinning, planner=dataclasses.replace(twinning.planner, growth=GROWTH))
         if self.paper:
             return Config(paper=True, policy="paper", start="random", twinning=twinning)
         return Config(twinning=self.suited(twinning))
