@@ -14,6 +14,10 @@ import torch
 from rt_torchrl.atomic_file import write_atomically
 
 
+class DamagedFileError(ValueError):
+    """A file that is not what a run has written: damaged, foreign, or such that loading it would run code."""
+
+
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     """Write tensors, numbers and strings in dicts, lists and tuples; ``torch.load`` can read the file too.
 
@@ -34,29 +38,41 @@ def load_tensors(path: Path) -> dict[str, Any]:
     The checksum (CRC-32) of every part of the file is compared first.
 
     Raises:
-        ValueError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
+        DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
             object is not built.
     """
     try:
         with zipfile.ZipFile(path) as archive:
+            _require_bounded(archive, path)
             torn = archive.testzip()
     # The kind of error depends on the byte that is wrong, and all of them come from reading the file.
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError, zlib.error) as error:
-        raise ValueError(f"{path} is damaged, or no file of a run: {error}") from error
+        raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
     if torn is not None:
-        raise ValueError(f"{path} is damaged: part {torn!r} does not have the checksum that it was written with.")
+        raise DamagedFileError(f"{path} is damaged: part {torn!r} does not have the checksum that it was written with.")
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
     except pickle.UnpicklingError as error:
-        raise ValueError(
+        raise DamagedFileError(
             f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
             f"in plain containers. {first_line(error)}"
         ) from error
     except (RuntimeError, EOFError, KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
-        raise ValueError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
+        raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
     if not isinstance(content, dict):
-        raise ValueError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
+        raise DamagedFileError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
     return content
+
+
+def _require_bounded(archive: zipfile.ZipFile, path: Path) -> None:
+    """Refuse parts that would take more memory than the file has bytes; a run writes none, and compresses nothing.
+
+    Raises:
+        zipfile.BadZipFile: if there are any.
+    """
+    parts, size = archive.infolist(), path.stat().st_size
+    if any(part.compress_type != zipfile.ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:
+        raise zipfile.BadZipFile(f"its parts are larger than its {size} bytes")
 
 
 def first_line(error: Exception) -> str:
