@@ -122,7 +122,9 @@ def _read(file: Path) -> dict[str, Any]:
     """The content of a checkpoint of any format."""
     found = load_tensors(file)
     if not {"format", "episodes", "state"} <= found.keys():
-        raise DamagedFileError(f"{file} is damaged, or no checkpoint: it holds {', '.join(map(str, found)) or 'nothing'}.")
+        raise DamagedFileError(
+            f"{file} is damaged, or no checkpoint: it holds {', '.join(map(str, found)) or 'nothing'}."
+        )
     return found
 
 

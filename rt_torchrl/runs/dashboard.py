@@ -68,6 +68,13 @@ class Dashboard:
         for key in record:
             if key.startswith(("hypothesis/", "misfit/")):
                 self._writer.add_scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
+        faults = record.get("faults", ())
+        if faults:
+            rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
+            table = "\n".join(["| time in the episode [s] | fault | detail |", "|---|---|---|", *rows])
+            self._writer.add_text("faults", table, step)
+        for key in (key for key in record if key.startswith("faults/")):
+            self._writer.add_scalar(key, record[key], step)
         for name, seconds in record["seconds"].items():
             self._writer.add_scalar(f"seconds/{name}", seconds, step)
 

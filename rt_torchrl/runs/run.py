@@ -209,6 +209,10 @@ class Run:
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
         record["closure"] = named_weights(self.algorithm.twin.closure)
+        if self.algorithm.flights.faults:
+            record["faults"] = [fault.entry() for fault in self.algorithm.flights.faults]
+            for fault in self.algorithm.flights.faults:
+                bar.write(f"episode {record['episode'] + 1}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         every = self.config.unseen_every
         if every and (len(self.episodes) + 1) % every == 0:
             self._follow_wear()

@@ -19,10 +19,9 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig
 from rt_torchrl.runs.settings import read_settings
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.referees import ROLES, Role
 from rt_torchrl.twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
-from rt_torchrl.twinning.starts.recorded_flights import pieces_of_equal_length
 
 SHORTEST = 10
 """Least number of control intervals of a part of a log."""

@@ -90,8 +90,9 @@ class ActionLimits:
         # The rate must not lead out of the range, even if the last action was outside it.
         sent = torch.minimum(torch.maximum(reached, self.low), self.high)
         held = {"range": (inside != action) | (sent != reached), "rate": reached != inside}
-        return sent, {name: _components(mask) for name, mask in held.items() if mask.any()}
+        return sent, {name: components(mask) for name, mask in held.items() if mask.any()}
 
 
-def _components(mask: Tensor) -> str:
+def components(mask: Tensor) -> str:
+    """The components of an action that a mask marks, in words."""
     return "action " + ", ".join(map(str, mask.flatten().nonzero().flatten().tolist()))

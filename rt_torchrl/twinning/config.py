@@ -27,6 +27,8 @@ class TwinningConfig:
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
+        least_sound: least share of a real episode without a fault, in a row, that is learned from; with a lower share
+            the episode is flown again.
         judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse on the twin, in the
             arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
             ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
@@ -44,6 +46,7 @@ class TwinningConfig:
     realisations: int = 5
     records: int = 1
     virtual_episodes: int = 20
+    least_sound: float = 0.5
     judged_updates: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
@@ -59,3 +62,5 @@ class TwinningConfig:
         for argument in ("realisations", "records", "virtual_episodes"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+        if not 0.0 < self.least_sound <= 1.0:
+            raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")

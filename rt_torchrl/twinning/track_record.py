@@ -131,6 +131,6 @@ def shares(policy: nn.Module, plant: Plant, record: Trajectory) -> Float[Tensor,
     at = torch.linspace(0, n - 1, min(n, LOOKED_AT), device=record.states.device).round().long()
     if isinstance(policy, StateFeedback):
         return torch.full((len(at) * len(plant.actions),), ELSEWHERE, dtype=torch.float64, device=at.device)
-    observations = plant.observe(at.double() * plant.dt, record.states[at], record.exogenous[at])
+    observations = plant.observe(record.start + at.double() * plant.dt, record.states[at], record.exogenous[at])
     low, high = bounds(plant.actions, device=at.device)
     return (2.0 * policy(observations) / (high - low)).flatten()
