@@ -70,7 +70,7 @@ def test_a_file_runs_no_code(tmp_path, legacy):
     if legacy:
         file.write_bytes(pickle.dumps({"format": Bomb(trace)}))
     else:
-        torch.save({"format": 3, "state": Bomb(trace)}, file)
+        torch.save({"format": 4, "state": Bomb(trace)}, file)
     with pytest.raises(ValueError, match="checkpoint.pt is (not loaded|damaged, or no file of a run)"):
         load_tensors(file)
     assert not trace.exists()

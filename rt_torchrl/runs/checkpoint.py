@@ -10,7 +10,7 @@ from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.runs.tensor_file import DamagedFileError, load_tensors, save_tensors
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
-FORMAT = 3
+FORMAT = 4
 NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
 """Name of an earlier checkpoint."""
 FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -103,7 +103,7 @@ class Run:
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:
-            system = simulated(plant, config, device=device, compiled=compiled) if env is None else env
+            system = simulated(plant, config, first, device=device, compiled=compiled) if env is None else env
             self._make_algorithm(system, physics, device=device, compiled=compiled)
             self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
             self.unseen.physics = physics

@@ -101,7 +101,8 @@ class FaultySystem(EnvBase):
     ):
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.injections, self._interval, self._sleep = env, tuple(injections), interval, sleep
-        self._episode, self._count, self._own_clock = -1, 0, CLOCK not in env.full_observation_spec
+        self._episode, self._own_clock = -1, CLOCK not in env.full_observation_spec
+        self._begin()
         self.action_spec, self.reward_spec = env.action_spec.clone(), env.reward_spec.clone()
         self.done_spec = env.full_done_spec.clone()
         observation = env.full_observation_spec.clone()
@@ -133,10 +134,15 @@ class FaultySystem(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
-        self._count, self._offset, self._held, self._sent = 0, 0.0, {}, None
+        self._begin()
         self._clocked(found)
         self._reading = found.clone()
         return found
+
+    def _begin(self) -> None:
+        self._count, self._offset = 0, 0.0
+        self._held: dict[Injection, Tensor] = {}
+        self._sent: Tensor | None = None
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._episode += self._count == 0

@@ -50,7 +50,7 @@ class SafetyLayer(EnvBase):
         env: environment of one real system, with batch size () or (1,).
         config: limits on actions and observations.
         fallback: action within the range, or controller that makes an action from the TensorDict of the last
-            observation.
+            observation; if it has a method ``begin``, that is called at every reset.
         clock: wall clock [s].
 
     Raises:
@@ -137,9 +137,14 @@ class SafetyLayer(EnvBase):
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
         self.watchdog.begin()
+        if hasattr(self._fallback, "begin"):
+            self._fallback.begin()
         faults = self._faults(found, 0.0)
+        if faults.pop("limit", None):
+            self.watchdog.note(0.0, True)  # the fallback begins
         if faults:
-            raise ValueError(f"the system begins with a fault, {faults}: {found}; nothing was sent to it.")
+            read = {key: found[key].flatten().tolist() for key in self._watched if key in found}
+            raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
         self._step_count, self._last, self._good = 0, self._rest, {}
         self._remember(found)
         if "applied" not in found:

@@ -19,6 +19,7 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
@@ -88,6 +89,7 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.clearance = Clearance(env, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual)
@@ -158,15 +160,19 @@ class ReinforcementTwinning:
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
         acting = self.actor.exploring(self.policies[live], self.episodes_done)
         self.learning.adopt(acting)
+        cleared = self.clearance.choose(live, self.judged)
+        if cleared.policy is not self.policies[live]:
+            acting, live = cleared.policy, cleared.role
         # Virtual episodes need the inputs of one whole real episode.
         needed = self.config.arm != "model_free" and not self.virtual.processes
         flight = self.flights.fly(acting, strength=strength, whole=needed)
         self._keep(flight)
-        explored = self.actor.strength * self.config.exploration.spread if acting is self.policies[live] else 1.0
+        explored = self.actor.strength * self.config.exploration.spread if acting is cleared.policy else 1.0
         if flight.whole:  # costs of parts cannot be compared with those of episodes
-            self.track_record.append(flight.record, live, flight.cost.item(), explored)
+            self.track_record.append(flight.record, live, flight.cost.item(), explored, cleared.policy)
             self.learning.flown(acting, flight.cost.item())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
+        report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
 
     def _keep(self, flight: Flight) -> None:
@@ -289,4 +295,4 @@ class ReinforcementTwinning:
 
 
 KEPT = ("virtual", "short_term", "track_record")  # components that leave the tensors of their state on their device
-COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
+COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", "clearance", *KEPT)

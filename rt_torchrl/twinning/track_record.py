@@ -49,9 +49,12 @@ class TrackRecord:
         self._policies = policies
         self._flown: deque[Flown] = deque(maxlen=KEPT)
 
-    def append(self, trajectory: Trajectory, role: Role, cost: float, exploration: float = 0.0) -> None:
-        """Add an episode that the policy with this role has just flown."""
-        weights = {name: weight.detach().clone() for name, weight in self._policies[role].state_dict().items()}
+    def append(
+        self, trajectory: Trajectory, role: Role, cost: float, exploration: float = 0.0, policy: nn.Module | None = None
+    ) -> None:
+        """Add an episode that the policy with this role has just flown, or an earlier one of its structure."""
+        flew = self._policies[role] if policy is None else policy
+        weights = {name: weight.detach().clone() for name, weight in flew.state_dict().items()}
         self._flown.append(Flown(trajectory, role, weights, cost, exploration))
 
     @property
