@@ -111,8 +111,10 @@ def _live(folder: Path) -> Role:
     file = folder / "metrics.json"
     try:
         live: Role = json.loads(file.read_text(encoding="utf-8"))["summary"]["live"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file} does not say which policy was live ({error!r}); take a finished run.") from error
+    if live not in ROLES:
+        raise ValueError(f"{file} says that {live!r} was live; it must be {' or '.join(ROLES)}.")
     return live
 
 

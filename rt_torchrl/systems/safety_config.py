@@ -62,6 +62,7 @@ class SafetyConfig:
         check_options(self, infinite=("low", "high", "rates", "following", "deadline", "hold", "patience"))
         if not self.interval > 0.0:
             raise ValueError(f"interval={self.interval} s must be positive: the system's control interval.")
+        self.watchdog()  # which has ranges of its own
 
     def watchdog(self) -> Watchdog:
         """The watchdog of these limits."""

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from rt_torchrl.options import require_number
+
 SHARE = 0.5
 """Share of an interval by which the system's clock may miss it, unless a tolerance is given."""
 
@@ -38,6 +40,8 @@ class SampleCheck:
         tolerance: float | None = None,
         frozen: Mapping[str, int] | None = None,
     ):
+        if tolerance is not None:
+            require_number("clock_tolerance", tolerance)
         if tolerance is not None and not 0.0 < tolerance < math.inf:
             raise ValueError(f"clock_tolerance={tolerance} s must be positive and finite.")
         for entry, count in (frozen or {}).items():

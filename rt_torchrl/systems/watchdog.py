@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from rt_torchrl.options import require_number
 from rt_torchrl.systems.sample_check import SampleCheck
 
 ROUNDING = 1e-9
@@ -41,6 +42,8 @@ class Watchdog:
         limits: Mapping[str, Range] | None = None,
         samples: SampleCheck | None = None,
     ):
+        for argument, value in (("deadline", deadline), ("hold", hold), ("patience", patience)):
+            require_number(argument, value, finite=False)
         if not deadline > 0.0:
             raise ValueError(f"deadline={deadline} s must be positive; infinity waits for ever.")
         for argument, value in (("hold", hold), ("patience", patience)):
