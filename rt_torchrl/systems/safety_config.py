@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rt_torchrl.options import check_options
-from rt_torchrl.systems.sample_check import SampleCheck
+from rt_torchrl.systems.sample_check import Count, SampleCheck
 from rt_torchrl.systems.watchdog import Range, Watchdog
 
 
@@ -29,7 +29,8 @@ class SafetyConfig:
             or is left out, and a clock that jumps, show in it.
         clock_tolerance: greatest difference between the clock's step and the interval [s]; None for half an interval.
         frozen: entries of the observation whose components always move, by name, each with the number of equal readings
-            in a row of one component that count as a frozen sensor.
+            in a row that count as a frozen sensor: one number for all components, or one for each, where 0 does not
+            watch a component.
         following: greatest difference between the action sent and the one that the system reports as ``applied``, for
             each action; beyond it an event says that the actuator does not follow. None does not compare them.
         deadline: longest wall-clock time from an action to the observation of its effect [s].
@@ -51,7 +52,7 @@ class SafetyConfig:
     limits: Mapping[str, Range] = field(default_factory=dict)
     clock: str | None = None
     clock_tolerance: float | None = None
-    frozen: Mapping[str, int] = field(default_factory=dict)
+    frozen: Mapping[str, Count] = field(default_factory=dict)
     following: tuple[float, ...] | None = None
     deadline: float = math.inf
     hold: float = 0.0

@@ -1,13 +1,14 @@
 """The check of the order of readings: does the system's clock go on, and does every sensor still move?"""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from rt_torchrl.options import require_number
+from rt_torchrl.options import array_of, require_number
 
+Count = int | Sequence[int]
 SHARE = 0.5
 """Share of an interval by which the system's clock may miss it, unless a tolerance is given."""
 
@@ -25,8 +26,8 @@ class SampleCheck:
         clock: entry that holds the system's clock [s]; None if it reports none.
         interval: control interval of the system [s].
         tolerance: greatest difference between the clock's step and the interval [s]; None for half an interval.
-        frozen: entries whose components always move, each with the number of equal readings in a row of any component
-            that count as a frozen sensor.
+        frozen: entries whose components always move, each with the number of equal readings in a row that count as a
+            frozen sensor: one number for all components, or one for each, where 0 does not watch a component.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -38,18 +39,20 @@ class SampleCheck:
         clock: str | None = None,
         interval: float = math.inf,
         tolerance: float | None = None,
-        frozen: Mapping[str, int] | None = None,
+        frozen: Mapping[str, Count] | None = None,
     ):
         if tolerance is not None:
             require_number("clock_tolerance", tolerance)
         if tolerance is not None and not 0.0 < tolerance < math.inf:
             raise ValueError(f"clock_tolerance={tolerance} s must be positive and finite.")
-        for entry, count in (frozen or {}).items():
-            if count < 2:
+        self._frozen = {entry: torch.as_tensor(array_of("frozen", count)) for entry, count in (frozen or {}).items()}
+        for entry, counts in self._frozen.items():
+            if not ((counts >= 2.0) | (counts == 0.0)).all():
                 raise ValueError(
-                    f"frozen={count} readings of {entry!r} must be at least 2: a reading and its repetition."
+                    f"frozen={counts.tolist()} readings of {entry!r} must be at least 2, a reading and its repetition; "
+                    "0 does not watch a component."
                 )
-        self._clock, self._interval, self._frozen = clock, interval, dict(frozen or {})
+        self._clock, self._interval = clock, interval
         self._tolerance = SHARE * interval if tolerance is None else tolerance
         self.begin()
 
@@ -64,8 +67,9 @@ class SampleCheck:
         found, self.stale = {}, 0
         if self._clock is not None and (said := self._clock_fault(entries.get(self._clock))):
             found["clock"] = said
-        for entry in self._frozen:
-            if entry in entries and (count := self._equal(entry, entries[entry])) >= self._frozen[entry]:
+        for entry, limit in self._frozen.items():
+            count = self._equal(entry, entries[entry], limit) if entry in entries else 0
+            if count:
                 found["frozen"] = f"{entry}, {count} equal readings"
                 self.stale = max(self.stale, count - 2)
         return found
@@ -84,9 +88,10 @@ class SampleCheck:
         self._sound, self._since = now, 0
         return None
 
-    def _equal(self, entry: str, value: Tensor) -> int:
-        """Number of equal readings in a row, with this one, of the component that has stood still for longest."""
+    def _equal(self, entry: str, value: Tensor, limit: Tensor) -> int:
+        """Number of equal readings in a row, with this one, of the frozen component that has stood still for longest."""
         last, counts = self._values.get(entry, (torch.full_like(value, torch.nan), torch.ones_like(value)))
         counts = torch.where(value == last, counts + 1, torch.ones_like(counts))
         self._values[entry] = value.clone(), counts
-        return int(counts.max())
+        limit = limit.to(counts)
+        return int(torch.where((limit > 0.0) & (counts >= limit), counts, 0.0).max())
