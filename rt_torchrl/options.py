@@ -75,7 +75,7 @@ def _check(name: str, value: Any, kind: Any, *, finite: bool) -> None:
             _check(f"{name}[{place}]", entry, each, finite=finite)
     elif kind in (int, float):
         _check_number(name, value, kind, finite=finite)
-    elif kind in PLAIN and not isinstance(value, kind):
+    elif kind in PLAIN and not isinstance(value, (str, Path) if kind is str else kind):
         raise ValueError(f"{name}={value!r} must be {PLAIN[kind]}.")
     elif dataclasses.is_dataclass(kind) and not isinstance(value, typing.cast(type, kind)):
         raise ValueError(f"{name}={value!r} must be a {typing.cast(type, kind).__name__}.")

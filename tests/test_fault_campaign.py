@@ -402,11 +402,12 @@ def machine(plant, kind):
     last = 39 if kind in OF_ACTUATORS else last
     fault = Injection(kind=kind, episode=1, first=first, last=last, value=value)
     slept = []
+    watched = (3, *[0] * (len(plant.readings) - 1))  # other components may rest
     system = FaultySystem(PlantEnv(plant, seed=0), [fault], interval=plant.dt, sleep=slept.append)
     config = SafetyConfig(
         interval=plant.dt,
         clock="time",
-        frozen={"state": (3, *[0] * (len(plant.readings) - 1))},
+        frozen={"state": watched},
         ranges={"state": (-1e8, 1e8)},
         deadline=5.0,
     )

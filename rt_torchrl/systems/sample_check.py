@@ -89,7 +89,7 @@ class SampleCheck:
         return None
 
     def _equal(self, entry: str, value: Tensor, limit: Tensor) -> int:
-        """Number of equal readings in a row, with this one, of the frozen component that has stood still for longest."""
+        """Number of equal readings in a row, with this one, of the component frozen for longest; 0 if none is."""
         last, counts = self._values.get(entry, (torch.full_like(value, torch.nan), torch.ones_like(value)))
         counts = torch.where(value == last, counts + 1, torch.ones_like(counts))
         self._values[entry] = value.clone(), counts
