@@ -13,17 +13,18 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_settings import as_written
 from rt_torchrl.runs.settings import config_of
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.operating_limits import LimitsConfig, OperatingLimits
+from rt_torchrl.systems.operating_limits import OperatingLimits
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
-LIMITS = LimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})
+LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})
 
 
 def limited(limits=LIMITS, **options):
     plant = LinearQuadratic(horizon=2.0)
-    parts = twinning(plant, limits=LimitsConfig(), **options)
+    parts = twinning(plant, limits=OperatingLimitsConfig(), **options)
     config = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
     layer = SafetyLayer(PlantEnv(plant, seed=0), config, fallback=(0.0,))
     return ReinforcementTwinning(
@@ -122,7 +123,7 @@ def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
 )
 def test_limits_that_cannot_be_are_refused(limits, message):
     with pytest.raises(ValueError, match=message):
-        OperatingLimits(LinearQuadratic(), LimitsConfig(**limits))
+        OperatingLimits(LinearQuadratic(), OperatingLimitsConfig(**limits))
 
 
 def test_limits_need_a_safety_layer():

@@ -5,7 +5,9 @@ import json
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from printed_commands import blocks
 from small_runs import SMALL
+from tensordict.nn import TensorDictModule
 from test_algorithm import twinning
 
 from rt_torchrl.runs.run import Run
@@ -183,3 +185,18 @@ def algorithm_of(run, system):
 def test_injections_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         guarded(Injection(**options))
+
+
+def test_the_example_of_the_documentation_flies():
+    """As printed; then four episodes whose actions are constant."""
+    (code,) = blocks("faults.md", "python")
+    names = {}
+    exec(code, names)
+    layer = names["layer"]
+    flown, steady = [], TensorDictModule(lambda seen: torch.ones(1, 2).double(), ["observation"], ["action"])
+    for _ in range(3):
+        flown.append(layer.rollout(layer.plant.n_steps, steady))
+    assert layer.reports[1].counts["not finite"] == 5 and flown[1]["next", "refused"].sum() == 5
+    assert {kind for _, _, kind in layer.injected} == {"nan", "stuck_actuator"}
+    with pytest.raises(ConnectionError, match="injected"):
+        layer.rollout(layer.plant.n_steps)

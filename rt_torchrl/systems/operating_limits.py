@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -10,51 +9,14 @@ from jaxtyping import Bool
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.systems.safety import SafetyLayer
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 ROUNDING = 1e-9
 """Share of a rate by which rounding may exceed it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LimitsConfig:
-    """Operating limits; a safety layer holds those of actions and rates, and its fallback acts beyond those of states.
-
-    Args:
-        states: least and greatest value of states, by name, in their units.
-        actions: least and greatest value of actions, by name, in their units.
-        rates: greatest rate of change of actions, by name [unit/s].
-        tolerated: greatest share of the control intervals of virtual episodes in which a policy may be predicted to
-            leave the limits; beyond it the policy does not act.
-
-    Raises:
-        ValueError: if a number is out of its range.
-    """
-
-    states: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    actions: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    rates: Mapping[str, float] = field(default_factory=dict)
-    tolerated: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument in ("states", "actions"):
-            for name, (low, high) in getattr(self, argument).items():
-                if not low < high:
-                    raise ValueError(f"limits.{argument} {name}={low} to {high} must have its least value first.")
-        for name, rate in self.rates.items():
-            if not rate > 0.0:
-                raise ValueError(f"limits.rates {name}={rate} must be positive.")
-        if not 0.0 <= self.tolerated <= 1.0:
-            raise ValueError(f"limits.tolerated={self.tolerated} must lie in [0, 1], a share of control intervals.")
-
-    def __bool__(self) -> bool:
-        """Whether there is any limit."""
-        return bool(self.states or self.actions or self.rates)
 
 
 class OperatingLimits:
@@ -68,7 +30,7 @@ class OperatingLimits:
         ValueError: if the plant has no such state or action, or the limits leave no action of its range.
     """
 
-    def __init__(self, plant: Plant, config: LimitsConfig):
+    def __init__(self, plant: Plant, config: OperatingLimitsConfig):
         self.config, self._dt, self._read = config, plant.dt, len(plant.readings)
         self.states = _ends("states", plant.readings, config.states)
         self.actions = _ends("actions", plant.actions, config.actions)

@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.operating_limits import LimitsConfig, OperatingLimits, require_layer
+from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.findings import findings
@@ -42,7 +43,7 @@ class Clearance:
     """
 
     def __init__(
-        self, env: EnvBase, policies: Mapping[Role, nn.Module], virtual: VirtualEpisodes, config: LimitsConfig
+        self, env: EnvBase, policies: Mapping[Role, nn.Module], virtual: VirtualEpisodes, config: OperatingLimitsConfig
     ):
         if config:
             require_layer(env)

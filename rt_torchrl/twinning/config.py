@@ -5,7 +5,7 @@ from typing import Literal
 
 from rt_torchrl.options import check_options
 from rt_torchrl.systems.exploration import ExplorationConfig
-from rt_torchrl.systems.operating_limits import LimitsConfig
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
@@ -50,7 +50,7 @@ class TwinningConfig:
     records: int = 1
     virtual_episodes: int = 20
     least_sound: float = 0.5
-    limits: LimitsConfig = field(default_factory=LimitsConfig)
+    limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     judged_updates: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
