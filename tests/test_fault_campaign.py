@@ -412,7 +412,7 @@ def machine(plant, kind):
         deadline=5.0,
     )
     middle = tuple(0.5 * (action.low + action.high) for action in plant.actions)
-    return SafetyLayer(system, config, fallback=middle, clock=lambda: sum(slept))
+    return SafetyLayer(system, config, fallback=middle, clock=lambda: float(sum(slept)))
 
 
 def require_faults_survived(name, kind):

@@ -182,6 +182,7 @@ def algorithm_of(run, system):
         ({"kind": "slow_actuator", "value": 1.0}, "share of the way"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_injections_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         guarded(Injection(**options))

@@ -29,12 +29,14 @@ def require_words_or_soundness(name, folder, examples):
         tried()
 
 
+@pytest.mark.usefixtures("unchecked")  # what stands for an algorithm is none
 @pytest.mark.parametrize("name", READERS)
 def test_a_damaged_file_is_refused_or_sound(name, tmp_path):
     require_words_or_soundness(name, tmp_path, FEW)
 
 
 @pytest.mark.faults
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", READERS)
 def test_many_damaged_files_are_refused_or_sound(name, tmp_path):
     require_words_or_soundness(name, tmp_path, MANY)

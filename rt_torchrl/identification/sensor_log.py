@@ -255,8 +255,8 @@ def _read(path: Path) -> Any:
         if path.suffix == ".parquet":
             _require_entries(path)
         return readers[path.suffix](path)
-    except (OSError, ValueError, OverflowError, MemoryError) as error:
-        raise ValueError(f"log {path} cannot be read: {error}") from error
+    except Exception as error:  # the readers of tables raise errors of many kinds at what is wrong in a file
+        raise ValueError(f"log {path} cannot be read: {type(error).__name__}: {error}") from error
 
 
 def _require_entries(path: Path) -> None:

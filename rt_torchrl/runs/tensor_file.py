@@ -4,7 +4,6 @@ import hashlib
 import io
 import pickle
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -49,7 +48,7 @@ def load_tensors(path: Path) -> dict[str, Any]:
     try:
         sound = _verified(path.read_bytes())
     # The kind of error depends on the byte that is wrong, and all of them come from reading the file.
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError, zlib.error) as error:
+    except Exception as error:
         raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
     try:
         content = torch.load(sound, weights_only=True, map_location="cpu")
@@ -58,7 +57,7 @@ def load_tensors(path: Path) -> dict[str, Any]:
             f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
             f"in plain containers. {first_line(error)}"
         ) from error
-    except (RuntimeError, EOFError, KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
+    except Exception as error:  # of as many kinds
         raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
     if not isinstance(content, dict):
         raise DamagedFileError(f"{path} is no file of a run: it holds a {type(content).__name__}.")

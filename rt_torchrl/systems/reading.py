@@ -125,7 +125,8 @@ def require_numbers(what: str, **values: float | Sequence[float]) -> None:
     """
     for argument, value in values.items():
         found = array_of(argument, value)
-        if not (found.size and np.isfinite(found).all()):
+        # A plant may have no inputs, but a reading has numbers.
+        if not np.isfinite(found).all() or (found.size == 0 and argument != "exogenous"):
             raise ValueError(f"{argument}={value} of the {what} must be finite: a number, or one for each signal.")
 
 
