@@ -137,10 +137,11 @@ def test_a_frozen_sensor_is_known_for_wrong_from_its_first_repetition():
     assert found.flights.faults[0].interval == 11 and found.short_term[-1].start == pytest.approx(14 * DT)
 
 
-def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path):
+@pytest.mark.parametrize("figures", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_real_fault_is_in_the_record_and_on_the_dashboard(tmp_path, figures):
     plant = LinearQuadratic(horizon=DT * N)
     config = RunConfig(
-        episodes=3, log_dir=tmp_path, compiled=False, unseen=2, untrained=0, figures=True, twinning=SMALL
+        episodes=3, log_dir=tmp_path, compiled=False, unseen=2, untrained=0, figures=figures, twinning=SMALL
     )
     run = Run(config, plant)
     run.algorithm.env = None
@@ -188,6 +189,7 @@ def test_injections_that_cannot_be_are_refused(options, message):
         guarded(Injection(**options))
 
 
+@pytest.mark.slow
 def test_the_example_of_the_documentation_flies():
     """As printed; then four episodes whose actions are constant."""
     (code,) = blocks("faults.md", "python")

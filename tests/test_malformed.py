@@ -9,7 +9,7 @@ from malformed_files import GOOD, READERS, damaged, outcome
 from malformed_options import cases
 from malformed_options import outcome as option_outcome
 
-FEW, MANY = 12, 150
+FEW, MANY = 5, 150
 SHARED = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
 
