@@ -18,6 +18,7 @@ from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.identification.sensor_log import SensorLog, logged_states
 from rt_torchrl.identification.simulated_log import ClassicalLaw, Law, policy_law, recorded
 from rt_torchrl.runs.shipped_plants import plant_class
+from rt_torchrl.runs.tensor_file import load_tensors
 
 CONTROLLERS: dict[str, type[ClassicalController]] = {
     "wind_turbine": JonkmanController,
@@ -98,7 +99,10 @@ def law_of(config: Config, plant: Plant, generator: torch.Generator) -> Law:
         return ClassicalLaw(CONTROLLERS[config.plant](plant))
     policy = plant.make_policy(generator)
     if config.weights:
-        policy.load_state_dict(torch.load(config.weights, weights_only=True)[config.role])
+        try:
+            policy.load_state_dict(load_tensors(config.weights)[config.role])
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(f"weights of {config.role!r} in {config.weights} do not fit: {error}") from error
     return policy_law(plant, policy)
 
 

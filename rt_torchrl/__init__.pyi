@@ -17,6 +17,9 @@ from .baselines.classical import ClassicalController
 from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
 from .systems.environment import PlantEnv
 from .systems.exploration import ExplorationConfig
+from .systems.faulty_system import FaultySystem, Injection
+from .systems.operating_limits import OperatingLimits
+from .systems.operating_limits_config import OperatingLimitsConfig
 from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyLayer
@@ -106,6 +109,7 @@ __all__ = [
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "FaultySystem",
     "FirstController",
     "Forecast",
     "Foreseen",
@@ -115,6 +119,7 @@ __all__ = [
     "IdentificationConfig",
     "IncrementalTD3",
     "IncrementalTD3Config",
+    "Injection",
     "Learner",
     "LearnerConfig",
     "LimitConfig",
@@ -122,6 +127,8 @@ __all__ = [
     "LogConfig",
     "LongTermMemoryConfig",
     "Measurement",
+    "OperatingLimits",
+    "OperatingLimitsConfig",
     "Planner",
     "PlannerConfig",
     "Plant",

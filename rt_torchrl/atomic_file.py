@@ -1,6 +1,7 @@
 """A file that is written whole or not at all."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -24,6 +25,7 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
+        _flush_folder(path.parent)
     except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -31,6 +33,20 @@ def write_atomically(path: Path, content: bytes) -> None:
             reason = error.strerror or str(error)
             raise OSError(error.errno, f"{reason}; what was there before is intact, make room", str(path)) from error
         raise
+
+
+def _flush_folder(folder: Path) -> None:
+    """Put the names in a folder on the disk, so that a power cut does not bring an old name back."""
+    if os.name == "nt":  # folders cannot be opened there
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that flush no folder
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def remove_partials(folder: Path) -> None:

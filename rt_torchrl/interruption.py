@@ -1,23 +1,31 @@
-"""Ctrl-C takes effect between two iterations, so that no iteration is left half done."""
+"""Ctrl-C and SIGTERM take effect between two iterations, so that no iteration is left half done."""
 
+import contextlib
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from types import FrameType
 
-NOTICE = b"\ninterrupted: the training stops after the iteration under way (Ctrl-C again to leave at once)\n"
+NOTICE = b"\ninterrupted: the training stops after the iteration under way (once more to leave at once)\n"
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a training: that of Ctrl-C, and that by which service managers and batch systems stop a process."""
+UNTOUCHED = (signal.default_int_handler, signal.SIG_DFL)
+"""Handlers of a signal for which nobody has installed one."""
 
 
 class Interruption:
-    """A context in which Ctrl-C takes effect at the next :func:`safe_point`, and a second Ctrl-C at once.
+    """A context in which Ctrl-C or SIGTERM takes effect at the next :func:`safe_point`, and a second one at once.
 
     A KeyboardInterrupt at any other place can hit torch or TorchRL while they have swapped weights, switched gradients
     off or hold a lock. They then fail in other ways, or remain in that state.
 
-    Note: only the main thread receives Ctrl-C, and a handler of SIGINT that the user has installed stays in charge.
-    The context does nothing in another thread or beside such a handler.
+    Note: only the main thread receives signals, and a handler that the user has installed stays in charge of its
+    signal. The context does nothing in another thread.
 
-    The attribute ``at_once`` tells whether there was a second Ctrl-C.
+    The attribute ``at_once`` tells whether there was a second signal.
     """
 
     _asked = False
@@ -25,15 +33,17 @@ class Interruption:
     def __enter__(self) -> "Interruption":
         Interruption._asked = self.at_once = False
         main = threading.current_thread() is threading.main_thread()
-        self._installed = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        if self._installed:
-            signal.signal(signal.SIGINT, self._handle)
+        self._before = {number: signal.getsignal(number) for number in SIGNALS if main}
+        for number, handler in self._before.items():
+            if handler in UNTOUCHED:
+                signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *error: object) -> None:
         Interruption._asked = False
-        if self._installed:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in self._before.items():
+            if handler in UNTOUCHED:
+                signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if Interruption._asked:
@@ -44,11 +54,25 @@ class Interruption:
         os.write(2, NOTICE)
 
 
+@contextlib.contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """A context in which SIGTERM raises KeyboardInterrupt, as Ctrl-C does; a handler that is there already stays."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 def safe_point() -> None:
-    """Stop here if Ctrl-C was pressed; long computations call this function between two iterations.
+    """Stop here if an end was asked for; long computations call this function between two iterations.
 
     Raises:
-        KeyboardInterrupt: if Ctrl-C was pressed since the :class:`Interruption` was entered.
+        KeyboardInterrupt: if Ctrl-C or SIGTERM came since the :class:`Interruption` was entered.
     """
     if Interruption._asked:
         raise KeyboardInterrupt

@@ -7,15 +7,19 @@ import types
 import typing
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 
 def check_options(config: object, *, infinite: Sequence[str] = ()) -> None:
     """Refuse options whose values do not fit the types that their configuration declares.
 
     A dataclass does not check its types itself. This function checks every field that is declared as a ``Literal``, a
-    number, or an optional or a tuple of these. It leaves other fields alone. A configuration calls it first in its
-    ``__post_init__``, before the checks of its own ranges, which a nan would pass.
+    number, a truth value, a text, a path or another configuration, or an optional or a tuple of these. It leaves other
+    fields alone. A configuration calls it first in its ``__post_init__``, before the checks of its own ranges, which a
+    nan would pass.
 
     Args:
         config: an instance of a dataclass.
@@ -62,18 +66,74 @@ def _check(name: str, value: Any, kind: Any, *, finite: bool) -> None:
             raise ValueError(f"{name}={value!r} does not exist; choose {_listed(arguments)}.")
     elif origin in (typing.Union, types.UnionType):
         others = [argument for argument in arguments if argument is not type(None)]
-        if len(others) == 1 and value is not None:
+        if len(others) == 1 and (value is not None or len(others) == len(arguments)):
             _check(name, value, others[0], finite=finite)
-    elif origin in (tuple, Sequence) and isinstance(value, (tuple, list)):
+    elif origin in (tuple, Sequence):
+        _check_length(name, value, arguments if origin is tuple else (*arguments, Ellipsis))
         kinds = arguments if origin is tuple and arguments[-1] is not Ellipsis else arguments[:1] * len(value)
         for place, (entry, each) in enumerate(zip(value, kinds, strict=False)):
             _check(f"{name}[{place}]", entry, each, finite=finite)
-    elif kind is int and not _is(value, numbers.Integral):
+    elif kind in (int, float):
+        _check_number(name, value, kind, finite=finite)
+    elif kind in PLAIN and not isinstance(value, (str, Path) if kind is str else kind):
+        raise ValueError(f"{name}={value!r} must be {PLAIN[kind]}.")
+    elif dataclasses.is_dataclass(kind) and not isinstance(value, typing.cast(type, kind)):
+        raise ValueError(f"{name}={value!r} must be a {typing.cast(type, kind).__name__}.")
+
+
+def _check_number(name: str, value: Any, kind: type, *, finite: bool) -> None:
+    if kind is int and not _is(value, numbers.Integral):
         raise ValueError(f"{name}={value!r} must be a whole number.")
-    elif kind is float and not _is(value, numbers.Real):
+    if kind is float and not _is(value, numbers.Real):
         raise ValueError(f"{name}={value!r} must be a number.")
-    elif kind is float and (math.isnan(value) or (finite and math.isinf(value))):
+    if kind is float and (math.isnan(value) or (finite and math.isinf(value))):
         raise ValueError(f"{name}={value} must be {'a finite number' if finite else 'a number or infinite'}.")
+
+
+PLAIN = {bool: "True or False", str: "a text", Path: "a path"}
+"""Kinds of values that have no range, with the words for them in errors."""
+
+
+def _check_length(name: str, value: Any, arguments: tuple[Any, ...]) -> None:
+    """Refuse what is no tuple, or has another number of entries than its declaration."""
+    if not isinstance(value, (tuple, list)):
+        raise ValueError(f"{name}={value!r} must be a tuple.")
+    if arguments[-1:] != (Ellipsis,) and len(value) != len(arguments):
+        raise ValueError(f"{name}={value!r} must have {len(arguments)} entries.")
+
+
+def require_number(name: str, value: Any, *, whole: bool = False, finite: bool = True) -> None:
+    """Refuse a value that is no number, as :func:`check_options` does for an option.
+
+    Args:
+        name: name of the argument, for the message.
+        value: value of the argument.
+        whole: whether the number must be a whole one.
+        finite: whether it must be finite; NaN is never a number.
+
+    Raises:
+        ValueError: if the value is something else.
+    """
+    _check(name, value, int if whole else float, finite=finite)
+
+
+def array_of(name: str, values: Any) -> np.ndarray:
+    """The values as an array in double precision.
+
+    Args:
+        name: name of the argument, for the message.
+        values: numbers in an array or in nested sequences.
+
+    Raises:
+        ValueError: if they are no numbers, or the rows differ in length.
+    """
+    try:
+        found = np.asarray(values)
+        if found.dtype.kind not in "fiu" and found.size:
+            raise ValueError(f"its entries are of type {found.dtype}")
+        return found.astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name} must be an array of numbers: {error}.") from error
 
 
 def _is(value: Any, kind: type) -> bool:

@@ -76,7 +76,7 @@ def test_a_checkpoint_without_a_part_does_not_fit(folder, tmp_path, part):
 
 def test_a_checkpoint_of_another_format_is_refused(folder, tmp_path):
     save_tensors(tmp_path / "checkpoint.pt", load_tensors(folder / "checkpoint.pt") | {"format": 2})
-    with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 3"):
+    with pytest.raises(ValueError, match="checkpoint.pt has checkpoint format 2; this version reads format 4"):
         checkpoint.load(tmp_path / "checkpoint.pt", small_run(tmp_path / "run", **QUICK).algorithm)
 
 

@@ -187,15 +187,15 @@ def test_weights_are_recalled_that_are_expected_to_cost_less():
 def test_a_training_goes_back_to_what_was_better_in_reality(rule):
     """The twin's plans cost ten times as much on the real system, which the referee's evidence shows."""
     found = twinning(arm="model_based", referee=RefereeConfig(rule=rule))
-    fly, costs = found._flown, []
+    fly, costs = found.flights.fly, []
 
-    def flown(policy, *, strength):
-        flight = fly(policy, strength=strength)
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
         rewards = flight.transitions["next", "reward"]
         flight.transitions["next", "reward"] = rewards * (1.0 if not costs else 10.0)
         costs.append(flight.cost)
         return flight
 
-    found._flown = flown
+    found.flights.fly = flown
     recalled = [found.episode()["recalled"].item() for _ in range(3)]
     assert any(recalled) == (rule == "weight_of_evidence")

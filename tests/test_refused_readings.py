@@ -115,9 +115,12 @@ class Silent(PlantEnv):
         return found.exclude("observation") if self._step_count >= 3 else found
 
 
-def test_an_observation_that_is_left_out_is_refused_by_the_layer():
-    with pytest.raises(ValueError, match=r"does not report \['observation'\] at the end of interval 2"):
-        fly(layer(Silent(LinearQuadratic(horizon=HORIZON))), [0.5] * 20)
+def test_an_observation_that_is_left_out_is_a_fault_and_the_last_one_is_held():
+    env = layer(Silent(LinearQuadratic(horizon=HORIZON)))
+    episode = fly(env, [0.5] * 20)
+    assert episode["next", "refused"].flatten().nonzero().flatten().tolist() == list(range(2, 20))
+    assert (episode["next", "observation"][0, 2:] == episode["next", "observation"][0, 1]).all()
+    assert env.report.counts["missing"] == 18 and "observation" in env.report.events[0].reasons["missing"]
 
 
 def test_a_critic_that_has_diverged_is_told_before_a_memory_takes_its_errors():

@@ -70,7 +70,7 @@ def test_a_file_runs_no_code(tmp_path, legacy):
     if legacy:
         file.write_bytes(pickle.dumps({"format": Bomb(trace)}))
     else:
-        torch.save({"format": 3, "state": Bomb(trace)}, file)
+        torch.save({"format": 4, "state": Bomb(trace)}, file)
     with pytest.raises(ValueError, match="checkpoint.pt is (not loaded|damaged, or no file of a run)"):
         load_tensors(file)
     assert not trace.exists()
@@ -102,6 +102,22 @@ def test_a_changed_bit_is_noticed_or_without_effect(tmp_path):
             noticed += 1
     # Half of the file is the one large tensor, whose bits all count.
     assert noticed > 500
+
+
+def test_torch_reads_no_field_that_python_does_not_check(tmp_path):
+    """The flag that makes a part a folder: torch gives memory of its size that nobody has written."""
+    file = tmp_path / "weights.pt"
+    save_tensors(file, CONTENT)
+    whole = file.read_bytes()
+    flag = whole.index(b"PK\x01\x02") + 38  # external attributes of the first part
+    changed = whole[:flag] + b"\x10" + whole[flag + 1 :]
+    file.write_bytes(changed)
+    with pytest.raises(ValueError, match=r"weights\.pt is damaged.*does not have the checksum"):
+        load_tensors(file)
+    # A file of an earlier version has no checksum of the whole.
+    length = whole.rindex(b"sha256:") - 2
+    file.write_bytes(changed[:length] + b"\0\0")
+    assert same(load_tensors(file), CONTENT)
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00" * 100, b"PK\x03\x04", b"{}", os.urandom(5000)])

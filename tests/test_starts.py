@@ -19,12 +19,12 @@ from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.cloning import clones
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.starts.recorded_flights import pieces_of_equal_length, transitions_of
+from rt_torchrl.twinning.starts.recorded_flights import transitions_of
 
 GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(

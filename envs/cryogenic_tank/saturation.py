@@ -4,6 +4,7 @@ import math
 import os
 import tempfile
 import zipfile
+import zlib
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -138,7 +139,7 @@ def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]
     try:
         with np.load(path, allow_pickle=False) as file:
             table, limits = file["table"], file["range"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
         return None
     shape = (CELLS, DEGREE + 1, len(Properties._fields))
     whole = table.shape == shape and table.dtype == np.float64 and np.isfinite(table).all()

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rt_torchrl.envs.wind_turbine.power_coefficient import csv_rows
+from rt_torchrl.options import array_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,7 +36,7 @@ class Polar:
     def __post_init__(self) -> None:
         from scipy.interpolate import PchipInterpolator  # here, because it takes a second to load
 
-        columns = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("alpha", "cl", "cd")}
+        columns = {name: array_of(f"{name} of a polar", getattr(self, name)) for name in ("alpha", "cl", "cd")}
         shapes = {name: column.shape for name, column in columns.items()}
         if len(set(shapes.values())) > 1 or columns["alpha"].ndim != 1 or columns["alpha"].size < 2:
             raise ValueError(

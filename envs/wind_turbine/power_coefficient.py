@@ -9,9 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.bounded_file import require_bounded
+from rt_torchrl.options import array_of
+
 Axis = Sequence[float] | np.ndarray
 Rows = Sequence[Sequence[float]] | np.ndarray
 DATA = Path(__file__).parent / "data"
+GREATEST_BYTES = 2**24
+"""Greatest size of a table [bytes]."""
 STALL_KNOT = 0.5
 """Knot between the two pieces of the stall element, as a fraction of the table's least λ."""
 STALL_SHARE = 0.2
@@ -163,10 +168,14 @@ def csv_rows(path: str | Path) -> list[list[str]]:
     """The rows of a comma-separated file from the header on, without blank lines and ``#`` comments.
 
     Raises:
-        ValueError: if there is no row below the header.
+        ValueError: if the file cannot be read as such a text, or there is no row below the header.
     """
-    with Path(path).open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
+    require_bounded(path, GREATEST_BYTES)
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
+    except (csv.Error, UnicodeError) as error:
+        raise ValueError(f"path={str(path)!r} is no comma-separated text: {error}") from error
     if len(rows) < 2:
         raise ValueError(
             f"path={str(path)!r} holds {len(rows)} rows; it needs a header and at least one row of numbers."
@@ -222,7 +231,7 @@ def _neighbours(axis: Float[Tensor, " n"], at: Float[Tensor, ""]) -> Float[Tenso
 
 
 def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:
-    array = np.asarray(axis, dtype=np.float64)
+    array = array_of(name, axis)
     if array.ndim != 1 or len(array) < 4:
         raise ValueError(
             f"{name} has shape {array.shape}; a cubic spline needs one dimension with at least 4 entries. Add points."
@@ -240,7 +249,7 @@ def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:
 
 
 def _checked_values(values: Rows, n_lam: int, n_beta: int) -> Float[np.ndarray, "n_lam n_beta"]:
-    array = np.asarray(values, dtype=np.float64)
+    array = array_of("values", values)
     if array.shape != (n_lam, n_beta):
         hint = "; transpose it" if array.shape == (n_beta, n_lam) else ""
         raise ValueError(

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rt_torchrl.options import array_of
+
 PRINTED_TIME_RESOLUTION = 1e-3
 """Resolution of the times in a ``.hh`` file [s]; TurbSim prints them as F8.3."""
 GREATEST_SPEED = 200.0
@@ -30,7 +32,7 @@ class WindRecord:
 
     def __post_init__(self) -> None:
         for field in ("time", "speed"):
-            array = np.array(getattr(self, field), dtype=np.float64)
+            array = array_of(f"{self.source}: {field}", getattr(self, field))
             array.setflags(write=False)
             object.__setattr__(self, field, array)
         self._check_shapes()

@@ -33,7 +33,8 @@ def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elem
         record: the real episode.
     """
     probe = Probe(plant.closure)
-    t = plant.dt * torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
+    clock = torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
+    t = record.start + plant.dt * clock
     plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, probe)
     return probe.features
 

@@ -20,6 +20,7 @@ from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, H
 from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import Rollout
@@ -41,6 +42,9 @@ class LimitConfig:
         hold: number of control intervals for which a command of the optimum is held.
         window: parameters of model predictive control; None where gradients find no plans.
         descent: parameters of the descents.
+
+    Raises:
+        ValueError: if an option does not fit its type, or ``hold`` is not positive.
     """
 
     starts: Mapping[str, type[ClassicalController]]
@@ -50,6 +54,11 @@ class LimitConfig:
     descent: BoundedDescentConfig = field(
         default_factory=lambda: BoundedDescentConfig(iterations=3000, tolerance=1e-13)
     )
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.hold < 1:
+            raise ValueError(f"hold={self.hold} control intervals of a command must be at least 1.")
 
 
 @dataclass(frozen=True, kw_only=True)

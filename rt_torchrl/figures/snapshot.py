@@ -26,10 +26,11 @@ class Snapshot:
         initial_closure: the closure that the training started from.
         policies: both policies, by role.
         live: role of the live policy.
-        record: the last real episode.
+        record: the last real episode, or its longest sound part.
         replay: states of the twin with the record's actions and exogenous input.
-        large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin.
-        realisations: samples of the exogenous process of the record; None if the arm trains no twin.
+        large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin, or the record
+            is a part of an episode.
+        realisations: samples of the exogenous process of the record; None as ``large_scale``.
         episodes: entries of the episodes, as in ``metrics.json``.
     """
 
@@ -52,8 +53,10 @@ class Snapshot:
     ) -> "Snapshot":
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
-        replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None])
-        process = algorithm.virtual.processes[-1] if algorithm.virtual.processes else None
+        replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None], start=record.start)
+        # An episode of which only a part is sound has no process.
+        fitted = algorithm.virtual.processes and algorithm.short_term.whole(twin.plant.n_steps, latest=1)
+        process = algorithm.virtual.processes[-1] if fitted else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(
             plant=twin.plant,

@@ -1,7 +1,7 @@
 """Recorded logs of a real system's sensors and actuators, in CSV or Parquet files."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.identification.units import converted
-from rt_torchrl.options import check_options
+from rt_torchrl.options import array_of, check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
 TIME = "time"
 READERS = (".csv", ".parquet")
+MOST_ENTRIES = 500_000_000
+"""Greatest number of entries of a log, which take 4 GB."""
 """Ends of the names of files that are read."""
 NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
 COLUMN = re.compile(
@@ -47,6 +50,7 @@ class Column:
     unit: str | None = None
 
     def __post_init__(self) -> None:
+        check_options(self)
         if self.unit is not None and (self.factor, self.offset) != (1.0, 0.0):
             raise ValueError(
                 f"column {self.header!r} has unit={self.unit!r}, and factor={self.factor} and offset={self.offset} "
@@ -96,6 +100,8 @@ class LogConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
+        if self.gap is not None and not self.gap > 0.0:
+            raise ValueError(f"gap={self.gap} s must be positive: the longest time between two rows that is bridged.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,11 +123,15 @@ class SensorLog:
     columns: dict[str, Float[np.ndarray, " rows"]]
 
     def __post_init__(self) -> None:
-        t = self.times
+        t = array_of("times", self.times)
+        if t.ndim != 1:
+            raise ValueError(f"times has shape {t.shape}; a log has one time in each row.")
+        if not isinstance(self.columns, Mapping):
+            raise ValueError(f"columns={self.columns!r} must map each signal to its values.")
         if len(t) < 2 or not np.isfinite(t).all():
             raise ValueError(
-                f"log has {len(t)} rows, {int((~np.isfinite(t)).sum())} of them without a time; it needs at least 2, "
-                "all with a finite time."
+                f"times of the log: {len(t)} rows, {int((~np.isfinite(t)).sum())} of them without a time; it needs at "
+                "least 2, all with a finite time."
             )
         wrong = np.flatnonzero(np.diff(t) <= 0.0)
         if wrong.size:
@@ -129,10 +139,10 @@ class SensorLog:
             kind = "the same time as the one before" if t[k] == t[k - 1] else "an earlier time than the one before"
             raise ValueError(
                 f"row {k} of the log (counted from 0) has {kind}: {t[k]:.12g} s after {t[k - 1]:.12g} s; {wrong.size} "
-                "rows in all. Sort the log and keep one row of each instant."
+                "such times in all. Sort the log and keep one row of each instant."
             )
         for name, values in self.columns.items():
-            if values.shape != t.shape:
+            if array_of(f"column {name!r}", values).shape != t.shape:
                 raise ValueError(f"column {name!r} has shape {values.shape}; the log has {len(t)} rows.")
 
     def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":
@@ -241,9 +251,22 @@ def _read(path: Path) -> Any:
     if path.suffix not in readers:
         raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
     try:
+        require_bounded(path)
+        if path.suffix == ".parquet":
+            _require_entries(path)
         return readers[path.suffix](path)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"log {path} cannot be read: {error}") from error
+    except Exception as error:  # the readers of tables raise errors of many kinds at what is wrong in a file
+        raise ValueError(f"log {path} cannot be read: {type(error).__name__}: {error}") from error
+
+
+def _require_entries(path: Path) -> None:
+    """Refuse a Parquet file that would become far larger in memory, because its columns are compressed."""
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        rows, columns = file.metadata.num_rows, file.metadata.num_columns
+    if rows * columns > MOST_ENTRIES:
+        raise ValueError(f"it has {rows} rows of {columns} columns, more than {MOST_ENTRIES} entries")
 
 
 def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndarray, " rows"]:

@@ -2,6 +2,8 @@
 
 import math
 
+from rt_torchrl.options import require_number
+
 MOST_STEPS = 10_000_000
 """Control intervals of the longest episode; a hundred numbers for each interval take 8 GB."""
 
@@ -19,6 +21,7 @@ def whole_steps(plant: str, dt: float, horizon: float) -> int:
             intervals.
     """
     for argument, value in (("dt", dt), ("horizon", horizon)):
+        require_number(argument, value, finite=False)
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{argument}={value} s of plant {plant!r} must be positive and finite.")
     if not horizon / dt <= MOST_STEPS:

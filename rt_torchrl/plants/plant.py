@@ -80,8 +80,8 @@ class Plant(nn.Module, ABC):
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
-        self.dt = float(dt)
         self.n_steps = whole_steps(self.name, dt, horizon)
+        self.dt = float(dt)
         self.closure = closure
         self.observed = self.chosen(observe)
         self.previews = tuple(m.read for m in self.observed if isinstance(m.read, Preview))

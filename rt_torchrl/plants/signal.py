@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.options import require_number
+
 Values = TypeVar("Values", Tensor, np.ndarray)
 
 
@@ -40,6 +42,8 @@ class Signal:
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"Signal name={self.name!r} must be an identifier such as 'rotor_speed'; rename it.")
+        for end in ("low", "high"):
+            require_number(end, getattr(self, end), finite=False)
         if not self.low < self.high:
             raise ValueError(
                 f"Signal {self.name!r} has low={self.low}, high={self.high} [{self.unit}]; low must be below high."

@@ -33,6 +33,7 @@ TAGS = {
     "diverged_solves": "predictive control/solves whose model diverged",
     "paired_difference": "twin/log of the real cost over the twin's, same policy and inputs",
     "alarm": "twin/alarm: the twin is wrong where it matters",
+    "predicted_violations": "violations/predicted share of intervals (twin, the policy that acts)",
     "weight_change": "switch/relative weight change of the idle policy",
     "distillation_error": "switch/RMS action error of a distilled clone, share of range",
     "distillation_cost_ratio": "switch/J_a of a distilled clone over that of the live policy (twin)",
@@ -66,6 +67,13 @@ class Dashboard:
         for key in record:
             if key.startswith(("hypothesis/", "misfit/")):
                 self._writer.add_scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
+        faults = record.get("faults", ())
+        if faults:
+            rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
+            table = "\n".join(["| time in the episode [s] | fault | detail |", "|---|---|---|", *rows])
+            self._writer.add_text("faults", table, step)
+        for key in (key for key in record if key.startswith(("faults/", "violations/"))):
+            self._writer.add_scalar(key, record[key], step)
         for name, seconds in record["seconds"].items():
             self._writer.add_scalar(f"seconds/{name}", seconds, step)
 

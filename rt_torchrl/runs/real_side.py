@@ -1,20 +1,69 @@
 """The real side of a run: the system in simulation, the episodes that judge on it, and what does not go with it."""
 
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
 
+from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 
 
-def simulated(plant: Plant, config: RunConfig, *, device: torch.device, compiled: bool) -> PlantEnv:
-    """The real system in simulation, with the sensors and the wear of the configuration."""
+class Resting:
+    """The fallback of a safety layer where nothing else is known: the action nearest to zero within the limits.
+
+    Args:
+        controller: controller that the real system has had so far, which acts instead; None if there is none.
+        rest: that action.
+    """
+
+    def __init__(self, controller: ActingController | None, rest: Tensor):
+        self.controller, self.rest = controller, rest
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        if self.controller is not None:
+            self.controller.begin()
+
+    def __call__(self, reported: TensorDictBase) -> Tensor:
+        if self.controller is None:
+            return self.rest
+        return self.controller.act(0.0, reported["state"], reported["exogenous"])
+
+
+def simulated(
+    plant: Plant,
+    config: RunConfig,
+    first: type[ClassicalController] | None,
+    *,
+    device: torch.device,
+    compiled: bool,
+) -> EnvBase:
+    """The real system in simulation, with the sensors and the wear of the configuration.
+
+    With limits it is behind a safety layer, whose fallback is the controller that the real system has had so far, or
+    rest.
+    """
     wear = config.wear(plant)
-    return PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, noise=config.noise, wear=wear)
+    env = PlantEnv(plant, seed=config.seed, device=device, compiled=compiled, noise=config.noise, wear=wear)
+    if not config.twinning.limits:
+        return env
+    limits = OperatingLimits(plant, config.twinning.limits)
+    controller = None if first is None else ActingController(first(plant, compiled=compiled).to(device))
+    zero = env.action_spec.zero()
+    low, high = (zero.new_tensor(end) for end in limits.actions)
+    rest = torch.minimum(torch.maximum(zero, low), high).clamp(env.action_spec.space.low, env.action_spec.space.high)
+    config_of_layer = SafetyConfig(interval=plant.dt, **limits.safety())
+    return SafetyLayer(env, config_of_layer, fallback=Resting(controller, rest))
 
 
 def judged_on(

@@ -1,6 +1,7 @@
 """A run, which a recipe's main makes: the algorithm with its progress, dashboard, checkpoints and results."""
 
 import copy
+import errno
 import functools
 import time
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.interruption import Interruption, safe_point
+from rt_torchrl.interruption import Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, reference, results
@@ -102,7 +103,7 @@ class Run:
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:
-            system = simulated(plant, config, device=device, compiled=compiled) if env is None else env
+            system = simulated(plant, config, first, device=device, compiled=compiled) if env is None else env
             self._make_algorithm(system, physics, device=device, compiled=compiled)
             self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
             self.unseen.physics = physics
@@ -138,23 +139,26 @@ class Run:
     def train(self) -> dict[str, Any]:
         """Train, evaluate and write the results.
 
-        Ctrl-C ends the training after the present iteration; the evaluation then takes the episodes done so far. A
-        second Ctrl-C, or one after the training, ends the run at once; the run can then be resumed.
+        Ctrl-C or SIGTERM ends the training after the present iteration; the evaluation then takes the episodes done so
+        far. A second one, or one after the training, ends the run at once; the run can then be resumed.
 
         Returns:
             Content of ``metrics.json``.
 
         Raises:
-            KeyboardInterrupt: if Ctrl-C ended the run at once.
+            KeyboardInterrupt: if Ctrl-C or SIGTERM ended the run at once.
+            OSError: if a file cannot be written, such as on a full disk; what was done before is saved.
             ValueError: if another training has taken the folder since an earlier call of this method.
         """
         self._held.hold()
         try:
-            return self._train()
-        except KeyboardInterrupt:
+            with termination_as_interrupt():
+                return self._train()
+        except (KeyboardInterrupt, OSError) as error:
             if self._held.begun():
+                how = "ended at once" if isinstance(error, KeyboardInterrupt) else "stopped"
                 done = len(self.episodes)
-                print(f"ended at once: {done} episodes done are in {self.folder}; --resume goes on with them")
+                print(f"{how}: {done} episodes done are in {self.folder}; --resume goes on with them")
             raise
         finally:
             self._held.release()
@@ -205,13 +209,20 @@ class Run:
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
         record["closure"] = named_weights(self.algorithm.twin.closure)
+        if self.algorithm.flights.faults:
+            record["faults"] = [fault.entry() for fault in self.algorithm.flights.faults]
+            for fault in self.algorithm.flights.faults:
+                bar.write(f"episode {record['episode'] + 1}, {fault.time:g} s: {fault.kind}: {fault.detail}")
         every = self.config.unseen_every
         if every and (len(self.episodes) + 1) % every == 0:
             self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.referee.live]
             record["J_a_unseen"] = self.unseen.control_costs(acting).mean().item()
+        done = [*self.episodes, record]
+        short = checkpoint.save(self._held.checkpoint, self.algorithm, done, kept=self.config.checkpoints)
         self.episodes.append(record)
-        checkpoint.save(self._held.checkpoint, self.algorithm, self.episodes)
+        if short is not None:
+            raise OSError(errno.ENOSPC, f"{short}; make room", str(self.folder))
         dashboard.episode(record)
         every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:

@@ -62,6 +62,7 @@ class RunConfig:
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir.
         overwrite: whether to replace the files that an earlier run left in log_dir.
+        checkpoints: number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before.
         quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
             unseen episodes.
         unseen: number of unseen episodes that twin and policies are judged on at the end.
@@ -99,6 +100,7 @@ class RunConfig:
     log_dir: Path | None = None
     resume: bool = False
     overwrite: bool = False
+    checkpoints: int = 3
     quick: bool = False
     unseen: int = 20
     untrained: int = 20
@@ -126,6 +128,7 @@ class RunConfig:
             ("episodes", 1),
             ("seed", 0),
             ("threads", 0),
+            ("checkpoints", 1),
             ("unseen", 2),
             ("untrained", 0),
             ("figures_every", 0),

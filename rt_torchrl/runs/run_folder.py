@@ -7,13 +7,20 @@ from pathlib import Path
 import filelock
 
 from rt_torchrl.atomic_file import remove_partials
-from rt_torchrl.runs import run_settings
+from rt_torchrl.runs import checkpoint, run_settings
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import FILE
 
 RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
-LEFT = ("events.out.tfevents.*", "figures/*.png", "figures/animation.gif", *WRITTEN)
+LEFT = (
+    "events.out.tfevents.*",
+    "figures/*.png",
+    "figures/animation.gif",
+    "checkpoint-*.pt",
+    "checkpoint*.pt.damaged",
+    *WRITTEN,
+)
 """Files of a run, in the order of their removal: ``config.json`` comes last, because it tells what the others are."""
 
 
@@ -96,7 +103,7 @@ class RunFolder:
         if not self.begun():
             raise ValueError(f"log_dir={self.path} holds no run to resume: it has no {FILE}. Start without --resume.")
         run_settings.require_same(self.path, self._config)
-        if not self.checkpoint.is_file() and any((self.path / name).exists() for name in RESULTS):
+        if not checkpoint.exists(self.checkpoint) and any((self.path / name).exists() for name in RESULTS):
             raise ValueError(
                 f"log_dir={self.path} holds a finished run without its {self.checkpoint.name}: there is nothing to go "
                 "on with. To train anew in this folder, use --overwrite."
@@ -104,14 +111,15 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Path of the checkpoint, whether or not it exists yet."""
+        """Path of the newest checkpoint, whether or not it exists yet."""
         return self.path / "checkpoint.pt"
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""
-        if self._config.resume and not self.checkpoint.is_file():
+        there = checkpoint.exists(self.checkpoint)
+        if self._config.resume and not there:
             print(f"The run in {self.path} has no episode done yet: it starts from its beginning.")
-        return self._config.resume and self.checkpoint.is_file()
+        return self._config.resume and there
 
     def begun(self) -> bool:
         """Whether the folder holds a run: its options are written when it begins."""

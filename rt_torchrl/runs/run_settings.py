@@ -17,6 +17,7 @@ from rt_torchrl.runs.settings import BESIDE, FILE, RAN, read_settings, settings_
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
 HARMLESS = {
     *("episodes", "figures", "figures_every", "unseen_every", "untrained", "reference", "limit_episodes"),
+    "checkpoints",
     # These change a result by rounding alone.
     *("threads", "compiled"),
     *("log_dir", "resume", "overwrite"),

@@ -19,10 +19,9 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig
 from rt_torchrl.runs.settings import read_settings
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.referees import ROLES, Role
 from rt_torchrl.twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
-from rt_torchrl.twinning.starts.recorded_flights import pieces_of_equal_length
 
 SHORTEST = 10
 """Least number of control intervals of a part of a log."""
@@ -112,8 +111,10 @@ def _live(folder: Path) -> Role:
     file = folder / "metrics.json"
     try:
         live: Role = json.loads(file.read_text(encoding="utf-8"))["summary"]["live"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file} does not say which policy was live ({error!r}); take a finished run.") from error
+    if live not in ROLES:
+        raise ValueError(f"{file} says that {live!r} was live; it must be {' or '.join(ROLES)}.")
     return live
 
 

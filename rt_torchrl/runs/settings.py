@@ -13,10 +13,12 @@ from typing import Any, Literal
 
 import cattrs
 
+from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import PREFIX, attribute, module_of
 
 FILE = "config.json"
+GREATEST_BYTES = 2**24
 RAN = "ran"
 """Key of the list with an entry for every start of the run."""
 BESIDE = ("plant", "recipe", RAN)
@@ -51,8 +53,9 @@ def read_settings(folder: Path) -> dict[str, Any]:
             "as runs/wind_turbine/TIME-seed-0."
         )
     try:
+        require_bounded(file, GREATEST_BYTES)
         settings = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is damaged: {error}") from error
     if not isinstance(settings, dict) or not isinstance(settings.get("plant"), str):
         raise ValueError(f"{file} is not that of a run: it does not name a plant.")

@@ -1,9 +1,9 @@
 """Files of tensors in plain containers, which run no code when they are read, and whose damage is noticed."""
 
+import hashlib
 import io
 import pickle
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,13 @@ import numpy as np
 import torch
 
 from rt_torchrl.atomic_file import write_atomically
+
+SEAL = b"sha256:"
+"""Beginning of the comment of an archive that holds the checksum of all before it."""
+
+
+class DamagedFileError(ValueError):
+    """A file that is not what a run has written: damaged, foreign, or such that loading it would run code."""
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
@@ -25,38 +32,74 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     """
     buffer = io.BytesIO()
     torch.save(plain(content), buffer)
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, _sealed(buffer.getvalue()))
 
 
 def load_tensors(path: Path) -> dict[str, Any]:
     """The content that :func:`save_tensors` wrote, on the CPU.
 
-    The checksum (CRC-32) of every part of the file is compared first.
+    The checksum of the whole file (SHA-256) is compared first, and those of its parts (CRC-32), which files of earlier
+    versions have alone.
 
     Raises:
-        ValueError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
+        DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
             object is not built.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            torn = archive.testzip()
+        sound = _verified(path.read_bytes())
     # The kind of error depends on the byte that is wrong, and all of them come from reading the file.
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OSError, zlib.error) as error:
-        raise ValueError(f"{path} is damaged, or no file of a run: {error}") from error
-    if torn is not None:
-        raise ValueError(f"{path} is damaged: part {torn!r} does not have the checksum that it was written with.")
+    except Exception as error:
+        raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
     try:
-        content = torch.load(path, weights_only=True, map_location="cpu")
+        content = torch.load(sound, weights_only=True, map_location="cpu")
     except pickle.UnpicklingError as error:
-        raise ValueError(
+        raise DamagedFileError(
             f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
             f"in plain containers. {first_line(error)}"
         ) from error
-    except (RuntimeError, EOFError, KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
-        raise ValueError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
+    except Exception as error:  # of as many kinds
+        raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
     if not isinstance(content, dict):
-        raise ValueError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
+        raise DamagedFileError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
     return content
+
+
+def _sealed(archive: bytes) -> bytes:
+    """The bytes of a zip archive without a comment, with a comment that holds their SHA-256."""
+    seal = SEAL + hashlib.sha256(archive).hexdigest().encode()
+    return archive[:-2] + len(seal).to_bytes(2, "little") + seal
+
+
+def _verified(file: bytes) -> io.BytesIO:
+    """The archive of a file, packed anew from parts whose checksums are right.
+
+    Torch reads fields of an archive that Python does not, such as the flag that makes a part a folder, and gives
+    memory that nobody has written for it. It gets an archive in which these fields are Python's own.
+
+    Raises:
+        zipfile.BadZipFile: if a checksum is wrong, or parts would take more memory than the file has bytes; a run
+            compresses nothing.
+    """
+    length = len(SEAL) + 64
+    end = file[-length:]
+    if end.startswith(SEAL):
+        archive = file[: -length - 2] + b"\0\0"
+        if hashlib.sha256(archive).hexdigest().encode() != end[len(SEAL) :]:
+            raise zipfile.BadZipFile("it does not have the checksum that it was written with")
+    elif file[-2:] != b"\0\0":  # the length of the comment, with which an archive without one ends
+        raise zipfile.BadZipFile("its end is not that of a file of a run")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(file)) as old, zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as new:
+        parts = old.infolist()
+        stored = all(part.compress_type == zipfile.ZIP_STORED for part in parts)
+        if not stored or sum(part.file_size for part in parts) > len(file):
+            raise zipfile.BadZipFile(f"its parts are larger than its {len(file)} bytes")
+        if len({part.filename for part in parts}) < len(parts):
+            raise zipfile.BadZipFile("two of its parts have the same name")
+        for part in parts:
+            new.writestr(part.filename, old.read(part))  # which compares the checksum of the part
+    packed.seek(0)
+    return packed
 
 
 def first_line(error: Exception) -> str:

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 from torchrl.data import TensorSpec
 
+from rt_torchrl.options import array_of, require_number
+
 
 class ActionLimits:
     r"""Limits that saturate an action, and then hold :math:`|a_k - a_{k-1}| \le r\,\Delta t`.
@@ -34,6 +36,7 @@ class ActionLimits:
         high: Sequence[float] | None = None,
         rates: Sequence[float] | None = None,
     ):
+        require_number("interval", interval, finite=False)
         if not 0.0 < interval < math.inf:
             raise ValueError(f"interval={interval} s must be positive and finite: the system's control interval.")
         self.spec = spec
@@ -43,9 +46,9 @@ class ActionLimits:
         self.high = own[1] if high is None else torch.minimum(own[1], self.constant("high", high))
         if not ((self.low <= self.high) & (self.low < math.inf) & (self.high > -math.inf)).all():
             raise ValueError(f"low={low} and high={high} leave no action of the system's own range {spec.space}.")
-        if rates is not None and not min(rates) > 0.0:
-            raise ValueError(f"rates={rates} must be positive; infinity does not limit an action.")
         self._increment = None if rates is None else interval * self.constant("rates", rates)
+        if self._increment is not None and not (self._increment > 0.0).all():
+            raise ValueError(f"rates={rates} must be positive; infinity does not limit an action.")
 
     def constant(self, argument: str, values: Sequence[float]) -> Tensor:
         """The action of these values, one number for each component.
@@ -53,7 +56,8 @@ class ActionLimits:
         Raises:
             ValueError: if the values are too many or too few, or one is NaN.
         """
-        found = torch.tensor(tuple(values), dtype=self.spec.dtype, device=self.spec.device)
+        array = array_of(argument, values)
+        found = torch.as_tensor(array, dtype=self.spec.dtype, device=self.spec.device)
         if found.shape != self.spec.shape[-1:] or found.isnan().any():
             raise ValueError(f"{argument}={values} must have {self.spec.shape[-1]} numbers, one for each action.")
         return found.expand(self.spec.shape)
@@ -90,8 +94,9 @@ class ActionLimits:
         # The rate must not lead out of the range, even if the last action was outside it.
         sent = torch.minimum(torch.maximum(reached, self.low), self.high)
         held = {"range": (inside != action) | (sent != reached), "rate": reached != inside}
-        return sent, {name: _components(mask) for name, mask in held.items() if mask.any()}
+        return sent, {name: components(mask) for name, mask in held.items() if mask.any()}
 
 
-def _components(mask: Tensor) -> str:
+def components(mask: Tensor) -> str:
+    """The components of an action that a mask marks, in words."""
     return "action " + ", ".join(map(str, mask.flatten().nonzero().flatten().tolist()))

@@ -1,8 +1,10 @@
 """Collectors fly whole real episodes, one at a time: by steps or, in simulation, by machine code."""
 
+from typing import cast
+
 import torch
 from jaxtyping import Float
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -11,9 +13,10 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.redrawn_policy import RedrawnPolicy
+from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
-from rt_torchrl.trajectories.rollout import drive_of, require_finite
+from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import Remembering, RememberingInterval, StateFeedback
 
 
@@ -58,7 +61,7 @@ class ExploringController(RememberingInterval, ExploringInterval):
 
 
 class EpisodeCollector:
-    """A collector by TorchRL's own rollout: each episode begins with one reset, however the last episode ended.
+    """A collector that steps the system: each episode begins with one reset, however the last episode ended.
 
     Args:
         env: the real system.
@@ -75,13 +78,42 @@ class EpisodeCollector:
         """Fly one episode; its TensorDict has the batch size ``batch n``.
 
         Raises:
-            ValueError: if the system ends the episode before its horizon.
+            EpisodeEndedError: if the system fails in the episode, or ends it before its horizon; it holds the intervals
+                before.
+            DivergenceError: if the system is a simulation that diverges.
         """
+        flown: list[TensorDictBase] = []
+        plant = self._plant
         pass_over(self.env)
-        episode = self.env.rollout(self._plant.n_steps, self._actor)
-        if episode.shape[-1] < self._plant.n_steps:
-            raise ended_early(episode[..., -1]["next"], episode.shape[-1], self._plant)
-        return episode
+        try:
+            now = self.env.reset()
+        except DivergenceError:
+            raise
+        except Exception as error:  # whatever a machine, its driver or its connection may raise
+            raise EpisodeEndedError(f"the system failed in its reset: {_said(error)}", None) from error
+        for k in range(plant.n_steps):
+            asked = self._actor(now)
+            try:
+                stepped = self.env.step(asked)
+            except DivergenceError:
+                raise
+            except Exception as error:
+                said = f"the system failed in interval {k}, at {k * plant.dt:g} s: {_said(error)}"
+                raise EpisodeEndedError(said, together(flown)) from error
+            flown.append(stepped.copy())
+            if stepped["next", "done"].any() and k + 1 < plant.n_steps:
+                raise EpisodeEndedError(str(ended_early(stepped["next"], k + 1, plant)), together(flown))
+            now = self.env.step_mdp(stepped)
+        return cast(TensorDict, together(flown))
+
+
+def together(flown: list[TensorDictBase]) -> TensorDictBase | None:
+    """The intervals of an episode as one TensorDict of batch size ``batch n``; None if there are none."""
+    return torch.stack(flown, 1) if flown else None
+
+
+def _said(error: Exception) -> str:
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
 
 
 class FlightCollector:

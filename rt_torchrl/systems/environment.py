@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import require_number
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.compilation import compiled_if
@@ -61,6 +62,8 @@ class PlantEnv(EnvBase):
         noise: float = 0.0,
         wear: Callable[[int], nn.Module] | None = None,
     ):
+        for argument, value, whole in (("batch_size", batch_size, True), ("seed", seed, True), ("noise", noise, False)):
+            require_number(argument, value, whole=whole)
         if batch_size < 1:
             raise ValueError(f"batch_size={batch_size} must be at least 1.")
         if not 0.0 <= noise < 1.0:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from rt_torchrl.options import array_of
 from rt_torchrl.plants.signal import Signal
 
 
@@ -123,7 +124,9 @@ def require_numbers(what: str, **values: float | Sequence[float]) -> None:
         ValueError: if an argument is not finite; it names the first one.
     """
     for argument, value in values.items():
-        if not np.isfinite(value).all():
+        found = array_of(argument, value)
+        # A plant may have no inputs, but a reading has numbers.
+        if not np.isfinite(found).all() or (found.size == 0 and argument != "exogenous"):
             raise ValueError(f"{argument}={value} of the {what} must be finite: a number, or one for each signal.")
 
 

@@ -1,10 +1,7 @@
 """A safety layer between a policy and a real system: limits on what is sent, a watchdog on what comes back."""
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,55 +10,16 @@ from torch import Tensor
 from torchrl.data import Binary, Unbounded
 from torchrl.envs import EnvBase
 
-from rt_torchrl.options import check_options
-from rt_torchrl.systems.action_limits import ActionLimits
+from rt_torchrl.systems.action_limits import ActionLimits, components
+from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
-from rt_torchrl.systems.watchdog import Range, Watchdog
 
-WRONG = frozenset({"not finite", "out of range"})
-"""Faults that make an observation wrong; a late observation is right, and so not among them."""
+__all__ = ["WRONG", "Fallback", "SafetyConfig", "SafetyLayer"]
+
+WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
+"""Faults that make an observation wrong; a late one is right, and so is one of a system beyond its limits."""
 
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SafetyConfig:
-    """Limits of a safety layer on actions and observations.
-
-    Args:
-        interval: control interval of the system [s].
-        low: least value of each action, where it is to be above the system's own.
-        high: greatest value of each action, where it is to be below the system's own.
-        rates: greatest rate of change of each action [unit/s]; infinity does not limit it.
-        rest: action, within its range, from which the rate limits the first action of an episode; with None the rate
-            of the first action is free.
-        ranges: admissible range (low, high) of entries of the observation, by name; each end is one number for all
-            components or one number for each component.
-        deadline: longest wall-clock time from an action to the observation of its effect [s].
-        hold: time without a fault after which the policy acts again [s]; with infinity it does not act again in the
-            same episode.
-        patience: time of uninterrupted fallback after which the episode is truncated [s].
-        log: file to which every event is appended, as one JSON object per line.
-
-    Raises:
-        ValueError: if an option is not a number of its type, or the interval is not positive and finite.
-    """
-
-    interval: float
-    low: tuple[float, ...] | None = None
-    high: tuple[float, ...] | None = None
-    rates: tuple[float, ...] | None = None
-    rest: tuple[float, ...] | None = None
-    ranges: Mapping[str, Range] = field(default_factory=dict)
-    deadline: float = math.inf
-    hold: float = 0.0
-    patience: float = math.inf
-    log: Path | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self, infinite=("low", "high", "rates", "deadline", "hold", "patience"))
-        if not self.interval > 0.0:
-            raise ValueError(f"interval={self.interval} s must be positive: the system's control interval.")
 
 
 class SafetyLayer(EnvBase):
@@ -69,17 +27,17 @@ class SafetyLayer(EnvBase):
 
     Range and rate, :math:`|a_k - a_{k-1}| \le r\,\Delta t`, limit every action. They limit the fallback too, because
     they are limits of the machine. The fallback acts while the watchdog is tripped. The layer passes observations on;
-    it replaces only values that are not finite, by the last finite ones, because a policy cannot use NaN, and the event
-    says so. It passes the system's reward on and never takes it for a fault. It adds three entries:
+    it replaces only values that are missing or not finite, by the last finite ones, because a policy cannot use NaN,
+    and the event says so. It passes the system's reward on and never takes it for a fault. It adds three entries:
 
     ==================  ======  ======================================================================================
     ``applied``         n_a     the action sent to the system; where the system has an entry of that name, it is kept
     ``tripped``         1       whether this observation trips the watchdog, or the watchdog is still tripped
-    ``refused``         1       whether this observation is not finite or out of range, and so not to be learned from
+    ``refused``         1       whether this observation is wrong, and so not to be learned from, see ``WRONG``
     ==================  ======  ======================================================================================
 
     A learner learns from ``("next", "applied")``, not from the ``action`` that the policy asked for.
-    ``ReinforcementTwinning`` learns nothing from an episode with a refused observation; it flies another one.
+    ``ReinforcementTwinning`` learns nothing from the intervals before and after a refused observation.
 
     A shutdown truncates the episode and does not terminate it. Where rewards are negative costs, a return that ends
     with the shutdown would make the shutdown the policy's goal. ``ReinforcementTwinning`` needs whole episodes: leave
@@ -92,7 +50,7 @@ class SafetyLayer(EnvBase):
         env: environment of one real system, with batch size () or (1,).
         config: limits on actions and observations.
         fallback: action within the range, or controller that makes an action from the TensorDict of the last
-            observation.
+            observation; if it has a method ``begin``, that is called at every reset.
         clock: wall clock [s].
 
     Raises:
@@ -120,12 +78,14 @@ class SafetyLayer(EnvBase):
         self._clock = clock
         self.reports: list[SafetyReport] = []
         self._good: dict[str, Tensor] = {}
-        self.watchdog = Watchdog(config.ranges, deadline=config.deadline, hold=config.hold, patience=config.patience)
+        self.watchdog = config.watchdog()
+        self._unwritten: OSError | None = None
         self._make_specs()
         self.limits = ActionLimits(
             env.action_spec, interval=config.interval, low=config.low, high=config.high, rates=config.rates
         )
         self._rest = None if config.rest is None else self.limits.sendable("rest", config.rest)
+        self._following = None if config.following is None else self.limits.constant("following", config.following)
         self._fallback = fallback if callable(fallback) else self.limits.sendable("fallback", fallback)
         if config.log is not None:
             config.log.parent.mkdir(parents=True, exist_ok=True)
@@ -133,9 +93,17 @@ class SafetyLayer(EnvBase):
 
     def _make_specs(self) -> None:
         observation, action = self.env.full_observation_spec.clone(), self.env.action_spec
-        unknown = set(self.config.ranges) - set(observation.keys())
-        if unknown:
-            raise ValueError(f"ranges has {sorted(unknown)}; the system observes {sorted(observation.keys())}.")
+        clock = [] if self.config.clock is None else [self.config.clock]
+        named = {
+            "ranges": self.config.ranges,
+            "limits": self.config.limits,
+            "frozen": self.config.frozen,
+            "clock": clock,
+        }
+        for argument, entries in named.items():
+            unknown = set(entries) - set(observation.keys())
+            if unknown:
+                raise ValueError(f"{argument} has {sorted(unknown)}; the system observes {sorted(observation.keys())}.")
         if "applied" not in observation:
             observation["applied"] = Unbounded(shape=action.shape, dtype=action.dtype, device=self.device)
         for flag in ("tripped", "refused"):
@@ -163,12 +131,20 @@ class SafetyLayer(EnvBase):
         return self.reports[-1]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if self._unwritten is not None:
+            error, self._unwritten = self._unwritten, None
+            raise error  # now that nothing moves; in the episode the system came first
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
-        faults = self._faults(found, 0.0, "after its reset")
-        if faults:
-            raise ValueError(f"the system begins with a fault, {faults}: {found}; nothing was sent to it.")
         self.watchdog.begin()
+        if hasattr(self._fallback, "begin"):
+            self._fallback.begin()
+        faults = self._faults(found, 0.0)
+        if faults.pop("limit", None):
+            self.watchdog.note(0.0, True)  # the fallback begins
+        if faults:
+            read = {key: found[key].flatten().tolist() for key in self._watched if key in found}
+            raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
         self._step_count, self._last, self._good = 0, self._rest, {}
         self._remember(found)
         if "applied" not in found:
@@ -187,14 +163,17 @@ class SafetyLayer(EnvBase):
         applied, reasons = self._chosen(t, tensordict)
         start = self._clock()
         found = self.env.step(tensordict.exclude("next", "tripped", "refused").set("action", applied.clone()))["next"]
-        faults = self._faults(found, self._clock() - start, f"at the end of interval {self._step_count}")
+        faults = self._faults(found, self._clock() - start)
         self.watchdog.note(end, bool(faults))
         found = self._remember(found.copy())
         if "applied" not in self.env.full_observation_spec:
             found["applied"] = applied.clone()
         found["tripped"] = self._flag(self.watchdog.tripped(end))
         found["refused"] = self._flag(not WRONG.isdisjoint(faults))
-        reasons |= faults
+        if found["refused"].any():
+            first = max(0, self._step_count - self.watchdog.samples.stale)
+            self.report.wrong.update(range(first, self._step_count + 1))
+        reasons |= faults | self._not_followed(applied, found["applied"])
         found["truncated"] = found.get("truncated", self._flag(False))
         if self.watchdog.exhausted(end):
             reasons["truncated"] = f"tripped for {self.watchdog.patience:g} s"
@@ -219,24 +198,24 @@ class SafetyLayer(EnvBase):
         applied, held = self.limits(action, self._last)
         return applied, reasons | held
 
-    def _faults(self, found: TensorDictBase, elapsed: float, when: str) -> dict[str, str]:
-        """Faults of an observation by kind, each with a detail.
-
-        Raises:
-            ValueError: if an entry is missing that the system declares.
-        """
+    def _faults(self, found: TensorDictBase, elapsed: float) -> dict[str, str]:
+        """Faults of an observation by kind, each with a detail."""
         missing = [key for key in self._watched if key not in found]
-        if missing:
-            raise ValueError(
-                f"the system does not report {missing} {when}, although it declares to observe it; it has "
-                f"{sorted(found.keys())}. Mend the system's step, or take the entry out of its observation_spec."
-            )
-        return self.watchdog.faults({key: found[key] for key in self._watched}, elapsed)
+        said = {"missing": f"{', '.join(missing)}, which the system declares to observe"} if missing else {}
+        there = {key: found[key] for key in self._watched if key in found}
+        return said | self.watchdog.faults(there, elapsed)
+
+    def _not_followed(self, sent: Tensor, applied: Tensor) -> dict[str, str]:
+        """Actuators that do not do what was sent; the record holds what they have done instead."""
+        if self._following is None:
+            return {}
+        behind = (applied - sent).abs() > self._following
+        return {"actuator": components(behind)} if behind.any() else {}
 
     def _remember(self, found: TensorDictBase) -> TensorDictBase:
-        """Replace values that are not finite by the last finite ones."""
+        """Replace values that are missing or not finite by the last finite ones."""
         for key in self._watched:
-            value = found[key]
+            value = found[key] if key in found else torch.full_like(self._good[key], torch.nan)
             good = self._good.get(key, torch.zeros_like(value))
             self._good[key] = torch.where(value.isfinite(), value, good)
             found[key] = self._good[key]
@@ -249,9 +228,13 @@ class SafetyLayer(EnvBase):
         event = SafetyEvent(len(self.reports) - 1, self._step_count, t, reasons, *flat)
         self.report.events.append(event)
         self.report.counts.update(reasons.keys())
-        if self.config.log is not None:
-            with self.config.log.open("a", encoding="utf-8") as file:
-                file.write(event.line() + "\n")
+        if self.config.log is not None and self._unwritten is None:
+            try:
+                with self.config.log.open("a", encoding="utf-8") as file:
+                    file.write(event.line() + "\n")
+            except OSError as error:
+                # A full disk must not stop the control of a machine that moves.
+                self._unwritten = error
 
     def _flag(self, value: bool) -> Tensor:
         return torch.full((*self.batch_size, 1), value, dtype=torch.bool, device=self.device)

@@ -11,9 +11,10 @@ class SafetyEvent(NamedTuple):
     """One control interval in which the layer acted or saw a fault.
 
     ``reasons`` maps each reason to a detail. ``range`` and ``rate`` say that the action was limited, ``asked`` that the
-    policy's action was not finite, and ``fallback`` that the fallback acted. ``not finite``, ``out of range`` and
-    ``late`` are faults of the observation at the end of the interval. ``truncated`` says that the layer ended the
-    episode.
+    policy's action was not finite, and ``fallback`` that the fallback acted. ``missing``, ``not finite``, ``out of
+    range``, ``frozen``, ``clock`` and ``late`` are faults of the observation at the end of the interval. ``limit`` says
+    that the system has left its limits, and ``actuator`` that an actuator does not follow. ``truncated`` says that the
+    layer ended the episode.
     """
 
     episode: int
@@ -33,7 +34,11 @@ class SafetyEvent(NamedTuple):
 
 @dataclass
 class SafetyReport:
-    """Events of one episode, and the number of intervals in which each reason occurred."""
+    """Events of one episode, the number of intervals in which each reason occurred, and where readings are wrong.
+
+    ``wrong`` holds the intervals at whose end the observation is wrong, also those of which this became known later.
+    """
 
     events: list[SafetyEvent] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
+    wrong: set[int] = field(default_factory=set)

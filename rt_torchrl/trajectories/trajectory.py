@@ -76,6 +76,23 @@ def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(states, actions, exogenous, starts[0] if together else states.new_tensor(starts))
 
 
+def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: float) -> list[Trajectory]:
+    """Segments of a log cut to pieces of one length, which is chosen so that most of the log stays.
+
+    Args:
+        segments: segments of the log, oldest first.
+        longest: greatest number of control intervals of a piece.
+        dt: control interval [s].
+
+    Returns:
+        The pieces, oldest first; a shorter rest at the end of a segment is left out.
+    """
+    counts = [len(segment.actions) for segment in segments]
+    length = max({min(count, longest) for count in counts}, key=lambda n: (n * sum(c // n for c in counts), n))
+    cuts = [(segment, k * length) for segment, c in zip(segments, counts, strict=True) for k in range(c // length)]
+    return [segment.part(first, first + length, dt) for segment, first in cuts]
+
+
 def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"]:
     r"""J_a of each trajectory, :math:`\frac1{T_o}\big(\int L_a\,dt + \Phi_a(s_n)\big)` by its samples."""
     states, actions, exogenous, start = trajectory

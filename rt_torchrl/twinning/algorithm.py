@@ -19,13 +19,14 @@ from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.evidence.examination import Examination
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
-from rt_torchrl.twinning.flight import Flight, fly
+from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
@@ -88,12 +89,14 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.clearance = Clearance(env, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = collector_of(env, self.actor, twin.plant)
+        self.flights = RealFlights(env, self.actor, lambda: self.collector.rollout(), twin.plant, config.least_sound)
         self.episodes_done = 0
         self.earlier = EarlierClosure(twin, model_based, self.planner, generator)
 
@@ -113,6 +116,7 @@ class ReinforcementTwinning:
             ``real_cost``, ``live``, what the steps of this arm report, and the ``seconds`` of each step.
         """
         arm, report, seconds = self.config.arm, findings(), {}
+        self.flights.begin()
         steps = [self.start] if self.first is not None and not self.episodes_done else []
         steps += [self.interact]
         steps += [self.update_model_free] if arm != "model_based" else []
@@ -136,7 +140,7 @@ class ReinforcementTwinning:
             part.restart()
         if not pupils:
             return findings()
-        flights = self.first.flights(lambda policy: fly(self.actor, self.collector.rollout, policy, strength=0.0))
+        flights = self.first.flights(lambda policy: self.flights.fly(policy, strength=0.0, whole=True))
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
         for flight in flights:
             self._keep(flight)
@@ -157,21 +161,24 @@ class ReinforcementTwinning:
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
         acting = self.actor.exploring(self.policies[live], self.episodes_done)
         self.learning.adopt(acting)
-        flight = self._flown(acting, strength=strength)
-        explored = self.actor.strength * self.config.exploration.spread if acting is self.policies[live] else 1.0
-        self.track_record.append(flight.record, live, flight.cost.item(), explored)
-        self.learning.flown(acting, flight.cost.item())
+        cleared = self.clearance.choose(live, self.judged)
+        if cleared.policy is not self.policies[live]:
+            acting, live = cleared.policy, cleared.role
+        # Virtual episodes need the inputs of one whole real episode.
+        needed = self.config.arm != "model_free" and not self.virtual.processes
+        flight = self.flights.fly(acting, strength=strength, whole=needed)
+        self._keep(flight)
+        explored = self.actor.strength * self.config.exploration.spread if acting is cleared.policy else 1.0
+        if flight.whole:  # costs of parts cannot be compared with those of episodes
+            self.track_record.append(flight.record, live, flight.cost.item(), explored, cleared.policy)
+            self.learning.flown(acting, flight.cost.item())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
+        report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
 
-    def _flown(self, policy: nn.Module, *, strength: float) -> Flight:
-        """An episode on the real system, which both memories hold; of those that :func:`fly` refuses, none does."""
-        flight = fly(self.actor, self.collector.rollout, policy, strength=strength)
-        self._keep(flight)
-        return flight
-
     def _keep(self, flight: Flight) -> None:
-        self.learner.store(flight.transitions)
+        """Both memories hold the sound part of an episode; of those that are refused, none does."""
+        self.learning.store(flight.parts(self.twin.plant.dt))
         self.short_term.append(flight.record)
 
     def update_model_free(self) -> TensorDict:
@@ -180,18 +187,16 @@ class ReinforcementTwinning:
         return self.learning.update()
 
     def fit_exogenous(self) -> TensorDict:
-        """Step 3: fit a Gaussian process to the exogenous input of this episode."""
-        self.virtual.learn(self.short_term[-1])
+        """Step 3: fit a Gaussian process to the exogenous input of this episode, if it is whole."""
+        if self.short_term.whole(self.twin.plant.n_steps, latest=1):
+            self.virtual.learn(self.short_term[-1])
         return findings()
 
     def assimilate(self, records: Sequence[Trajectory] = ()) -> TensorDict:
         """Step 4: n_G gradient steps on J_p over virtual trajectories with stored actions, of D_S or ``records``."""
-        records = list(records or self.short_term)
-        processes = list(self.virtual.processes)[-len(records) :]
+        latest, processes = self.virtual.paired(list(records or self.short_term))
         self.earlier.remember()
-        found = self.assimilation.update(
-            records[-len(processes) :], processes, self.config.realisations, self.generator
-        )
+        found = self.assimilation.update(latest, processes, self.config.realisations, self.generator)
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
         return merged(fit, findings(**self.assimilation.report()))
 
@@ -291,4 +296,4 @@ class ReinforcementTwinning:
 
 
 KEPT = ("virtual", "short_term", "track_record")  # components that leave the tensors of their state on their device
-COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
+COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", "clearance", *KEPT)

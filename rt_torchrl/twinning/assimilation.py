@@ -136,7 +136,7 @@ class Assimilation:
         if not self.config.segment:
             return self._descend_anew(whole)
         before = self._cost_of(whole)
-        found = self._descend_anew(whole.segments(self.config.segment, self.twin.plant.dt))
+        found = self._descend_anew(whole.segments(min(self.config.segment, whole.actions.shape[1]), self.twin.plant.dt))
         return found._replace(start=before, best=self._cost_of(whole))
 
     def _descend_anew(self, replayed: Trajectory) -> Descended:

@@ -5,6 +5,7 @@ from typing import Literal
 
 from rt_torchrl.options import check_options
 from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.exogenous import ExogenousConfig
@@ -27,6 +28,10 @@ class TwinningConfig:
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
+        least_sound: least share of a real episode without a fault, in a row, that is learned from; with a lower share
+            the episode is flown again.
+        limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
+            to be kept before a policy may act.
         judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse on the twin, in the
             arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
             ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
@@ -44,6 +49,8 @@ class TwinningConfig:
     realisations: int = 5
     records: int = 1
     virtual_episodes: int = 20
+    least_sound: float = 0.5
+    limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     judged_updates: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
@@ -59,3 +66,10 @@ class TwinningConfig:
         for argument in ("realisations", "records", "virtual_episodes"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+        if not 0.0 < self.least_sound <= 1.0:
+            raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")
+        if self.limits and self.exploration.redrawn:
+            raise ValueError(
+                f"exploration.redrawn={self.exploration.redrawn} draws weights that no twin has checked; leave it at 0 "
+                "where there are limits."
+            )

@@ -1,64 +1,155 @@
 """A flight on the real system, in step 1."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.refusal import note_refusal
+from rt_torchrl.systems.sound_part import (
+    SHORTEST,
+    EpisodeEndedError,
+    Fault,
+    SoundPart,
+    report_of,
+    sound_part,
+    tried_in_vain,
+)
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.findings import findings
+
+FLIGHTS = 3
+"""Number of real episodes in a row without a sound part after which somebody has to look at the machine."""
 
 
 class Flight(NamedTuple):
     """A real episode that can be learned from.
 
     Attributes:
-        transitions: its transitions, whose action is the applied one.
-        record: its trajectory.
+        transitions: the transitions of its longest sound part, whose action is the applied one.
+        record: the trajectory of that part; its clock says where it begins.
         refused: why earlier attempts could not be learned from.
+        faults: faults of the system in this episode and in the earlier attempts.
+        others: transitions of its other sound parts, each with the number of its first interval.
+        whole: whether the record is that of a whole episode.
     """
 
     transitions: TensorDict
     record: Trajectory
-    refused: list[str]
+    refused: Sequence[str] = ()
+    faults: Sequence[Fault] = ()
+    others: Sequence[tuple[int, TensorDict]] = ()
+    whole: bool = True
 
     @property
     def cost(self) -> Tensor:
-        """J_a as measured."""
+        """J_a as measured, in the sound part."""
         return -self.transitions["next", "reward"].mean()
 
+    def parts(self, dt: float) -> list[tuple[int, TensorDict]]:
+        """The transitions of all sound parts, in their order, each with the number of its first interval."""
+        first = round(float(self.record.start) / dt)
+        return sorted([(first, self.transitions), *self.others], key=lambda part: part[0])
+
     def report(self) -> TensorDict:
-        """The cost, and how often and why the episode was flown again."""
+        """The cost, the faults, and how often and why the episode was flown again."""
         found = findings(real_cost=self.cost, reward=-self.cost)
         if self.refused:
             found.update(findings(episodes_refused=float(len(self.refused))))
             found.set_non_tensor("refusal", "; ".join(self.refused))
+        if self.faults:
+            counts = {fault.kind: 0.0 for fault in self.faults}
+            for fault in self.faults:
+                counts[fault.kind] += 1.0
+            found.update(findings(**{f"faults/{kind}": count for kind, count in counts.items()}))
+        if not self.whole:
+            found.update(findings(sound_intervals=float(sum(len(part) for _, part in self.parts(1.0)))))
         return found
 
 
-def fly(actor: LivePolicy, rollout: Callable[[], TensorDict], policy: nn.Module, *, strength: float) -> Flight:
-    """Fly one episode on the real system, and again if it cannot be learned from.
+class RealFlights:
+    """Real episodes of the algorithm: each is flown, and flown again if too little of it is sound.
 
     Args:
+        env: the real system.
         actor: what acts in the rollout.
         rollout: function that flies one episode of batch size 1.
-        policy: policy that acts.
-        strength: strength ξ of the exploration.
-
-    Raises:
-        ValueError: if several episodes in a row cannot be learned from.
+        plant: plant that gives the length of an episode.
+        least_sound: least share of an episode in one sound part, below which it is flown again.
     """
-    refused: list[str] = []
-    while True:
-        actor.begin(policy, strength=strength)
-        episode = rollout()[0]
-        if not note_refusal(refused, episode):
-            break
+
+    def __init__(
+        self, env: EnvBase, actor: LivePolicy, rollout: Callable[[], TensorDict], plant: Plant, least_sound: float
+    ):
+        self.env, self.actor, self.rollout, self.plant = env, actor, rollout, plant
+        self._least = max(SHORTEST, least_sound * plant.n_steps)
+        self.faults: list[Fault] = []
+        """Faults of the system in the episodes since :meth:`begin`."""
+
+    def begin(self) -> None:
+        """Begin an episode of the algorithm."""
+        self.faults = []
+
+    def fly(self, policy: nn.Module, *, strength: float, whole: bool) -> Flight:
+        """Fly one episode.
+
+        Args:
+            policy: policy that acts.
+            strength: strength ξ of the exploration.
+            whole: whether only a whole episode will do.
+
+        Raises:
+            ValueError: if several episodes in a row cannot be learned from.
+        """
+        refused: list[str] = []
+        faults: list[Fault] = []
+        while True:
+            self.actor.begin(policy, strength=strength)
+            episode, found, cause = self._attempt()
+            faults += found.faults
+            self.faults += found.faults
+            first, last = found.longest
+            if episode is not None and (found.whole or (not whole and last - first >= self._least)):
+                break
+            refused.append(found.reason)
+            if len(refused) == FLIGHTS:
+                raise ValueError(tried_in_vain(refused)) from cause
+        others = [(part[0], _transitions(episode, part)) for part in found.parts if part != (first, last)]
+        transitions = _transitions(episode, (first, last))
+        states = torch.cat([transitions["state"], transitions["next", "state"][-1:]])
+        start = first * self.plant.dt
+        record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
+        return Flight(transitions, record, refused, faults, others, found.whole)
+
+    def _attempt(self) -> tuple[TensorDictBase | None, SoundPart, Exception | None]:
+        """One episode, its sound part, and the error that ended it."""
+        try:
+            episode, ended = self.rollout()[0], None
+        except EpisodeEndedError as error:
+            ended, flown = error, error.flown
+            if flown is None:
+                fault = Fault("ended", 0, 0.0, str(error))
+                return None, SoundPart([], [fault], str(error), whole=False), error
+            episode = flown[0]
+        found = sound_part(episode, self.plant, report_of(self.env))
+        if ended is None:
+            return episode, found, None
+        n = len(episode)
+        fault = Fault("ended", n, n * self.plant.dt, str(ended))
+        reason = "; ".join(part for part in (found.reason, str(ended)) if part)
+        return episode, found._replace(faults=[*found.faults, fault], reason=reason, whole=False), ended
+
+
+def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
+    """The transitions of a part of an episode; the last one is truncated."""
+    first, last = part
+    found = episode[first:last].clone() if last - first < len(episode) else episode
     # The learner learns from the action that was applied.
-    episode["action"] = episode["next", "applied"]
-    states = torch.cat([episode["state"], episode["next", "state"][-1:]])
-    return Flight(episode, Trajectory(states, episode["action"], episode["exogenous"]), refused)
+    found["action"] = found["next", "applied"]
+    for key in ("done", "truncated"):
+        found["next", key][-1] = True
+    return found

@@ -1,7 +1,7 @@
 """Step 2: the learner's update, which step 6 can take back where it is worse on the twin."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,6 +21,9 @@ class Learning:
     begins with a controller it explores little, and an actor that climbs the critic leaves those actions within one
     update. Plans and clones are judged on the twin, too.
 
+    A learner that needs more than one interval in a row says so by ``shortest``; one that takes the first interval it
+    is given for the start of an episode has a true ``from_the_start``.
+
     A learner that learns from the twin has a method ``take_twin(twin)``. One that wants to know of the real episodes
     that its policy flies has methods ``adopt()`` and ``flown(cost)``.
 
@@ -36,6 +39,17 @@ class Learning:
         take = getattr(learner, "take_twin", None)
         if taught and take is not None:
             take(virtual.twin)
+
+    def store(self, parts: Sequence[tuple[int, TensorDict]]) -> None:
+        """Give the learner the transitions of the sound parts of an episode that it can use.
+
+        Args:
+            parts: number of the first interval, and the transitions, of each part.
+        """
+        shortest, bound = getattr(self.learner, "shortest", 1), getattr(self.learner, "from_the_start", False)
+        for first, transitions in parts:
+            if len(transitions) >= shortest and not (bound and first):
+                self.learner.store(transitions)
 
     def update(self) -> TensorDict:
         """Update the policy; see :meth:`Learner.update`."""

@@ -14,6 +14,10 @@ class ShortTermMemory(deque[Trajectory]):
             raise ValueError(f"capacity={capacity} of the short-term memory (n_S) must be at least 1.")
         super().__init__(maxlen=capacity)
 
+    def whole(self, n_steps: int, *, latest: int = 0) -> bool:
+        """Whether the latest records, or all with 0, are those of whole episodes of ``n_steps`` control intervals."""
+        return all(len(record.actions) == n_steps for record in list(self)[-latest:])
+
     def state_dict(self) -> dict[str, Any]:
         return {"records": [record._asdict() for record in self]}
 

@@ -49,9 +49,12 @@ class TrackRecord:
         self._policies = policies
         self._flown: deque[Flown] = deque(maxlen=KEPT)
 
-    def append(self, trajectory: Trajectory, role: Role, cost: float, exploration: float = 0.0) -> None:
-        """Add an episode that the policy with this role has just flown."""
-        weights = {name: weight.detach().clone() for name, weight in self._policies[role].state_dict().items()}
+    def append(
+        self, trajectory: Trajectory, role: Role, cost: float, exploration: float = 0.0, policy: nn.Module | None = None
+    ) -> None:
+        """Add an episode that the policy with this role has just flown, or an earlier one of its structure."""
+        flew = self._policies[role] if policy is None else policy
+        weights = {name: weight.detach().clone() for name, weight in flew.state_dict().items()}
         self._flown.append(Flown(trajectory, role, weights, cost, exploration))
 
     @property
@@ -131,6 +134,6 @@ def shares(policy: nn.Module, plant: Plant, record: Trajectory) -> Float[Tensor,
     at = torch.linspace(0, n - 1, min(n, LOOKED_AT), device=record.states.device).round().long()
     if isinstance(policy, StateFeedback):
         return torch.full((len(at) * len(plant.actions),), ELSEWHERE, dtype=torch.float64, device=at.device)
-    observations = plant.observe(at.double() * plant.dt, record.states[at], record.exogenous[at])
+    observations = plant.observe(record.start + at.double() * plant.dt, record.states[at], record.exogenous[at])
     low, high = bounds(plant.actions, device=at.device)
     return (2.0 * policy(observations) / (high - low)).flatten()

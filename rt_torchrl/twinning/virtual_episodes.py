@@ -1,13 +1,14 @@
 """Virtual episodes: their draws, and the cost of a policy in them."""
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 
@@ -28,9 +29,29 @@ class VirtualEpisodes:
 
     def learn(self, record: Trajectory) -> None:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
+        self.processes.append(self._process(record))
+
+    def paired(self, records: Sequence[Trajectory]) -> tuple[list[Trajectory], list[ExogenousProcess]]:
+        """The latest records that have a process, and these processes, in pairs.
+
+        If only a part of an episode is sound, the records differ in length. Then they are cut to pieces of one length,
+        and each piece gets a process that is not kept.
+
+        Args:
+            records: the latest records, oldest first.
+        """
+        processes = list(self.processes)[-len(records) :]
+        latest = list(records)[-len(processes) :] if processes else []
+        if latest and all(len(a.actions) == len(b.mean) for a, b in zip(latest, processes, strict=True)):
+            return latest, processes
+        plant = self.twin.plant
+        pieces = pieces_of_equal_length(records, plant.n_steps, plant.dt)
+        return pieces, [self._process(piece) for piece in pieces]
+
+    def _process(self, record: Trajectory) -> ExogenousProcess:
         plant, signals = self.twin.plant, self.twin.plant.acting_inputs
         acted = record.exogenous[:, : len(signals)]
-        self.processes.append(ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config))
+        return ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config)
 
     def draw(self, count: int) -> Scenario:
         """Draw random initial states, and exogenous inputs from the processes that are kept.

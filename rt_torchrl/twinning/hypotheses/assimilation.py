@@ -11,7 +11,7 @@ import torch
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.exogenous import ExogenousProcess
@@ -187,9 +187,8 @@ class EnsembleAssimilation(Assimilation):
 @torch.no_grad()
 def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> float:
     """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
-    whole = [with_hidden_states(twin, record) for record in records]
-    stacked = Trajectory(*(torch.stack(parts) for parts in zip(*(record[:3] for record in whole), strict=True)))
-    measured, actions, exogenous, start = stacked.segments(segment, twin.plant.dt)
+    stacked = batch_of([with_hidden_states(twin, record) for record in records])
+    measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
     try:
         flown = twin.replay(measured[:, 0], exogenous, actions, start=start)
     except DivergenceError:

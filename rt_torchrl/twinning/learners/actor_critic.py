@@ -123,6 +123,11 @@ class ActorCritic(ABC):
         """The critics in the form that TorchRL's losses take."""
         return [ValueOperator(critic, in_keys=["observation", "action"]) for critic in self.critics]
 
+    @property
+    def shortest(self) -> int:
+        """Least number of control intervals in a row that can be stored."""
+        return self.config.return_steps
+
     def store(self, episode: TensorDictBase) -> None:
         """Keep the transitions of a real episode, with their TD errors as priorities.
 

@@ -122,6 +122,14 @@ class IncrementalTD3:
             )
         return self._teacher
 
+    from_the_start = True
+    """A twin that teaches counts the time from the first interval that is stored."""
+
+    @property
+    def shortest(self) -> int:
+        """Least number of control intervals in a row that can be stored."""
+        return self.decisions * self.memory.intervals + 1
+
     def store(self, episode: TensorDictBase) -> None:
         """See :meth:`Learner.store`; a TensorDict with ``state`` and ``exogenous``, too."""
         self.memory.store(episode)

@@ -1,0 +1,155 @@
+"""The sound part of a real episode: the intervals that show what the system did, and the faults of the others."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.systems.safety import SafetyLayer
+from rt_torchrl.systems.safety_report import SafetyReport
+
+GREATEST = torch.finfo(torch.float32).max
+"""Greatest number to be learned from: the long-term memory keeps its priorities in single precision."""
+SHORTEST = 10
+"""Least number of control intervals of a part that is learned from."""
+LEARNED = ("state", "exogenous", "observation", *(("next", k) for k in ("state", "observation", "applied", "reward")))
+"""Entries of an episode that go into a memory."""
+FAULTS = ("missing", "not finite", "out of range", "frozen", "clock", "late", "limit", "actuator", "asked")
+"""Reasons of a safety layer's events that are faults of the system, or of a policy that asks for no number."""
+
+
+class Fault(NamedTuple):
+    """A fault of the real system in one control interval.
+
+    ``kind`` is a reason of :class:`SafetyEvent`, ``ended`` where the system failed or ended the episode early, or
+    ``overflow`` where a number is not finite in single precision.
+    """
+
+    kind: str
+    interval: int
+    time: float  # start of the interval, counted from the start of the episode [s]
+    detail: str
+
+    def entry(self) -> dict[str, Any]:
+        """The fault in an episode's record."""
+        return self._asdict()
+
+
+class EpisodeEndedError(ValueError):
+    """The error of a real episode that has not reached its horizon: the system failed, or ended it.
+
+    Args:
+        message: what happened.
+        flown: the episode up to there; None if no interval was finished.
+    """
+
+    def __init__(self, message: str, flown: TensorDictBase | None):
+        super().__init__(message)
+        self.flown = flown
+
+
+class SoundPart(NamedTuple):
+    """What can be learned from a real episode.
+
+    ``parts`` holds the first interval, and the one after the last, of each sound part; ``longest`` is the longest one.
+    ``whole`` says whether all intervals of the horizon are sound, ``reason`` why not.
+    """
+
+    parts: list[tuple[int, int]]
+    faults: list[Fault]
+    reason: str
+    whole: bool
+
+    @property
+    def longest(self) -> tuple[int, int]:
+        """The longest part, the first of several; (0, 0) if there is none."""
+        return max(self.parts, key=lambda part: part[1] - part[0], default=(0, 0))
+
+
+def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | None) -> SoundPart:
+    """The intervals of an episode whose readings, at their start and at their end, are right.
+
+    A reading that a safety layer refuses does not show what the system did. A number that is not finite in single
+    precision would make a memory useless.
+
+    Args:
+        episode: one real episode of batch size ``n``, or its first intervals; its entry ``("next", "refused")``, if it
+            has one, marks the refused readings.
+        plant: plant that gives the length of an episode and the control interval.
+        report: report of the safety layer about this episode, if there is one.
+    """
+    refused, (overflow, faults) = _refused(episode, report), _overflows(episode, plant.dt)
+    faults = _reported(report) + faults
+    wrong = refused | overflow
+    wrong[1:] |= refused[:-1]  # what is read at the end of an interval is the start of the next one
+    said = []
+    if refused.any():
+        at = refused.nonzero().flatten().tolist()
+        said.append(f"the safety layer refused {len(at)} of its readings, the first at the end of interval {at[0]}")
+    said += [fault.detail for fault in faults if fault.kind == "overflow"][:1]
+    sound = (~wrong).tolist()
+    starts = [k for k, good in enumerate(sound) if good and (k == 0 or not sound[k - 1])]
+    ends = [k + 1 for k, good in enumerate(sound) if good and (k + 1 == len(sound) or not sound[k + 1])]
+    whole = len(episode) == plant.n_steps and all(sound)
+    return SoundPart(list(zip(starts, ends, strict=True)), faults, "; ".join(said), whole)
+
+
+def report_of(env: EnvBase) -> SafetyReport | None:
+    """The report of the safety layer of a real system about its last episode; None if there is none."""
+    inner: Any = env
+    while inner is not None and not isinstance(inner, SafetyLayer):
+        inner = getattr(inner, "env", None)
+    return inner.report if inner is not None and inner.reports else None
+
+
+def _refused(episode: TensorDictBase, report: SafetyReport | None) -> Bool[Tensor, " n"]:
+    """The intervals at whose end a safety layer has refused the reading, also where it did so later."""
+    n, found = len(episode), torch.zeros(len(episode), dtype=torch.bool, device="cpu")
+    if "refused" in episode["next"].keys():  # noqa: SIM118  (a TensorDict iterates over its batch)
+        found = episode["next", "refused"].flatten().cpu().clone()
+    for k in report.wrong if report is not None else ():
+        if k < n:
+            found[k] = True
+    return found
+
+
+def _overflows(episode: TensorDictBase, dt: float) -> tuple[Bool[Tensor, " n"], list[Fault]]:
+    """The intervals with numbers that are not finite in single precision, and a fault for each of their entries."""
+    found, faults = torch.zeros(len(episode), dtype=torch.bool, device="cpu"), []
+    for key in LEARNED:
+        wrong = ~(episode[key].abs() <= GREATEST)
+        rows = wrong.flatten(1).any(-1).cpu()
+        if rows.any():
+            k = int(rows.nonzero()[0, 0])
+            value = episode[key][wrong][0].item()
+            said = f"{key} holds {value:g} in interval {k}, which is not finite in single precision"
+            faults.append(Fault("overflow", k, k * dt, said))
+        found |= rows
+    return found, faults
+
+
+def _reported(report: SafetyReport | None) -> list[Fault]:
+    """The faults of a safety layer's report; a stretch of intervals with the same fault is one, at its beginning."""
+    found: list[Fault] = []
+    last: dict[str, int] = {}
+    for event in report.events if report is not None else ():
+        for kind, detail in event.reasons.items():
+            if kind not in FAULTS:
+                continue
+            if last.get(kind) != event.step - 1:
+                found.append(Fault(kind, event.step, event.time, detail))
+            last[kind] = event.step
+    return found
+
+
+def tried_in_vain(reasons: Sequence[str]) -> str:
+    """The error of several real episodes in a row from which nothing can be learned."""
+    return (
+        f"{len(reasons)} real episodes in a row cannot be learned from: {'; '.join(reasons)}. None of them was stored; "
+        "mend the system, its sensors, or the ranges of the safety layer, and go on with the next episode."
+    )

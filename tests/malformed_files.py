@@ -1,0 +1,226 @@
+"""Damaged and foreign files for every reader, and what no reader may do with them.
+
+A reader may return something sound, or raise a ValueError that names the file. Anything else is a defect.
+"""
+
+import json
+import math
+import struct
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from hypothesis import strategies as st
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.envs.wind_turbine.polars import Blade, Polar
+from rt_torchrl.envs.wind_turbine.power_coefficient import DATA, PowerCoefficientTable
+from rt_torchrl.envs.wind_turbine.turbsim import read_wind
+from rt_torchrl.envs.wind_turbine.wind_record import GREATEST_SPEED
+from rt_torchrl.identification.resampling import INTERVALS_PER_ROW, resample
+from rt_torchrl.identification.sensor_log import SensorLog, checked, read_log
+from rt_torchrl.runs import checkpoint
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_settings import as_written
+from rt_torchrl.runs.settings import BESIDE, config_of, read_settings
+from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
+
+PLANT = LinearQuadratic(horizon=2.0)
+
+
+class Reader(NamedTuple):
+    """A reader: the name of its file, a good file, and a function that reads it and requires a sound result."""
+
+    name: str
+    good: Callable[[], bytes]
+    read: Callable[[Path], None]
+
+
+def written(name: str, write: Callable[[Path], object]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
+
+
+def log() -> SensorLog:
+    t = 0.1 * np.arange(60)
+    columns = {"position": np.sin(t), "velocity": np.cos(t), "force": 0.1 * np.sin(3 * t), "disturbance": 0.0 * t}
+    return SensorLog(times=t, columns=columns)
+
+
+def read_sensor_log(path: Path) -> None:
+    found = checked(read_log(path, PLANT), PLANT)
+    resampled = resample(found, PLANT)
+    for segment in resampled.segments:
+        assert all(part.isfinite().all() for part in segment[:3])
+        # What the plant's signals may be, and no more intervals than the rows can tell of.
+        assert segment.actions.abs().max() <= 2.0
+    assert sum(len(s.actions) for s in resampled.segments) <= INTERVALS_PER_ROW * len(found.times)
+
+
+def wind_text() -> bytes:
+    rows = [
+        f"{0.5 * k:8.3f}{8.0 + 0.1 * k:8.2f}{0.0:8.2f}{0.1:8.2f}{0:8.3f}{0.2:8.3f}{0:8.3f}{0:8.2f}" for k in range(20)
+    ]
+    return ("! wind\n" + "\n".join(rows) + "\n").encode()
+
+
+def wind_field() -> bytes:
+    u = 8.0 + np.sin(np.arange(20 * 3 * 3)).reshape(20, 3, 3)
+    slope = 65535.0 / (u.max() - u.min())
+    offset = -32768.0 - slope * u.min()
+    header = struct.pack("<h4i6f", 7, 3, 3, 0, 20, 10.0, 8.0, 0.05, 8.0, 85.0, 75.0)
+    header += struct.pack("<6f", slope, offset, 3.0, 1.0, 5.0, -2.0) + struct.pack("<i", 4) + b"text"
+    raw = np.zeros((20, 9, 3), dtype="<i2")
+    raw[..., 0] = np.clip(np.rint(slope * u + offset), -32768, 32767).reshape(20, 9)
+    return header + raw.tobytes()
+
+
+def read_wind_file(path: Path) -> None:
+    found = read_wind(path)
+    assert np.isfinite(found.speed).all() and (np.diff(found.time) > 0).all()
+    assert found.speed.min() >= 0.0 and found.speed.max() <= GREATEST_SPEED
+
+
+def read_table(path: Path) -> None:
+    table = PowerCoefficientTable.from_csv(path)
+    probe = torch.tensor([[7.0, 0.0], [9.0, 10.0]]).double()
+    assert table(probe).isfinite().all() and table.values.max() <= 16 / 27
+
+
+def read_polar(path: Path) -> None:
+    assert all(np.isfinite(part).all() for part in Polar.from_csv(path)(np.linspace(-180.0, 180.0, 50)))
+
+
+def read_blade(path: Path) -> None:
+    blade = Blade.from_csv(path)
+    assert np.isfinite(blade.chord).all() and (np.diff(blade.r) > 0).all()
+
+
+@cache
+def weights() -> dict:
+    generator = torch.Generator().manual_seed(0)
+    return {
+        "policy": {"gain": torch.randn(3, 5, generator=generator, dtype=torch.float64)},
+        "names": ["a", None, True, 0.5],
+    }
+
+
+def read_weights(path: Path) -> None:
+    found = load_tensors(path)
+    if "policy" in found:  # a byte between the parts says nothing of the content
+        assert torch.equal(found["policy"]["gain"], weights()["policy"]["gain"])
+
+
+def content() -> dict:
+    return {"format": checkpoint.FORMAT, "episodes": [{"episode": 0}], "state": {"plant": "p", "algorithm": weights()}}
+
+
+class Holder:
+    """What takes a checkpoint's state, as an algorithm does."""
+
+    class twin:
+        plant = type("Named", (), {"name": "p"})
+
+    def load_state_dict(self, state: dict) -> None:
+        assert torch.equal(state["policy"]["gain"], weights()["policy"]["gain"])
+
+
+def read_checkpoint(path: Path) -> None:
+    assert checkpoint.load(path, Holder()) == [{"episode": 0}]
+
+
+def read_config(path: Path) -> None:
+    settings = read_settings(path.parent)
+    config = config_of(RunConfig, {key: value for key, value in settings.items() if key not in BESIDE})
+    assert math.isfinite(config.noise) and config.episodes >= 1
+
+
+READERS = {
+    "log.csv": Reader("log.csv", lambda: written("log.csv", log().write), read_sensor_log),
+    "log.parquet": Reader("log.parquet", lambda: written("log.parquet", log().write), read_sensor_log),
+    "wind.hh": Reader("wind.hh", wind_text, read_wind_file),
+    "wind.bts": Reader("wind.bts", wind_field, read_wind_file),
+    "C_p table": Reader("table.csv", (DATA / "nrel5mw_Cp_table_rosco.csv").read_bytes, read_table),
+    "polar": Reader("polar.csv", (DATA / "nrel5mw_polar_DU21_A17.csv").read_bytes, read_polar),
+    "blade": Reader("blade.csv", (DATA / "nrel5mw_blade_17nodes.csv").read_bytes, read_blade),
+    "weights.pt": Reader(
+        "weights.pt", lambda: written("weights.pt", lambda p: save_tensors(p, weights())), read_weights
+    ),
+    "checkpoint.pt": Reader(
+        "checkpoint.pt", lambda: written("checkpoint.pt", lambda p: save_tensors(p, content())), read_checkpoint
+    ),
+    "config.json": Reader(
+        "config.json",
+        lambda: json.dumps(as_written(RunConfig()) | {"plant": "p"}, indent=2).encode(),
+        read_config,
+    ),
+}
+GOOD = {name: reader.good() for name, reader in READERS.items()}
+WORDS = "nan,inf,-inf,1e308,-1,0,,x,1e999,2026-01-01,\",;,-0.0,99999999999999999999,µ,[],{},true,null,NaN,#,'"
+TOKENS = [*(word.encode() for word in WORDS.split(",")), b",", b"\n", b"\x00", b"\xff\xfe"]
+EDITS = ("flip", "cut", "insert", "delete", "repeat", "swap", "token", "bytes")
+
+
+def spoilt(whole: bytes, edit: str, at: float, span: int, token: bytes) -> bytes:
+    """The file after one edit at a share of its length."""
+    n = len(whole)
+    k = min(int(at * n), max(0, n - 1))
+    if edit == "flip" and n:
+        return whole[:k] + bytes([whole[k] ^ (1 << span % 8)]) + whole[k + 1 :]
+    if edit == "cut":
+        return whole[:k]
+    if edit == "insert":
+        return whole[:k] + token * (1 + span % 3) + whole[k:]
+    if edit == "delete":
+        return whole[:k] + whole[k + span :]
+    if edit == "repeat":
+        return whole[: k + span] + whole[k:]
+    if edit == "swap":
+        lines = whole.split(b"\n")
+        one, other = int(at * len(lines)) % len(lines), span % len(lines)
+        lines[one], lines[other] = lines[other], lines[one]
+        return b"\n".join(lines)
+    if edit == "token":  # in the place of an entry of a table or a value
+        start = max(whole.rfind(mark, 0, k) for mark in (b",", b"\n", b":", b" ")) + 1
+        ends = [end for mark in (b",", b"\n", b" ") if (end := whole.find(mark, k)) >= 0]
+        return whole[:start] + token + whole[min(ends, default=n) :]
+    return whole[:k] + struct.pack("<i", (-1) ** span * 2 ** (span % 31)) + whole[k + 4 :]
+
+
+EDIT = st.tuples(st.sampled_from(EDITS), st.floats(0.0, 1.0), st.integers(1, 200), st.sampled_from(TOKENS))
+
+
+def damaged(name: str) -> st.SearchStrategy[bytes]:
+    """Files of a reader: good ones after one to four edits, and, seldom, any bytes."""
+
+    def edited(edits: list[tuple]) -> bytes:
+        found = GOOD[name]
+        for edit in edits:
+            found = spoilt(found, *edit)
+        return found
+
+    return st.one_of(*[st.lists(EDIT, min_size=1, max_size=4).map(edited)] * 9, st.binary(max_size=400))
+
+
+def outcome(name: str, file: bytes, folder: Path) -> str:
+    """What a reader does with a file: refused, sound, or a defect in words."""
+    reader = READERS[name]
+    path = folder / reader.name
+    path.write_bytes(file)
+    try:
+        reader.read(path)
+    except ValueError as error:
+        return "refused" if str(error) else "a message without words"
+    except AssertionError as error:
+        return f"wrong accepted: {error}"
+    except Exception as error:
+        return f"raw: {type(error).__name__}: {error}"
+    finally:
+        for left in folder.glob("*"):
+            left.unlink()
+    return "sound"

@@ -1,0 +1,131 @@
+"""Operating limits: held on the real side, predicted on the twin before a policy acts, and counted."""
+
+import dataclasses
+
+import pytest
+import torch
+from linear_quadratic import LinearGain, LinearQuadratic
+from small_runs import SMALL
+from test_algorithm import twinning
+
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_settings import as_written
+from rt_torchrl.runs.settings import config_of
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.operating_limits import OperatingLimits
+from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
+from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+
+LIMITS = OperatingLimitsConfig(states={"velocity": (-3.0, 3.0)}, actions={"force": (-1.0, 1.0)}, rates={"force": 5.0})
+
+
+def limited(limits=LIMITS, **options):
+    plant = LinearQuadratic(horizon=2.0)
+    parts = twinning(plant, limits=OperatingLimitsConfig(), **options)
+    config = SafetyConfig(interval=plant.dt, **OperatingLimits(plant, limits).safety())
+    layer = SafetyLayer(PlantEnv(plant, seed=0), config, fallback=(0.0,))
+    return ReinforcementTwinning(
+        layer,
+        parts.twin,
+        config=dataclasses.replace(parts.config, limits=limits),
+        generator=torch.Generator().manual_seed(0),
+        **parts.policies,
+    )
+
+
+def test_what_leaves_a_limit_is_found_by_hand():
+    plant = LinearQuadratic(horizon=0.4)
+    states = torch.tensor([[0.0, 9.0], [0.0, 3.0], [9.0, -3.1], [0.0, 0.0], [0.0, 0.0]]).double()
+    actions = torch.tensor([[1.0], [0.5], [-0.1], [1.1]]).double()
+    found = OperatingLimits(plant, LIMITS).broken(Trajectory(states, actions, torch.zeros(4, 1).double()))
+    # The first state is nobody's fault; steps of 0.5 are 5 N/s.
+    assert found["states"].tolist() == [False, True, False, False]
+    assert found["actions"].tolist() == [False, False, False, True]
+    assert found["rates"].tolist() == [False, False, True, True]
+
+
+def test_the_layer_holds_them_for_every_policy_and_the_record_counts():
+    found = limited(dataclasses.replace(LIMITS, tolerated=1.0))
+    found.policies["model_free"].gain.data.fill_(40.0)
+    report = found.episode()
+    applied = found.short_term[-1].actions
+    assert applied.abs().max() == 1.0 and applied.diff(dim=0).abs().max() <= 0.5 + 1e-12
+    assert report["violations/actions"] == report["violations/rates"] == 0
+    velocities = found.short_term[-1].states[1:, 1]
+    assert report["violations/states"] == (velocities.abs() > 3.0).sum()
+    assert found.env.report.counts["limit"] == report["violations/states"]
+
+
+def test_a_policy_that_would_leave_them_does_not_act():
+    found = limited(dataclasses.replace(LIMITS, tolerated=0.2))
+    for policy in found.policies.values():
+        policy.gain.data.fill_(0.05)
+    found.episode()
+    found.planner.policy.gain.data.fill_(0.05)
+    wild = LinearGain([[80.0, -80.0]]).state_dict()
+    found.policies[found.referee.live].load_state_dict(wild)
+    idle, live = found.referee.idle, found.referee.live
+    cleared = found.clearance.choose(live, 5)
+    assert cleared.role == idle and f"{live} may not act" in cleared.report["reason"]
+    assert cleared.report["predicted_violations"] <= 0.2
+    # The oracle: the same share by a flight of the twin.
+    episodes = found.virtual.draw(5)
+    share = found.clearance.predicted(found.policies[live], episodes)
+    flown = found.twin.control(found.policies[live], *episodes)
+    beyond = (flown.states[:, 1:, 1].abs() > 3.0) | (flown.actions[..., 0].abs() > 1.0)
+    jumps = torch.cat([torch.zeros(5, 1), flown.actions[..., 0].diff(dim=1)], 1).abs() > 0.5 * (1 + 1e-9)
+    assert share == pytest.approx((beyond | jumps).double().mean().item()) and share > 0.2
+    # Neither: the weights that were cleared last act, under their role.
+    found.policies[idle].load_state_dict(wild)
+    last = found.clearance.choose(live, 5)
+    assert last.role == idle and last.policy is not found.policies[idle] and "reason" in last.report
+    assert torch.equal(last.policy.gain, torch.full_like(last.policy.gain, 0.05))
+    assert found.interact()["live"] == idle
+    assert torch.equal(found.track_record.policy_flown().gain, last.policy.gain)
+
+
+def test_without_a_policy_that_may_act_the_training_says_so():
+    found = limited(dataclasses.replace(LIMITS, states={"position": (-1e-3, 1e-3)}))
+    found.episode()
+    with pytest.raises(ValueError, match="no policy may act. .*would leave the limits in .* --start controller"):
+        found.episode()
+
+
+def test_a_run_in_simulation_is_guarded_and_resumed_to_the_bit(tmp_path):
+    def run(folder, **options):
+        twinning = dataclasses.replace(SMALL, limits=dataclasses.replace(LIMITS, tolerated=0.9))
+        shared = {"compiled": False, "unseen": 2, "untrained": 0, "figures": False}
+        config = RunConfig(log_dir=folder, twinning=twinning, **shared, **options)
+        assert config_of(RunConfig, as_written(config) | {"log_dir": None, "resume": False}).twinning == twinning
+        return Run(config, LinearQuadratic(horizon=2.0))
+
+    whole = run(tmp_path / "whole", episodes=3).train()["episodes"]
+    assert all("violations/states" in record for record in whole)
+    assert [("predicted_violations" in record) for record in whole] == [False, True, True]
+    run(tmp_path / "cut", episodes=2).train()
+    resumed = run(tmp_path / "cut", episodes=3, resume=True).train()["episodes"]
+    assert [{**record, "seconds": 0} for record in resumed] == [{**record, "seconds": 0} for record in whole]
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"states": {"speed": (0.0, 1.0)}}, "limits.states has speed; the plant has position, velocity"),
+        ({"actions": {"force": (3.0, 4.0)}}, "leave nothing of the action's range"),
+        ({"actions": {"force": (1.0, -1.0)}}, "least value first"),
+        ({"rates": {"force": 0.0}}, "must be positive"),
+        ({"rates": {"force": float("nan")}}, "must be positive"),
+        ({"tolerated": 2.0}, r"limits.tolerated=2.0 must lie in \[0, 1\]"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(limits, message):
+    with pytest.raises(ValueError, match=message):
+        OperatingLimits(LinearQuadratic(), OperatingLimitsConfig(**limits))
+
+
+def test_limits_need_a_safety_layer():
+    with pytest.raises(ValueError, match="no safety layer that holds them"):
+        twinning(limits=LIMITS)
