@@ -6,6 +6,7 @@ real system. The other is idle: it learns at the same time and can take over.
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
+from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -29,6 +31,7 @@ from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
+from rt_torchrl.twinning.operating import Operating
 from rt_torchrl.twinning.own_policies import require_own_policies
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
@@ -44,7 +47,7 @@ class ReinforcementTwinning:
     """The algorithm; call :meth:`episode` once per real episode.
 
     Args:
-        env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
+        env: the real system, of batch size 1: :class:`PlantEnv`, :class:`RealSystem`, or an :class:`Operation` of one.
         twin: the digital twin, whose closure is trained in place.
         model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based`` or with ``first``.
         model_based: policy π_mb, trained in place, or :class:`PredictiveControl` on the twin's closure.
@@ -62,7 +65,7 @@ class ReinforcementTwinning:
 
     def __init__(
         self,
-        env: EnvBase,
+        env: EnvBase | Operation,
         twin: DigitalTwin,
         *,
         model_free: nn.Module,
@@ -76,8 +79,8 @@ class ReinforcementTwinning:
     ):
         self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        acting: Role = "model_free" if first is None else first.live
-        acting = acting if config.arm == "twinning" else config.arm
+        begun: Role = "model_free" if first is None else first.live
+        acting = begun if config.arm == "twinning" else config.arm
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, acting)
@@ -86,14 +89,15 @@ class ReinforcementTwinning:
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses)
         self.short_term = ShortTermMemory(config.records)
         self.track_record = TrackRecord(self.policies)
-        experience = max(config.records, config.planner.experience)
-        self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        seen = max(config.records, config.planner.experience)
+        self.virtual = VirtualEpisodes(twin, config.exogenous, seen, generator=generator)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
-        self.collector = collector_of(env, self.actor, twin.plant)
+        self.operating = Operating(env, self) if isinstance(env, Operation) else None
+        self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)
         self.episodes_done = 0
         self.earlier = EarlierClosure(twin, model_based, self.planner, generator)
 
@@ -126,6 +130,7 @@ class ReinforcementTwinning:
             merged(report, self.earlier.sound(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
+        self.operating.hand_over(self.referee.live, self.episodes_done) if self.operating else None
         return EpisodeReport(report.update({"seconds": findings(**seconds)}))
 
     def start(self) -> TensorDict:
@@ -136,10 +141,11 @@ class ReinforcementTwinning:
             part.restart()
         if not pupils:
             return findings()
-        flights = self.first.flights(lambda policy: fly(self.actor, self.collector.rollout, policy, strength=0.0))
+        alone = partial(fly, self.actor, self.collector.rollout, strength=0.0)
+        flights = self.first.flights(self.operating.fly_first if self.operating else alone)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
         for flight in flights:
-            self._keep(flight)
+            self.keep(flight)
             self.virtual.learn(flight.record) if on_twin else None
         if on_twin:
             self.assimilate(records)
@@ -153,6 +159,8 @@ class ReinforcementTwinning:
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
+        if self.operating is not None:
+            return self.operating.take(self.referee.live, self.episodes_done)
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
         acting = self.actor.exploring(self.policies[live], self.episodes_done)
         self.learning.adopt(acting)
@@ -166,10 +174,11 @@ class ReinforcementTwinning:
     def _flown(self, policy: nn.Module, *, strength: float) -> Flight:
         """An episode on the real system, which both memories hold; of those that :func:`fly` refuses, none does."""
         flight = fly(self.actor, self.collector.rollout, policy, strength=strength)
-        self._keep(flight)
+        self.keep(flight)
         return flight
 
-    def _keep(self, flight: Flight) -> None:
+    def keep(self, flight: Flight) -> None:
+        """Give a flight to both memories."""
         self.learner.store(flight.transitions)
         self.short_term.append(flight.record)
 
@@ -251,8 +260,7 @@ class ReinforcementTwinning:
         """
         live, idle = self.referee.live, self.referee.idle
         report = self.cloning.clone(
-            self.policies[live],
-            self.policies[idle],
+            *(self.policies[role] for role in (live, idle)),
             seen=self.learner.observations,
             record=self.short_term[-1],
             costs=(costs[live].item(), costs[idle].item()),
@@ -280,8 +288,7 @@ class ReinforcementTwinning:
             ValueError: if the state of a component does not fit; it names the component.
         """
         state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
-        parts: dict[str, tuple[Any, Any]]
-        parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
+        parts: dict[str, tuple[Any, Any]] = {r: (policy, state["policies"][r]) for r, policy in self.policies.items()}
         parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
         load_parts(parts)

@@ -49,9 +49,17 @@ class TrackRecord:
         self._policies = policies
         self._flown: deque[Flown] = deque(maxlen=KEPT)
 
-    def append(self, trajectory: Trajectory, role: Role, cost: float, exploration: float = 0.0) -> None:
-        """Add an episode that the policy with this role has just flown."""
-        weights = {name: weight.detach().clone() for name, weight in self._policies[role].state_dict().items()}
+    def append(
+        self,
+        trajectory: Trajectory,
+        role: Role,
+        cost: float,
+        exploration: float = 0.0,
+        weights: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        """Add an episode that the policy with this role has just flown, with its present weights or with others."""
+        weights = self._policies[role].state_dict() if weights is None else weights
+        weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self._flown.append(Flown(trajectory, role, weights, cost, exploration))
 
     @property
