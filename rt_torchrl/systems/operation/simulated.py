@@ -99,7 +99,7 @@ class SimulatedOperation:
         return window
 
     def close(self) -> None:
-        self.operator.env.close()
+        """Do nothing, because the system stands still between two windows."""
 
     def state_dict(self) -> dict[str, Any]:
         return {
