@@ -37,6 +37,11 @@ class Pace:
         """Begin anew: the next interval is due at once."""
         self._due = None
 
+    def shift(self, seconds: float | None) -> None:
+        """Move all intervals to come by some time [s]; with None the present moment is when this one was due."""
+        now = self._clock()
+        self._due = now if seconds is None or self._due is None else self._due + seconds
+
     def wait(self) -> float:
         """Wait until the next interval is due; by how much it begins late [s]."""
         now = self._clock()
