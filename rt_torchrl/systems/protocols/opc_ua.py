@@ -2,6 +2,7 @@
 
 import asyncio
 import concurrent.futures
+import contextlib
 import logging
 import threading
 from collections.abc import Coroutine, Mapping, Sequence
@@ -55,6 +56,7 @@ class OpcUaLink:
         self._package, self.url, self.timeout = asyncua(), url, timeout
         self._read, self._written = dict(read), dict(written)
         self._client: Any = None
+        self._broken = False
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def connect(self) -> None:
@@ -63,8 +65,13 @@ class OpcUaLink:
             threading.Thread(target=self._loop.run_forever, daemon=True).start()
         self._disconnect()
         client = self._package.Client(self.url, timeout=CONNECT)
-        self._within(client.connect(), CONNECT)
-        self._client = client
+        try:
+            self._within(client.connect(), CONNECT)
+        except LinkLostError:
+            self._client = client  # whose tasks end with the next attempt
+            self._disconnect()
+            raise
+        self._client, self._broken = client, False
         self._sources = [client.get_node(identifier) for identifier in self._read.values()]
         self._targets = {tag: client.get_node(identifier) for tag, identifier in self._written.items()}
 
@@ -98,17 +105,21 @@ class OpcUaLink:
             return future.result(timeout)
         except (TimeoutError, concurrent.futures.TimeoutError, asyncio.TimeoutError) as error:
             future.cancel()
+            self._broken = True
             raise LinkLostError(f"{self.url} has not answered within {timeout:g} s.") from error
         except (OSError, self._package.ua.UaError, asyncio.CancelledError, concurrent.futures.CancelledError) as error:
+            self._broken = True
             raise LinkLostError(f"{self.url}: {type(error).__name__}: {error}") from error
 
     def _disconnect(self) -> None:
         client, self._client = self._client, None
-        if client is not None:
-            try:
-                self._within(client.disconnect(), CONNECT)
-            except LinkLostError:
-                return  # which is what was wanted
+        if client is None or self._loop is None:
+            return
+        if self._broken:
+            # Without a socket, the package ends its tasks at once instead of waiting for a server's farewell.
+            self._loop.call_soon_threadsafe(client.disconnect_socket)
+        with contextlib.suppress(LinkLostError):  # which is what is wanted
+            self._within(client.disconnect(), CONNECT)
 
     def close(self) -> None:
         if self._loop is not None:
