@@ -17,6 +17,11 @@ from .baselines.classical import ClassicalController
 from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
 from .systems.environment import PlantEnv
 from .systems.exploration import ExplorationConfig
+from .systems.operation.config import OperationConfig
+from .systems.protocols.connected_plant import ConnectedPlant
+from .systems.protocols.link import Link, LinkLostError
+from .systems.protocols.modbus import ModbusLink
+from .systems.protocols.opc_ua import OpcUaLink
 from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyLayer
@@ -91,6 +96,7 @@ __all__ = [
     "Clairvoyant",
     "ClassicalController",
     "Component",
+    "ConnectedPlant",
     "ContractReport",
     "Decaying",
     "DecisionTree",
@@ -116,10 +122,15 @@ __all__ = [
     "Learner",
     "LearnerConfig",
     "LimitConfig",
+    "Link",
+    "LinkLostError",
     "LoadedRun",
     "LogConfig",
     "LongTermMemoryConfig",
     "Measurement",
+    "ModbusLink",
+    "OpcUaLink",
+    "OperationConfig",
     "Planner",
     "PlannerConfig",
     "Plant",

@@ -21,14 +21,8 @@ def served(plant, protocol, *, safe, period, seed=0):
     port, ended, started = free_port(), threading.Event(), threading.Event()
     running = ServedPlant(plant, safe, seed=seed)
     board = BOARDS[protocol](running.tags, port)
-    show = board.show
-
-    async def shown(values):
-        started.set()
-        await show(values)
-
-    board.show = shown
-    work = threading.Thread(target=lambda: asyncio.run(serve(running, board, period, ended=ended.is_set)), daemon=True)
+    serving = serve(running, board, period, ended=ended.is_set, begun=started.set)
+    work = threading.Thread(target=lambda: asyncio.run(serving), daemon=True)
     work.start()
     assert started.wait(30.0)
     try:

@@ -125,7 +125,7 @@ class RunConfig:
         for argument in ("hidden", "closure_hidden"):
             require_widths(argument, getattr(self, argument))
         self._check_ranges()
-        if not self.asynchronous and self.operation != OperationConfig():
+        if not self.asynchronous and self.operation != self.usual_operation():
             raise ValueError("operation.* says how an asynchronous run operates; give --asynchronous, too.")
 
     def _check_ranges(self) -> None:
@@ -158,6 +158,11 @@ class RunConfig:
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
+
+    @staticmethod
+    def usual_operation() -> OperationConfig:
+        """The default of ``operation``; override this method where a recipe has another one."""
+        return OperationConfig()
 
     def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
         """The policy that the options ask for, with random initial weights.

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.systems.pace import Pace
-from rt_torchrl.systems.protocols.link import Link, LinkLostError
+from rt_torchrl.systems.protocols.link import LateAnswerError, Link, LinkLostError
 
 FRESH = 0.5
 """Share of the period for which the client waits for a new sample after it was due."""
@@ -22,6 +22,8 @@ LOOKS = 20
 """Number of looks for a new sample in a period."""
 EARLIER = 0.01
 """Share of the period by which the next look comes earlier where the sample was there at once; it keeps the phase."""
+TOLERATED = 4
+"""Number of late answers in a row after which a connection counts as lost."""
 AGAIN = 0.05
 """Time between two attempts to connect [s]."""
 
@@ -32,11 +34,14 @@ class ConnectedPlant(EnvBase):
     The plant's clock is the master: where a tag counts samples, the client follows it, and a reading that is no newer
     than the last one is not passed on as a new one. Where a reading does not come in time, because the connection is
     lost or the plant has stopped, the entries are NaN until the plant answers again. A safety layer in front of this
-    environment then marks them, and asks for its fallback. The plant must have a watchdog of its own, which brings its
-    safe action when commands stay out, as :class:`ServedPlant` has. A thread connects again, so that the pace is kept.
+    environment then marks them, and asks for its fallback. The entry ``skipped`` is the number of samples between this
+    reading and the last one that nobody read; where it is not zero, a transition is longer than one interval.
 
-    The attribute ``losses`` counts lost connections, ``stale`` the readings that did not come in time although the
-    plant answered, and ``skipped`` the samples between two readings that nobody read.
+    The plant must have a watchdog of its own, which brings its safe action when commands stay out, as
+    :class:`ServedPlant` has. A thread connects again, so that the pace is kept.
+
+    The attribute ``losses`` counts lost connections, ``late`` the answers that did not come in time, ``stale`` the
+    readings of a plant that answered and had no new sample, and ``skipped`` all samples that nobody read.
 
     Args:
         link: connection to the plant.
@@ -83,11 +88,13 @@ class ConnectedPlant(EnvBase):
         self._entries_of = {key: tuple(tags) for key, tags in entries.items()}
         self._commands, self._sample_tag, self._answered = tuple(commands), sample, answered
         self._patience, self._clock, self._sleep = patience, clock, sleep
-        self.losses = self.stale = self.skipped = 0
+        self.losses = self.late = self.stale = self.skipped = 0
+        self._in_a_row = self._gap = 0
         self._sample, self._connected, self._closing = -math.inf, False, False
         self._mender: threading.Thread | None = None
         double = {"dtype": torch.float64}
-        self.observation_spec = Composite({key: Unbounded((len(tags),), **double) for key, tags in entries.items()})
+        sizes = {key: len(tags) for key, tags in entries.items()} | {"skipped": 1}
+        self.observation_spec = Composite({key: Unbounded((n,), **double) for key, n in sizes.items()})
         low, high = bounds(tuple(actions))
         self.action_spec = Bounded(low, high, (len(actions),), **double)
         self.reward_spec = Unbounded((1,), **double)
@@ -119,8 +126,8 @@ class ConnectedPlant(EnvBase):
         if self._connected:
             try:
                 self.link.write(values)
-            except LinkLostError:
-                self._lose()
+            except LinkLostError as error:
+                self._lose(error)
         self.pace.wait()
         found = self._fresh() if self._connected else None
         ends = {"done": torch.zeros(1, dtype=torch.bool), "reward": torch.zeros(1, dtype=torch.float64)}
@@ -133,6 +140,7 @@ class ConnectedPlant(EnvBase):
             while True:
                 found = self.link.read()
                 if self._sample_tag is None:
+                    self._in_a_row = 0
                     return found
                 sample = found[self._sample_tag]
                 if math.isfinite(sample) and sample != self._sample:
@@ -143,15 +151,15 @@ class ConnectedPlant(EnvBase):
                     self.stale += 1
                     return None
                 self._sleep(self.pace.period / LOOKS)
-        except LinkLostError:
-            self._lose()
+        except LinkLostError as error:
+            self._lose(error)
             return None
 
     def _follow(self, sample: float, looks: int) -> None:
         """Keep the phase of the plant's clock: be there when the sample comes, and not long after it."""
-        if sample > self._sample + 1.0 and math.isfinite(self._sample):
-            self.skipped += int(sample - self._sample) - 1
-        self._sample = sample
+        self._gap = int(sample - self._sample) - 1 if math.isfinite(self._sample) and sample > self._sample else 0
+        self.skipped += self._gap
+        self._sample, self._in_a_row = sample, 0
         self.pace.shift(-EARLIER * self.pace.period if looks == 0 else None)
 
     def _entries(self, found: dict[str, float] | None) -> TensorDict:
@@ -159,11 +167,18 @@ class ConnectedPlant(EnvBase):
         for key, tags in self._entries_of.items():
             numbers = [math.nan if found is None else found[tag] for tag in tags]
             values[key] = torch.tensor(numbers, dtype=torch.float64)
+        gap, self._gap = self._gap, 0
+        values["skipped"] = torch.tensor([float(gap)], dtype=torch.float64)
         return TensorDict(values, batch_size=self.batch_size)
 
-    def _lose(self) -> None:
-        """Note a lost connection, and connect again beside the control loop."""
-        self._connected = False
+    def _lose(self, error: LinkLostError) -> None:
+        """Note a late answer, or a lost connection, and then connect again beside the control loop."""
+        if isinstance(error, LateAnswerError):
+            self.late += 1
+            self._in_a_row += 1
+            if self._in_a_row < TOLERATED:
+                return
+        self._connected, self._in_a_row = False, 0
         self.losses += 1
         if self._mender is None:
             self._mender = threading.Thread(target=self._mend, daemon=True)

@@ -8,6 +8,10 @@ class LinkLostError(OSError):
     """The plant does not answer: the connection is lost, or an answer did not come in time."""
 
 
+class LateAnswerError(LinkLostError):
+    """An answer did not come in time; the connection may still be there."""
+
+
 @runtime_checkable
 class Link(Protocol):
     """A connection to a plant's control system. A tag is a named number there.

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rt_torchrl.systems.protocols.link import LinkLostError
+from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError
 
 WIDTH = 4
 """Number of registers of a number in double precision."""
@@ -23,6 +23,7 @@ def pymodbus() -> Any:
     try:
         import pymodbus
         import pymodbus.client
+        import pymodbus.exceptions
         import pymodbus.server
         import pymodbus.simulator
     except ImportError as error:
@@ -90,12 +91,14 @@ class ModbusLink:
         if sorted(written.values()) != list(range(self._first_written, self._first_written + count, WIDTH)):
             raise ValueError(f"written={dict(written)} must be addresses one behind the other, {WIDTH} apart.")
         self._client = self._package.client.ModbusTcpClient(host, port=port, timeout=timeout, retries=0)
-        self._kind = self._client.DATATYPE.FLOAT64
+        self._kind, self._joined = self._client.DATATYPE.FLOAT64, False
 
     def connect(self) -> None:
         self._client.close()
+        self._joined = False
         if not self._asked(self._client.connect):
             raise LinkLostError(f"{self.address} does not answer.")
+        self._joined = True
 
     def read(self) -> dict[str, float]:
         answer = self._asked(
@@ -125,7 +128,12 @@ class ModbusLink:
             LinkLostError: if it does not come in time, or the server refuses.
         """
         try:
+            if self._joined and not self._client.connected and not self._client.connect():
+                raise LinkLostError(f"{self.address} does not answer.")
             answer = request(*arguments, **options)
+        except self._package.exceptions.ModbusIOException as error:
+            self._client.close()  # an answer that still comes would be taken for that of the next request
+            raise LateAnswerError(f"{self.address}: {error}") from error
         except (OSError, self._package.ModbusException) as error:
             self._client.close()
             raise LinkLostError(f"{self.address}: {type(error).__name__}: {error}") from error
@@ -135,4 +143,5 @@ class ModbusLink:
         return answer
 
     def close(self) -> None:
+        self._joined = False
         self._client.close()

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Coroutine, Mapping, Sequence
 from typing import Any, TypeVar
 
-from rt_torchrl.systems.protocols.link import LinkLostError
+from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError
 
 Result = TypeVar("Result")
 CONNECT = 4.0
@@ -106,7 +106,7 @@ class OpcUaLink:
         except (TimeoutError, concurrent.futures.TimeoutError, asyncio.TimeoutError) as error:
             future.cancel()
             self._broken = True
-            raise LinkLostError(f"{self.url} has not answered within {timeout:g} s.") from error
+            raise LateAnswerError(f"{self.url} has not answered within {timeout:g} s.") from error
         except (OSError, self._package.ua.UaError, asyncio.CancelledError, concurrent.futures.CancelledError) as error:
             self._broken = True
             raise LinkLostError(f"{self.url}: {type(error).__name__}: {error}") from error

@@ -112,7 +112,14 @@ BOARDS: dict[str, Callable[[Tags, int], Any]] = {"opcua": OpcUaBoard, "modbus": 
 """Boards by the name of their protocol."""
 
 
-async def serve(served: ServedPlant, board: Board, period: float, *, ended: Callable[[], bool]) -> None:
+async def serve(
+    served: ServedPlant,
+    board: Board,
+    period: float,
+    *,
+    ended: Callable[[], bool],
+    begun: Callable[[], None] = lambda: None,
+) -> None:
     """Run a plant at its pace until it is to end.
 
     Args:
@@ -120,10 +127,12 @@ async def serve(served: ServedPlant, board: Board, period: float, *, ended: Call
         board: its tags, which are started and stopped here.
         period: wall-clock time of a control interval [s].
         ended: function that says whether to end.
+        begun: function that is called when clients are answered.
     """
     await board.start()
     try:
         await board.show(served.published())
+        begun()
         due = time.monotonic()
         while not ended():
             due = max(due + period, time.monotonic())

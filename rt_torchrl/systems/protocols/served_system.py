@@ -18,8 +18,11 @@ from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 
 Protocol = Literal["opcua", "modbus"]
-ANSWER = 0.4
+ANSWER = 0.8
 """Share of the period within which the plant must answer a request."""
+
+NONE = (-0.5, 0.5)
+"""Range of a number of skipped samples that are none."""
 
 
 def link_to(protocol: Protocol, tags: Tags, port: int, *, period: float, host: str = "127.0.0.1") -> Link:
@@ -75,10 +78,8 @@ def served_system(
         answered=ANSWERED,
         patience=patience,
     )
-    ranges = {
-        "state": ([s.low for s in plant.readings], [s.high for s in plant.readings]),
-    }
-    bounded = {key: ends for key, ends in ranges.items() if any(map(math.isfinite, (*ends[0], *ends[1])))}
+    low, high = [s.low for s in plant.readings], [s.high for s in plant.readings]
+    bounded = {"skipped": NONE} | ({"state": (low, high)} if any(map(math.isfinite, (*low, *high))) else {})
     guarded = SafetyLayer(env, SafetyConfig(interval=plant.dt, ranges=bounded, log=log), fallback=tuple(safe))
     exogenous = Reading(keys=("exogenous",)) if plant.inputs else None
     return RealSystem(
