@@ -18,7 +18,7 @@ from rt_torchrl.trajectories.rollout import Rollout
 
 PLANT = LinearQuadratic(horizon=2.0)
 TAGS = Tags.of(PLANT)
-PROTOCOLS = ["opcua", "modbus"]
+PROTOCOLS = [pytest.param("opcua", marks=pytest.mark.slow), "modbus"]  # a server of OPC UA starts in seconds
 
 
 def test_a_served_plant_is_a_rollout_under_the_commands_that_answer_its_samples():
