@@ -40,7 +40,6 @@ class Crew:
         exploration: parameters of the noise.
         config: options of the operation.
         seed: seed of the noise.
-        core: core that the acting process has for itself; None for any.
     """
 
     make_env: Callable[[], EnvBase]
@@ -49,7 +48,6 @@ class Crew:
     exploration: ExplorationConfig
     config: OperationConfig
     seed: int
-    core: int | None = None
 
     def operator(self, env: EnvBase | None = None) -> Operator:
         """The operator of the real system.
@@ -67,7 +65,7 @@ class Crew:
         return Operator(env, actor, self.policies, continuous=self.config.continuous, pace=pace)
 
 
-def act(connection: Connection, parts: bytes, state: bytes | None) -> None:
+def act(connection: Connection, parts: bytes, state: bytes | None, core: int | None, realtime: bool) -> None:
     """Operate the real system until the learner says stop or has gone; the main function of the acting process.
 
     Two threads talk to the learner, so that the control loop never waits for it.
@@ -76,10 +74,13 @@ def act(connection: Connection, parts: bytes, state: bytes | None) -> None:
         connection: connection to the learner.
         parts: the pickled crew.
         state: pickled state of the operator to go on from; None for a new operation.
+        core: core that this process has for itself; None for any.
+        realtime: whether it runs before all others.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's, which then says stop
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH)
+    act_on(core, realtime=realtime)
     orders: SimpleQueue[Any] = SimpleQueue()
     windows: SimpleQueue[Any] = SimpleQueue()
     sender = threading.Thread(target=_send, args=(connection, windows), daemon=True)
@@ -87,7 +88,6 @@ def act(connection: Connection, parts: bytes, state: bytes | None) -> None:
     sender.start()
     try:
         crew: Crew = pickle.loads(parts)
-        act_on(crew.core)
         _operate(crew, None if state is None else pickle.loads(state), orders, windows)
     except BaseException as error:  # any error goes to the learner, because nobody sees this one
         windows.put(("failed", f"{type(error).__name__}: {error}", traceback.format_exc()))

@@ -29,6 +29,8 @@ class OperationConfig:
         core: number of the CPU core that the acting process has for itself, on the wall clock, where the operating
             system lets a process choose; -1 takes the last core that this process may use, and -2 leaves the choice to
             the operating system.
+        realtime: whether the acting process asks the operating system to run before all others, by the scheduler
+            SCHED_FIFO of Linux; it needs the right to, as root or by CAP_SYS_NICE.
 
     Raises:
         ValueError: if an option is out of its range, or is none of its choices.
@@ -41,6 +43,7 @@ class OperationConfig:
     handover: int = 20
     continuous: bool = False
     core: int = -1
+    realtime: bool = False
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -7,6 +7,9 @@ from pathlib import Path
 LAST, ANY = -1, -2
 """Values of a core: the last one that this process may use, and any."""
 
+PRIORITY = 10
+"""Priority of real-time scheduling; below that of the kernel's own threads."""
+
 
 def chosen_core(core: int) -> int | None:
     """The core that the acting process has for itself; None if it has none.
@@ -27,10 +30,28 @@ def chosen_core(core: int) -> int | None:
     return core
 
 
-def act_on(core: int | None) -> None:
-    """Let this process run on its own core alone."""
+def require_realtime() -> None:
+    """Refuse real-time scheduling where this process may not have it.
+
+    Raises:
+        ValueError: if the operating system has none, or does not allow it.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        raise ValueError("realtime=True needs the scheduler SCHED_FIFO of Linux; leave it out on this system.")
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except PermissionError as error:
+        raise ValueError(f"realtime=True is not allowed here ({error}); it needs root or CAP_SYS_NICE.") from error
+    os.sched_setscheduler(0, before, parameters)
+
+
+def act_on(core: int | None, *, realtime: bool) -> None:
+    """Let this thread and those that it will start run on their own core, and before all others if so wanted."""
     if core is not None:
         os.sched_setaffinity(0, {core})
+    if realtime:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
 
 
 def learn_beside(core: int | None) -> set[int] | None:

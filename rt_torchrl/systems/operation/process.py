@@ -1,6 +1,5 @@
 """Operation on the wall clock: the system is acted on in a process of its own while the learner learns."""
 
-import dataclasses
 import multiprocessing
 import pickle
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.operation.acting import STOP, Crew, act
-from rt_torchrl.systems.operation.cores import chosen_core, learn_beside, run_on
+from rt_torchrl.systems.operation.cores import chosen_core, learn_beside, require_realtime, run_on
 from rt_torchrl.systems.operation.event_log import EventLog
 from rt_torchrl.systems.operation.operation import segments_of
 from rt_torchrl.systems.operation.order import Order, OrderBook
@@ -44,9 +43,11 @@ class ProcessOperation:
     """
 
     def __init__(self, crew: Crew, system: EnvBase, *, log: EventLog | None = None):
-        self._core = chosen_core(crew.config.core)
+        self._core, self._realtime = chosen_core(crew.config.core), crew.config.realtime
+        if self._realtime:
+            require_realtime()
         try:
-            self._parts = pickle.dumps(dataclasses.replace(crew, core=self._core))
+            self._parts = pickle.dumps(crew)
         except Exception as error:  # pickle raises many kinds
             raise ValueError(
                 f"what acts cannot be sent to a process of its own ({type(error).__name__}: {error}); use the "
@@ -63,6 +64,11 @@ class ProcessOperation:
     def closure(self) -> nn.Module | None:
         closure: nn.Module | None = self.system.closure
         return closure
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the acting process; None while there is none."""
+        return None if self._process is None else self._process.pid
 
     @property
     def begun(self) -> bool:
@@ -88,7 +94,9 @@ class ProcessOperation:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         state = None if self._state is None else pickle.dumps(self._state)
-        self._process = context.Process(target=act, args=(theirs, self._parts, state), daemon=True)
+        self._process = context.Process(
+            target=act, args=(theirs, self._parts, state, self._core, self._realtime), daemon=True
+        )
         self._process.start()
         theirs.close()
         self._before = learn_beside(self._core)
