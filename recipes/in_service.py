@@ -58,10 +58,9 @@ class Config:
 
 def main(config: Config) -> None:
     # Here, because --help need not wait for TorchRL.
-    from rt_torchrl.export.exported_policy import load_policy
+    from rt_torchrl import ExplorationConfig, load_policy, served_system
     from rt_torchrl.systems.collectors import EpisodeCollector
-    from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-    from rt_torchrl.systems.protocols.served_system import served_system
+    from rt_torchrl.systems.exploration import LivePolicy
 
     torch.set_num_threads(1)
     make_folder("folder", config.folder)

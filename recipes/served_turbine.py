@@ -79,15 +79,14 @@ class Config(Turbine):
 
 def server_of(config: Config):
     """The context in which the turbine is in operation in a process of its own."""
-    from rt_torchrl.systems.protocols.server_process import ServerProcess
+    from rt_torchrl import ServerProcess
 
     options = {"protocol": config.protocol, "port": config.port, "period": config.period, "seed": config.seed}
     return ServerProcess(config.plant(), config.safe, **options)
 
 
 def main(config: Config) -> None:
-    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
-    from rt_torchrl.systems.protocols.served_system import served_system
+    from rt_torchrl import Run, served_system  # here, because --help need not wait for TorchRL
 
     if config.serve:
         return serve_alone(config)

@@ -144,9 +144,7 @@ def operate(config: Config, algorithm, server, until: float) -> tuple[list[dict[
 
 def main(config: Config) -> None:
     # Here, because --help need not wait for TorchRL.
-    from rt_torchrl.runs.run import Run
-    from rt_torchrl.systems.protocols.relay import Relay
-    from rt_torchrl.systems.protocols.served_system import served_system
+    from rt_torchrl import Relay, Run, served_system
 
     if not Path("/proc/self/fd").is_dir():
         raise ValueError("the soak reads memory and file handles from /proc, which this system does not have.")

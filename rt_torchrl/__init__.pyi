@@ -22,6 +22,9 @@ from .systems.protocols.connected_plant import ConnectedPlant
 from .systems.protocols.link import Link, LinkLostError
 from .systems.protocols.modbus import ModbusLink
 from .systems.protocols.opc_ua import OpcUaLink
+from .systems.protocols.relay import Relay
+from .systems.protocols.served_system import served_system
+from .systems.protocols.server_process import ServerProcess
 from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyLayer
@@ -80,6 +83,7 @@ from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
+from .export.exported_policy import ExportedPolicy, load_policy
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
 __version__: str
@@ -111,6 +115,7 @@ __all__ = [
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "ExportedPolicy",
     "FirstController",
     "Forecast",
     "Foreseen",
@@ -150,6 +155,7 @@ __all__ = [
     "Referee",
     "RefereeConfig",
     "ReinforcementTwinning",
+    "Relay",
     "Rollout",
     "Run",
     "RunConfig",
@@ -160,6 +166,7 @@ __all__ = [
     "SaturatedAffine",
     "SaturatedMLP",
     "Scenario",
+    "ServerProcess",
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
@@ -183,6 +190,7 @@ __all__ = [
     "export_program",
     "export_twin",
     "identification_cost",
+    "load_policy",
     "load_run",
     "main_of",
     "read_log",
@@ -190,5 +198,6 @@ __all__ = [
     "require_request",
     "require_stable_step",
     "rk4_step",
+    "served_system",
     "shipped_plants",
 ]

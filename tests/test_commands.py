@@ -23,7 +23,7 @@ def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
     if name == "unknown":
         return ["flapping_wing", *arguments]
-    if name in ("export", "real_time"):
+    if name in ("export", "in_service", "real_time"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments
@@ -96,5 +96,6 @@ def test_checks_that_are_printed_are_what_ci_runs():
     assert "uv run mypy" in script and any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
     rest = [command for command in commands() if command not in OF_A_RECIPE]
     known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow", "uv run pytest -m nightly"}
+    known.add("uv run pytest -m faults")
     assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs"}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
