@@ -81,8 +81,7 @@ def test_learning_in_no_time_is_the_synchronous_run_to_the_bit():
         assert one["real_cost"] == other["real_cost"] and one["live"] == other["live"] and one["windows"] == 1.0
 
 
-@pytest.mark.parametrize("continuous", [False, True])
-@pytest.mark.parametrize("learning", [7, 20, 53])
+@pytest.mark.parametrize(("learning", "continuous"), [(7, True), (20, False), (53, False)])
 def test_a_run_repeats_from_its_log_to_the_bit(tmp_path, learning, continuous):
     options = {"exploration": NOISY}
     log = EventLog(tmp_path / "events.jsonl")
@@ -195,7 +194,6 @@ def test_integrators_of_the_plant_carry_over():
         ("speed", math.inf),
         ("handover", 0),
         ("core", -3),
-        ("clock", "sundial"),
     ],
 )
 def test_impossible_options_are_refused(option, value):

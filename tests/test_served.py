@@ -27,7 +27,7 @@ def test_a_served_plant_is_a_rollout_under_the_commands_that_answer_its_samples(
     states = []
     for k, command in enumerate(asked.tolist()):
         states.append([plant.published()[f"state.{state.name}"] for state in PLANT.states])
-        plant.advance(k, [command])
+        plant.advance(float(k), [command])
     generator = torch.Generator().manual_seed(3)
     start, inputs = PLANT.draw_initial_state(1, generator), PLANT.draw_exogenous(1, generator)
     expected = Rollout(PLANT, PLANT.closure)(start, inputs, asked[None, :, None])
@@ -39,7 +39,7 @@ def test_a_served_plant_is_a_rollout_under_the_commands_that_answer_its_samples(
 def test_a_command_that_is_missing_or_wrong_brings_the_safe_action_in_its_interval(wrong):
     plant, applied = ServedPlant(PLANT, (-0.5,)), []
     for answered, command in [(0, 1.0), (1, 1.5), wrong, wrong, wrong, (5, 1.0)]:
-        plant.advance(answered, [command])
+        plant.advance(float(answered), [command])
         applied.append((plant.published()["applied.force"], plant.published()["safe"]))
     assert applied == [(1.0, 0.0), (1.5, 0.0), (-0.5, 1.0), (-0.5, 1.0), (-0.5, 1.0), (1.0, 0.0)]
     assert plant.missed == 3

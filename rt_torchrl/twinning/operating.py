@@ -1,6 +1,6 @@
 """Step 1 where the real system operates on while the algorithm learns."""
 
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 import torch
 from tensordict import TensorDict
@@ -21,6 +21,7 @@ NEVER = 2**31
 """Number of an episode whose weights are not drawn anew."""
 
 
+@runtime_checkable
 class Trainer(Protocol):
     """What :class:`Operating` needs of the algorithm."""
 

@@ -4,7 +4,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from rt_torchrl.systems.protocols.modbus import WIDTH, WRITTEN_AT, own_registers, pymodbus
 from rt_torchrl.systems.protocols.opc_ua import asyncua, own_nodes
@@ -12,6 +12,7 @@ from rt_torchrl.systems.protocols.served_plant import ServedPlant
 from rt_torchrl.systems.protocols.tags import ANSWERED, Tags
 
 
+@runtime_checkable
 class Board(Protocol):
     """The tags of a plant, as a server of some protocol shows them."""
 
