@@ -49,7 +49,7 @@ class Config:
             bench.
         compiled: compile the engines.
         eager: engines that are not compiled all the same, such as odeint_adjoint as torchdiffeq ships it.
-        repeats: greatest number of evaluations behind a median.
+        repeats: greatest number of turns behind a median, each of calls for a tenth of a second, at least one.
         limit: predicted time of one evaluation [s] above which a size is left out.
         minutes: time [min] after which nothing new begins; 0 sets no end.
         starts: whether to measure compilation and memory in fresh processes.

@@ -16,6 +16,7 @@ from rt_torchrl import (
     DescentConfig,
     ExogenousConfig,
     ExplorationConfig,
+    HypothesesConfig,
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
@@ -63,12 +64,14 @@ PAPER = TwinningConfig(
         receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
     ),
     referee=RefereeConfig(patience=4, clone_patience=20),
+    hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
     PAPER,
     planner=dataclasses.replace(
         PAPER.planner, iterations=12, descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6)
     ),
+    hypotheses=HypothesesConfig(),
 )
 """Configuration of the training by default, whose plans converge."""
 NEURAL = dataclasses.replace(

@@ -14,6 +14,7 @@ from rt_torchrl import (
     DescentConfig,
     ExogenousConfig,
     ExplorationConfig,
+    HypothesesConfig,
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
@@ -60,6 +61,7 @@ PAPER = TwinningConfig(
         iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
     ),
     referee=RefereeConfig(patience=4, clone_patience=4),
+    hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
     PAPER,
@@ -71,6 +73,7 @@ CONVERGED = dataclasses.replace(
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PREDICTIVE,
     ),
+    hypotheses=HypothesesConfig(),
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(
@@ -82,6 +85,9 @@ NEURAL = dataclasses.replace(
     ),
 )
 """Configuration of the training with ``--closure mlp``."""
+GROWTH = 4
+"""Growth of the plans of the paper's policy: thirty gradients do not pass the valley of its cost, and a hundred and
+twenty on the first gusts end where another gust throws the drone away."""
 
 
 OBSERVED = {"paper": "paper", "mlp": "measured+wind"}
@@ -155,6 +161,8 @@ class Config(RunConfig):
 
     def defaults(self) -> "Config":
         twinning = NEURAL if self.closure == "mlp" else PAPER if self.paper else CONVERGED
+        if self.policy == "paper" and twinning is CONVERGED:
+            twinning = dataclasses.replace(twinning, planner=dataclasses.replace(twinning.planner, growth=GROWTH))
         if self.paper:
             return Config(paper=True, policy="paper", start="random", twinning=twinning)
         return Config(twinning=self.suited(twinning))

@@ -53,7 +53,8 @@ class Config:
         seed: seed of the episodes; by default that of the unseen episodes of the trainings.
         horizon: length of an episode [s]; by default the plant's. A run has its own.
         hold: number of control intervals for which a command of the optimum is held; 0 for the plant's own.
-        starts: all, or classical to leave out constant and random commands.
+        starts: all, or classical to leave out constant and random commands; the policies of a run are always
+            among them.
         mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none while it
             commands the drop.
         run: folder of a training. Its plant takes the place of plant, with its cost, command and limits; its policies
@@ -125,13 +126,14 @@ def contenders(
     """The clairvoyant optimum and all controllers, as they are found."""
     episodes = UnseenEpisodes(plant, config.episodes, seed=config.seed)
     episodes.physics = plant if run is None else run.physics
-    starts = flown_starts(episodes, known)
+    policies = {} if run is None else {role.replace("_", "-"): policy for role, policy in run.policies.items()}
+    starts = flown_starts(episodes, known) | {role: episodes.fly(policy).actions for role, policy in policies.items()}
     chosen = starts | general_starts(episodes, seed=config.seed) if config.starts == "all" else starts
     yield "clairvoyant", limit(episodes, chosen, hold=config.hold or known.hold, config=config.descent)
     for name, controller in CONTROLLERS.get(plant.name, {}).items():
         yield name, classical(episodes, controller)
-    for role, policy in {} if run is None else run.policies.items():
-        yield role.replace("_", "-"), learned(episodes, policy)
+    for role, policy in policies.items():
+        yield role, learned(episodes, policy)
     if known.window is None:
         return
     window = fitting(known.window, plant)

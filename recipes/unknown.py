@@ -33,6 +33,7 @@ POLICY: dict[str, tuple[str, ...]] = {
 }
 """Policies of few weights, whose optimum exact gradients find."""
 WITH_HYPOTHESES = ("--twinning.hypotheses.which", "automatic", "--twinning.referee.rule", "weight_of_evidence")
+ALONE = ("--twinning.hypotheses.which", "none")
 UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "cryogenic_tank": 50}
 """Number of unseen episodes that judge a plant by default."""
 HOPS = 192
@@ -111,7 +112,7 @@ class Config:
 
     def trainings(self, system: str, *, helped: bool = False) -> list[Training]:
         """A training of the model-based half for each seed, alone or with hypotheses."""
-        options, kind = (WITH_HYPOTHESES, "-hypotheses") if helped else ((), "")
+        options, kind = (WITH_HYPOTHESES, "-hypotheses") if helped else (ALONE, "")
         return [
             Training(
                 recipe=self.recipe,

@@ -17,6 +17,7 @@ from torch import nn
 from rt_torchrl import (
     AssimilationConfig,
     DescentConfig,
+    HypothesesConfig,
     LearnerConfig,
     LimitConfig,
     PlannerConfig,
@@ -50,6 +51,7 @@ PAPER = TwinningConfig(
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),
+    hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
     PAPER,
@@ -63,6 +65,7 @@ CONVERGED = dataclasses.replace(
         descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),
+    hypotheses=HypothesesConfig(),
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(

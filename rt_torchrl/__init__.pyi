@@ -49,6 +49,7 @@ from .identification.sensor_log import LogConfig, read_log
 from .optimisers.descent import Descended, DescentConfig
 from .twinning.algorithm import ReinforcementTwinning
 from .twinning.assimilation import AssimilationConfig
+from .twinning.hypotheses.config import HypothesesConfig
 from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
@@ -120,6 +121,7 @@ __all__ = [
     "Forecast",
     "Foreseen",
     "Held",
+    "HypothesesConfig",
     "Identification",
     "IdentificationConfig",
     "IncrementalTD3",

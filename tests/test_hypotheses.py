@@ -8,6 +8,8 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.runs.results import hypotheses_of
+from rt_torchrl.runs.results_table import hypothesis_lines
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -39,9 +41,9 @@ def recorded(plant, steps=100):
     return Trajectory(read, flown.actions[0], exogenous[0]), flown.states[0]
 
 
-def ensemble(plant, **options):
+def ensemble(plant, call=0.0, **options):
     closure = LinearClosure([[0.0, 0.0], [0.0, 0.0]])
-    config = HypothesesConfig(which="automatic", **options)
+    config = HypothesesConfig(call=call, **options)
     twin = make_twin(plant, closure, config)
     return twin, make_assimilation(twin, ASSIMILATION, config)
 
@@ -107,6 +109,16 @@ def test_the_cost_is_the_weighted_mean_and_its_gradient_too():
     assert isinstance(assimilation, EnsembleAssimilation)
 
 
+def test_the_results_say_what_the_twin_lacks():
+    twin, _ = ensemble(PLANT)
+    assert hypotheses_of(twin) == hypotheses_of(DigitalTwin(PLANT, PLANT.closure)) == {}
+    twin.weights = {ALONE: 0.1, "lags": 0.6, "late": 0.3}
+    found = hypotheses_of(twin)
+    assert found["late"] == {"weight": 0.3, "weights": {}, "described": {}}
+    lines = hypothesis_lines(found)
+    assert lines == ["  beside the twin: lags, weight 0.60, force_lag = 0.2 s", "  beside the twin: late, weight 0.30"]
+
+
 def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
     twin, _ = ensemble(PLANT)
     twin.weights = {"late": 0.9, ALONE: 0.1}
@@ -120,18 +132,31 @@ def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
 
 
 def kept(misfits):
-    config = HypothesesConfig(which="automatic")
+    config = HypothesesConfig()
     return {name for name, share in evidence(misfits, config).items() if share >= config.least}
 
 
 def test_weights_ask_for_evidence():
-    shares = evidence({ALONE: 1.0, "lags": 0.95}, HypothesesConfig(which="automatic"))
+    shares = evidence({ALONE: 1.0, "lags": 0.95}, HypothesesConfig())
     assert shares == {ALONE: 1.0, "lags": pytest.approx(0.05 / 0.95**6)}
     assert kept({ALONE: 1.0, "lags": 0.95}) == {ALONE}
     assert kept({ALONE: 1.0, "lags": 0.8}) == {ALONE, "lags"}
     assert kept({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}) == {"lags", "late"}
     assert kept({ALONE: float("inf"), "lags": float("inf")}) == {ALONE}
     assert kept({ALONE: 0.0, "lags": 0.0}) == {ALONE}
+
+
+def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(monkeypatch):
+    twin, assimilation = ensemble(PLANT, call=0.05)
+    (lagging, _), generator = recorded(LaggedActuator(PLANT, "force", LAG)), torch.Generator()
+    assimilation.update([lagging], (), 1, generator)
+    assert not assimilation.explain(0.04, [lagging], generator)
+    assert twin.weights == {ALONE: 1.0} and assimilation.report() == {f"hypothesis/{n}": n == ALONE for n in twin.twins}
+    assert assimilation.explain(0.06, [lagging], generator) and twin.weights == {"lags": 1.0}
+    # The one that explains the records stays, and is fitted to each new one.
+    assert not assimilation.explain(0.0, [lagging], generator) and assimilation.called
+    twin.weights = {ALONE: 1.0}
+    assert not assimilation.explain(0.0, [lagging], generator) and not assimilation.called
 
 
 def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):
@@ -173,15 +198,16 @@ def test_the_state_is_kept():
 def test_hypotheses_are_chosen_by_name():
     twin, _ = ensemble(PLANT, names=("late",))
     assert list(twin.twins) == [ALONE, "late"]
-    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig())) is DigitalTwin
-    assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig(which="automatic"))) is DigitalTwin
+    assert type(make_twin(PLANT, PLANT.closure, HypothesesConfig(which="none"))) is DigitalTwin
+    assert type(make_twin(LinearQuadratic(), PLANT.closure, HypothesesConfig())) is DigitalTwin
 
 
 @pytest.mark.parametrize(
     "make, message",
     [
         (lambda: ensemble(PLANT, names=("inflow",)), r"does not suspect inflow; choose among late, lags"),
-        (lambda: HypothesesConfig(names=("late",)), r"which='automatic'"),
+        (lambda: HypothesesConfig(which="none", names=("late",)), r"which='automatic'"),
+        (lambda: HypothesesConfig(call=float("nan")), r"call=nan"),
         (lambda: HypothesesConfig(prior=0.0), r"prior=0.0"),
         (lambda: HypothesesConfig(risk=1.0), r"risk=1.0.*\[0, 1\)"),
         (lambda: HypothesesConfig(segment=1), r"segment=1.*at least 2"),
@@ -200,5 +226,5 @@ def test_what_is_no_hypothesis_is_refused(make, message):
 def test_options_are_those_of_the_algorithm():
     from rt_torchrl.twinning.config import TwinningConfig
 
-    changed = dataclasses.replace(TwinningConfig(), hypotheses=HypothesesConfig(which="automatic"))
-    assert TwinningConfig().hypotheses.which == "none" and changed.hypotheses.which == "automatic"
+    changed = dataclasses.replace(TwinningConfig(), hypotheses=HypothesesConfig(which="none"))
+    assert TwinningConfig().hypotheses.which == "automatic" and changed.hypotheses.which == "none"

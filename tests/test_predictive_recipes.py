@@ -33,16 +33,20 @@ def records(tmp_path, name, *options):
     return json.loads((tmp_path / "run" / "metrics.json").read_text())["episodes"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
-        "--observe measured+wind --policy mlp --model-error",
-        "--observe preview --noise 0.01 --twinning.referee.rule trust_ratio",
-        "--policy scheduled --twinning.learner.algorithm td3 --twinning.arm model_based",
+        pytest.param("--observe measured+wind --policy mlp --model-error", marks=pytest.mark.nightly),
+        pytest.param("--observe preview --noise 0.01 --twinning.referee.rule trust_ratio", marks=pytest.mark.nightly),
+        pytest.param(
+            "--policy scheduled --twinning.learner.algorithm td3 --twinning.arm model_based", marks=pytest.mark.slow
+        ),
         # Torch computes the gradients of a window that the critic prices, so that a solve takes tenths of a second.
-        "--closure mlp --twinning.assimilation.segment 5 --twinning.planner.receding-horizon.terminal critic "
-        "--episodes 1 --horizon 5 --twinning.planner.receding-horizon.horizon 2",
+        pytest.param(
+            "--closure mlp --twinning.assimilation.segment 5 --twinning.planner.receding-horizon.terminal critic "
+            "--episodes 1 --horizon 5 --twinning.planner.receding-horizon.horizon 2",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_turbine_takes_it_with_other_options(tmp_path, options):

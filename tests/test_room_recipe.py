@@ -63,7 +63,9 @@ def test_a_row_is_made_of_what_is_kept(tmp_path, monkeypatch):
 
     def metrics(training):
         helped = training.folder.name.endswith("hypotheses")
-        assert helped == ("--twinning.hypotheses.which" in training.options)
+        assert training.options[training.options.index("--twinning.hypotheses.which") + 1] == (
+            "automatic" if helped else "none"
+        )
         costs, paid = (HELPED.helped, HELPED.helped_paid) if helped else (HELPED.planned, HELPED.paid)
         unseen = {"J_a_model_based": {"mean": costs[training.seed]}, "baselines": {"PD": {"J_a": {"mean": 0.07}}}}
         summary = {"unseen": unseen, "cost_of_learning": {"sum": paid[training.seed]}}

@@ -70,6 +70,7 @@ def test_an_episode_is_known_by_its_seed_and_has_the_plants_wind(rosco):
     assert torch.equal(first["exogenous"], plant.draw_exogenous(1, generator)[0])
 
 
+@pytest.mark.slow
 def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
     """600 s of 11 m/s with 16 % turbulence: some 4.2 MW, as Jonkman's controller, with the speed held at rated."""
     plant = WindTurbine()

@@ -17,6 +17,8 @@ from rt_torchrl import DivergenceError
 
 Runner = tuple[str, Size]
 """A contender at a size, of which the threads are a part."""
+TURN = 0.1
+"""Time [s] that the calls of a turn take together; one call that takes longer is a turn of its own."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Cell:
         wall: median wall time [s].
         least: least wall time [s].
         cpu: median CPU time of the process [s].
-        repeats: number of evaluations behind the medians.
+        repeats: number of turns behind the medians; each has as many calls as take a tenth of a second.
         first: wall time of the first evaluation, which may compile [s].
         gap: relative difference of the result from that of the first contender of the cell.
         left_out: reason why there is no time; empty if there is one.
@@ -137,11 +139,13 @@ class Stopwatch:
                 found = _finite(function)
             if found is not None:
                 results[name, size], first[name, size] = found, time.perf_counter() - start
+        calls: dict[Runner, int] = {}
         for _ in range(self.repeats):
             for runner in results:
                 if sum(wall[runner]) <= self.limit:
                     with cores.torch_threads(runner[1].threads), cores.limited_to(runner[1].threads):
-                        _clock(functions[runner], wall[runner], cpu[runner])
+                        calls[runner] = calls.get(runner) or _calls_of_a_turn(functions[runner])
+                        _clock(functions[runner], calls[runner], wall[runner], cpu[runner])
         reference = next(iter(results.values()), None)
         diverged = [
             Cell(size, name, quantity, left_out="diverged") for name, size in functions if (name, size) not in results
@@ -171,8 +175,20 @@ def _finite(function: Callable[[], Any]) -> np.ndarray | None:
     return result if np.isfinite(result).all() else None
 
 
-def _clock(function: Callable[[], Any], wall: list[float], cpu: list[float]) -> None:
-    start, start_cpu = time.perf_counter(), time.process_time()
+def _calls_of_a_turn(function: Callable[[], Any]) -> int:
+    """Number of calls that take ``TURN``, at least one.
+
+    A single call of a millisecond would measure what the contender before it left in the caches.
+    """
+    start = time.perf_counter()
     function()
-    wall.append(time.perf_counter() - start)
-    cpu.append(time.process_time() - start_cpu)
+    return max(1, round(TURN / (time.perf_counter() - start)))
+
+
+def _clock(function: Callable[[], Any], calls: int, wall: list[float], cpu: list[float]) -> None:
+    """Append the time of one call, the mean over ``calls`` in a row."""
+    start, start_cpu = time.perf_counter(), time.process_time()
+    for _ in range(calls):
+        function()
+    wall.append((time.perf_counter() - start) / calls)
+    cpu.append((time.process_time() - start_cpu) / calls)

@@ -5,7 +5,7 @@ from .learning import closure_weights, learning_curves, seconds
 from .overview import figures_of
 from .policy import policy_contours
 from .snapshot import Snapshot
-from .style import save_figure
+from .style import pixels, save_figure, save_pixels
 from .unseen_episodes import unseen
 
 __all__ = [
@@ -15,8 +15,10 @@ __all__ = [
     "exogenous",
     "figures_of",
     "learning_curves",
+    "pixels",
     "policy_contours",
     "save_figure",
+    "save_pixels",
     "seconds",
     "states",
     "unseen",

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from torch import Tensor, nn
 
@@ -62,11 +64,24 @@ def panels(
     return figure, axes
 
 
+def pixels(figure: Figure) -> np.ndarray:
+    """The figure drawn once at 120 dpi: red, green and blue of each pixel, (height, width, 3) of ``uint8``."""
+    figure.set_dpi(120)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def save_pixels(drawn: np.ndarray, path: Path) -> None:
+    """Write what ``pixels`` gave as PNG, whole or not at all."""
+    file = io.BytesIO()
+    imsave(file, drawn, format="png", dpi=120)
+    write_atomically(path, file.getvalue())
+
+
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as PNG at 120 dpi, whole or not at all."""
-    drawing = io.BytesIO()
-    figure.savefig(drawing, dpi=120)
-    write_atomically(path, drawing.getvalue())
+    save_pixels(pixels(figure), path)
 
 
 def caption(ax: Axes, label: str, note: str = "") -> None:

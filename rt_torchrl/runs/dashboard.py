@@ -2,12 +2,10 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 from torch.utils.tensorboard import SummaryWriter
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw
 
 TAGS = {
     "real_cost": "cost/real episode (live policy)",
@@ -71,10 +69,10 @@ class Dashboard:
         for name, seconds in record["seconds"].items():
             self._writer.add_scalar(f"seconds/{name}", seconds, step)
 
-    def figures(self, figures: Mapping[str, "Figure"], step: int) -> None:
-        """Write the figures of an episode, whose number is ``step``."""
-        for name, figure in figures.items():
-            self._writer.add_figure(name, figure, step, close=False)
+    def images(self, images: Mapping[str, np.ndarray], step: int) -> None:
+        """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""
+        for name, image in images.items():
+            self._writer.add_image(name, image, step, dataformats="HWC")
 
     def scalar(self, tag: str, value: float) -> None:
         """Write a scalar of the run as a whole."""

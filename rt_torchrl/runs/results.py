@@ -12,8 +12,10 @@ from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.cloning import of_each_role
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.referees import Role
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
@@ -87,6 +89,7 @@ def summarise(
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
         | {"described": described_weights(closure)},
         "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
+        "hypotheses": hypotheses_of(algorithm.twin),
         "seconds": seconds_per_step(episodes),
     }
 
@@ -148,6 +151,19 @@ def closure_errors(
     laws = {"found": algorithm.twin.closure, "start": start}
     features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
     return {name: rms_error(law, true, features).tolist() for name, law in laws.items()}
+
+
+def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
+    """``weight`` and named ``weights`` of what is planned on beside the twin alone, by name; empty if nothing is."""
+    if not isinstance(twin, TwinEnsemble):
+        return {}
+    found: dict[str, Any] = {}
+    for name, weight in twin.weights.items():
+        if name != ALONE:
+            # A delay of whole intervals has no parameters of its own.
+            own = getattr(twin.twins[name].closure, "own", nn.Module())
+            found[name] = {"weight": weight, "weights": named_weights(own) or {}, "described": described_weights(own)}
+    return found
 
 
 def cost_of_learning(episodes: list[dict[str, Any]]) -> dict[str, float]:

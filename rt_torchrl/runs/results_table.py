@@ -43,6 +43,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
+    lines += hypothesis_lines(found.get("hypotheses", {}))
     lines += closure_lines(found["closure"])
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
@@ -118,4 +119,15 @@ def closure_lines(closure: dict[str, Any]) -> list[str]:
         label = f"{name} [{about['unit']}]" if about["unit"] else name
         shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)
         lines.append(f"  {label:<22}{shown}   {about['meaning']}".rstrip())
+    return lines
+
+
+def hypothesis_lines(hypotheses: dict[str, Any]) -> list[str]:
+    """Lines with what the twin lacks, as the hypotheses that explain the records have found it."""
+    lines = []
+    for name, one in hypotheses.items():
+        named = {key: value for key, value in one["weights"].items() if isinstance(value, float)}
+        units = {key: one["described"].get(key, {}).get("unit", "") for key in named}
+        found = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
+        lines.append(f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else ""))
     return lines

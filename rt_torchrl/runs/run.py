@@ -244,7 +244,8 @@ class Run:
         every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
             safe_point()
-            dashboard.figures(self._figures(self._snapshot()), len(self.episodes) - 1)
+            drawn = self._figures(self._snapshot())
+            dashboard.images({name: figures.pixels(figure) for name, figure in drawn.items()}, len(self.episodes) - 1)
 
     def _follow_wear(self) -> None:
         """Give the unseen episodes the real system's present closure, if it is known."""
@@ -283,8 +284,9 @@ class Run:
         snapshot = self._snapshot()
         drawn = self._figures(snapshot) | {"unseen": figures.unseen(judged, self.unseen.categories())}
         (self.folder / "figures").mkdir(exist_ok=True)
-        for name, figure in drawn.items():
-            figures.save_figure(figure, self.folder / "figures" / f"{name}.png")
-        dashboard.figures(drawn, len(self.episodes) - 1)
+        images = {name: figures.pixels(figure) for name, figure in drawn.items()}
+        for name, image in images.items():
+            figures.save_pixels(image, self.folder / "figures" / f"{name}.png")
+        dashboard.images(images, len(self.episodes) - 1)
         if self.animate:
             self.animate(snapshot, self.folder / "figures" / "animation.gif")

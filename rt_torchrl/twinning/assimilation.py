@@ -243,6 +243,14 @@ class Assimilation:
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
 
+    def explain(self, difference: float, records: Sequence[Trajectory], generator: torch.Generator) -> bool:
+        """Seek what makes real episodes cost other than the twin says; a twin alone knows nothing else.
+
+        Returns:
+            Whether the twin has changed.
+        """
+        return False
+
     def report(self) -> dict[str, float]:
         """What the last update has found beside J_p, by name; of one twin, nothing."""
         return {}

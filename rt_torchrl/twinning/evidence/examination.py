@@ -2,16 +2,17 @@
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
-from rt_torchrl.twinning.evidence.paired_differences import Belief, PairedDifferences
+from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
@@ -24,6 +25,9 @@ RECALLED_BELOW = 0.98
 class Examination:
     """Compares what real episodes cost with what the twin says of them.
 
+    The attribute ``unexplained`` is the paired difference of the latest episode beyond two standard deviations of what
+    its exploration explains.
+
     Args:
         track_record: the real episodes.
         virtual: virtual episodes of the twin.
@@ -31,6 +35,7 @@ class Examination:
 
     def __init__(self, track_record: TrackRecord, virtual: VirtualEpisodes):
         self.track_record, self.virtual = track_record, virtual
+        self.unexplained = 0.0
 
     @torch.no_grad()
     def examine(self) -> TensorDict:
@@ -42,12 +47,28 @@ class Examination:
         """
         found = self.track_record.differences(self.virtual)
         if not found.values:
+            self.unexplained = 0.0
             return findings()
+        self.unexplained = abs(found.values[-1]) - 2.0 * EXPLORED * found.exploration[-1]
         quiet = [d for d, noise in zip(found.values, found.exploration, strict=True) if noise <= QUIET]
         said = alarm(quiet)
         explained = self.virtual.twin.explanation()
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
+
+    @torch.no_grad()
+    def replayed(self, records: Sequence[Trajectory]) -> float:
+        """Greatest size of the paired differences of records whose actions the twin replays.
+
+        It takes the place of ``examine`` where no policy can fly them again.
+        """
+        whole, twin = batch_of(records), self.virtual.twin
+        try:
+            flown = twin.replay(whole.states[:, 0], whole.exogenous, whole.actions, start=whole.start)
+        except DivergenceError:
+            return LARGEST
+        real, predicted = (control_cost(twin.plant, one).tolist() for one in (whole, flown))
+        return max(abs(difference(*pair)) for pair in zip(real, predicted, strict=True))
 
     def judge(self, record: Trajectory) -> "RealJudge":
         """The judge of policies by the evidence so far; a record gives the observations in which they are compared."""

@@ -118,6 +118,7 @@ class EnsembleAssimilation(Assimilation):
         twin.risk = hypotheses.risk
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
         self.misfits: dict[str, float] = {}
+        self.called = not hypotheses.call
 
     def update(
         self,
@@ -126,8 +127,31 @@ class EnsembleAssimilation(Assimilation):
         count: int,
         generator: torch.Generator,
     ) -> Descended:
-        """As :meth:`Assimilation.update`, whose report is that of the twin alone."""
+        """As :meth:`Assimilation.update`, whose report is that of the twin alone, and fit the hypotheses if called."""
         found = super().update(records, processes, count, generator)
+        if self.called:
+            self._weigh(records, generator)
+        return found
+
+    def explain(self, difference: float, records: Sequence[Trajectory], generator: torch.Generator) -> bool:
+        """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
+
+        Args:
+            difference: paired difference of the latest episode beyond what exploration explains.
+            records: the records in D_S.
+            generator: source of random numbers.
+
+        Returns:
+            Whether they have been fitted.
+        """
+        wrong = difference > self.hypotheses.call or not self.hypotheses.call
+        first = wrong and not self.called
+        self.called = wrong or (self.called and set(self.ensemble.weights) != {ALONE})
+        if first:
+            self._weigh(records, generator)
+        return first
+
+    def _weigh(self, records: Sequence[Trajectory], generator: torch.Generator) -> None:
         alone = misfit(self.ensemble.twins[ALONE], records, self.segment)
         misfits = {name: self._misfit(fit, records, generator) for name, fit in self.fits.items()}
         self.misfits = {ALONE: alone} | misfits
@@ -135,7 +159,6 @@ class EnsembleAssimilation(Assimilation):
         for name, fit in self.fits.items():
             fit.rest(hopeless=shares[name] < HOPELESS)
         self.ensemble.weights = {name: share for name, share in shares.items() if share >= self.hypotheses.least}
-        return found
 
     def _misfit(self, fit: "Fit", records: Sequence[Trajectory], generator: torch.Generator) -> float:
         return fit.update(records, generator) if fit.due() else misfit(fit.twin, records, self.segment)
@@ -150,6 +173,7 @@ class EnsembleAssimilation(Assimilation):
             "fits": {name: fit.state_dict() for name, fit in self.fits.items()},
             "misfits": dict(self.misfits),
             "weights": self.ensemble.weights,
+            "called": self.called,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -157,6 +181,7 @@ class EnsembleAssimilation(Assimilation):
         for name, fit in self.fits.items():
             fit.load_state_dict(state["fits"][name])
         self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
+        self.called = state["called"]
 
 
 @torch.no_grad()

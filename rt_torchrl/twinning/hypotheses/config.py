@@ -14,6 +14,9 @@ class HypothesesConfig:
 
     Args:
         which: ``automatic`` for what the plant suspects (:meth:`Plant.suspects`), or ``none`` for the twin alone.
+        call: size of the paired difference log J − log Ĵ of a real episode, beyond what exploration explains, above
+            which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them
+            always.
         names: names of the suspects that are taken; all if there are none.
         prior: prior weight p_h of every addition, as a share of that of the twin alone. A small one asks for evidence
             before anything is added.
@@ -27,7 +30,8 @@ class HypothesesConfig:
         ValueError: if an argument is out of its range.
     """
 
-    which: Literal["none", "automatic"] = "none"
+    which: Literal["none", "automatic"] = "automatic"
+    call: float = 0.05
     names: tuple[str, ...] = ()
     prior: float = 0.05
     sharpness: float = 6.0
@@ -43,6 +47,8 @@ class HypothesesConfig:
         for argument in ("least", "risk"):
             if not 0.0 <= getattr(self, argument) < 1.0:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the hypotheses must lie in [0, 1).")
+        if not self.call >= 0.0:
+            raise ValueError(f"call={self.call} of the hypotheses must not be negative.")
         if self.segment is not None and self.segment < 2:
             raise ValueError(f"segment={self.segment} of the hypotheses must be at least 2 control intervals.")
         if self.names and self.which == "none":

@@ -95,6 +95,9 @@ class PlannerConfig:
             positive, and else whole_episodes.
         iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
             episodes.
+        growth: greatest multiple of ``iterations`` that a plan over whole episodes takes; the k-th plan takes
+            min(k, growth) times as many. While few inputs have been met and the twin is new, a plan that converges ends
+            where the next one would not go; later plans have to converge.
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
@@ -107,6 +110,7 @@ class PlannerConfig:
 
     method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
     iterations: int = 10
+    growth: int = 1
     realisations: int | None = None
     experience: int = 100
     descent: DescentConfig = field(default_factory=DescentConfig)
@@ -122,6 +126,8 @@ class PlannerConfig:
             )
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
+        if self.growth < 1:
+            raise ValueError(f"growth={self.growth} of the planning must be at least 1; 1 takes equal plans.")
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
         if self.experience < 1:

@@ -22,10 +22,13 @@ class WholeEpisodes:
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
+        self.plans = 0
 
     def plan(self, episodes: Scenario) -> Descended:
-        """Take n_mb gradient steps; the policy keeps the best weights seen in them."""
-        return self.descent.run(lambda: self.twin.cost(self.policy, *episodes), self.config.iterations)
+        """Take n_mb gradient steps, later more of them; the policy keeps the best weights seen in them."""
+        self.plans += 1
+        iterations = self.config.iterations * min(self.plans, self.config.growth)
+        return self.descent.run(lambda: self.twin.cost(self.policy, *episodes), iterations)
 
     def refuse(self) -> None:
         """Forget the state of the optimiser, because it led to the plan that was refused."""
@@ -36,7 +39,8 @@ class WholeEpisodes:
         self.descent.restart()
 
     def state_dict(self) -> dict[str, Any]:
-        return self.descent.state_dict()
+        return {"descent": self.descent.state_dict(), "plans": self.plans}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.descent.load_state_dict(state)
+        self.descent.load_state_dict(state["descent"])
+        self.plans = state["plans"]
