@@ -120,8 +120,7 @@ class ReinforcementTwinning:
         steps = [self.start] if self.first is not None and not self.episodes_done else []
         steps += [self.interact]
         steps += [self.update_model_free] if arm != "model_based" else []
-        on_twin = [self.fit_exogenous, self.assimilate, self.examine, self.plan]
-        steps += on_twin if arm != "model_free" else []
+        steps += [] if arm == "model_free" else [self.fit_exogenous, self.assimilate, self.examine, self.plan]
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
             safe_point()
@@ -258,10 +257,7 @@ class ReinforcementTwinning:
         return costs
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """Clone the live policy into the idle one, unless the referee finds the clone worse than what it replaces.
-
-        The costs are those of both policies over the virtual episodes ``judged_on``.
-        """
+        """Clone the live policy into the idle one, unless the clone is worse; ``costs`` are those on ``judged_on``."""
         live, idle = self.referee.live, self.referee.idle
         report = self.cloning.clone(
             *(self.policies[role] for role in (live, idle)),
