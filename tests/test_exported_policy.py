@@ -27,7 +27,7 @@ def written(folder, kind):
     return policy, folder / f"law.{kind}"
 
 
-@pytest.mark.parametrize("kind", ["c", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("pt2", "onnx"))])
+@pytest.mark.parametrize("kind", ["c", *(pytest.param(kind, marks=pytest.mark.nightly) for kind in ("pt2", "onnx"))])
 def test_a_policy_read_back_acts_as_before(kind, tmp_path):
     if kind == "c" and c_compiler.compiler() is None:
         pytest.skip("there is no C compiler here")
@@ -38,7 +38,7 @@ def test_a_policy_read_back_acts_as_before(kind, tmp_path):
     torch.testing.assert_close(found(seen[0]), policy(seen[0]).detach(), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["c", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("pt2", "onnx"))])
+@pytest.mark.parametrize("kind", ["c", *(pytest.param(kind, marks=pytest.mark.nightly) for kind in ("pt2", "onnx"))])
 def test_a_policy_of_other_observations_is_refused(kind, tmp_path):
     if kind == "c" and c_compiler.compiler() is None:
         pytest.skip("there is no C compiler here")

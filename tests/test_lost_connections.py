@@ -75,7 +75,7 @@ def check(course, moments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("protocol", ["opcua", "modbus"])
+@pytest.mark.parametrize("protocol", ["modbus", pytest.param("opcua", marks=pytest.mark.nightly)])
 def test_a_lost_connection_brings_the_safe_action_and_the_run_goes_on(protocol):
     course, moments, noticed = lost_connections(protocol, 2, 0)
     check(course, moments)
