@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 if __name__ == "__main__":
@@ -64,7 +65,7 @@ def main(config: Config) -> None:
     plant = config.plant()
     known = plant.closure if config.judged_on == "plant" else None
     device = require_device(config.device)
-    Run(config, plant, env=gymnasium_pendulum(plant, seed=config.seed, closure=known, device=device)).train()
+    Run(config, plant, env=partial(gymnasium_pendulum, plant, seed=config.seed, closure=known, device=device)).train()
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -216,7 +217,7 @@ def main(config: Config) -> None:
 
     plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
     if config.real == "rosco":
-        env = rosco_turbine(plant, seed=config.seed, device=require_device(config.device))
+        env = partial(rosco_turbine, plant, seed=config.seed, device=require_device(config.device))
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
     believed = config.believed()
     Run(config, plant, believed=believed, plant_figures=plant_figures, first=JonkmanController, **system).train()

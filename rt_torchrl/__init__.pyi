@@ -20,6 +20,14 @@ from .systems.exploration import ExplorationConfig
 from .systems.faulty_system import FaultySystem, Injection
 from .systems.operating_limits import OperatingLimits
 from .systems.operating_limits_config import OperatingLimitsConfig
+from .systems.operation.config import OperationConfig
+from .systems.protocols.connected_plant import ConnectedPlant
+from .systems.protocols.link import Link, LinkLostError
+from .systems.protocols.modbus import ModbusLink
+from .systems.protocols.opc_ua import OpcUaLink
+from .systems.protocols.relay import Relay
+from .systems.protocols.served_system import served_system
+from .systems.protocols.server_process import ServerProcess
 from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyLayer
@@ -79,6 +87,7 @@ from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
+from .export.exported_policy import ExportedPolicy, load_policy
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
 __version__: str
@@ -95,6 +104,7 @@ __all__ = [
     "Clairvoyant",
     "ClassicalController",
     "Component",
+    "ConnectedPlant",
     "ContractReport",
     "Decaying",
     "DecisionTree",
@@ -109,6 +119,7 @@ __all__ = [
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "ExportedPolicy",
     "FaultySystem",
     "FirstController",
     "Forecast",
@@ -123,12 +134,17 @@ __all__ = [
     "Learner",
     "LearnerConfig",
     "LimitConfig",
+    "Link",
+    "LinkLostError",
     "LoadedRun",
     "LogConfig",
     "LongTermMemoryConfig",
     "Measurement",
+    "ModbusLink",
+    "OpcUaLink",
     "OperatingLimits",
     "OperatingLimitsConfig",
+    "OperationConfig",
     "Planner",
     "PlannerConfig",
     "Plant",
@@ -148,6 +164,7 @@ __all__ = [
     "Referee",
     "RefereeConfig",
     "ReinforcementTwinning",
+    "Relay",
     "Rollout",
     "Run",
     "RunConfig",
@@ -158,6 +175,7 @@ __all__ = [
     "SaturatedAffine",
     "SaturatedMLP",
     "Scenario",
+    "ServerProcess",
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
@@ -181,6 +199,7 @@ __all__ = [
     "export_program",
     "export_twin",
     "identification_cost",
+    "load_policy",
     "load_run",
     "main_of",
     "read_log",
@@ -188,5 +207,6 @@ __all__ = [
     "require_request",
     "require_stable_step",
     "rk4_step",
+    "served_system",
     "shipped_plants",
 ]

@@ -23,7 +23,7 @@ def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
     if name == "unknown":
         return ["flapping_wing", *arguments]
-    if name in ("export", "real_time"):
+    if name in ("export", "in_service", "real_time"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments

@@ -21,13 +21,17 @@ HOMES = {
 }
 """The module that each public name comes from."""
 ROOMS_OF = {
+    "asynchronous.py": {"runs"},
     "benchmark.py": {"trajectories"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
+    "in_service.py": {"runs", "systems"},
+    "jitter.py": {"runs", "systems"},
     "limit.py": {"evaluation", "optimal_control", "runs", "study"},
     "pareto.py": {"runs", "study"},
     "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
+    "soak.py": {"runs"},
     "study.py": {"study", "runs"},
     "unknown.py": {"study", "runs"},
 }

@@ -43,7 +43,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     model = _converted(trace(policy, plant), name)
     entry = model.metadata_props.add()
     entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
-    difference = require_agreement(policy, _runtime(model.SerializeToString(), name), plant, what="the ONNX model")
+    difference = require_agreement(policy, runtime(model.SerializeToString(), name), plant, what="the ONNX model")
     Path(path).write_bytes(model.SerializeToString())
     return difference
 
@@ -84,7 +84,12 @@ def require_packages() -> None:
             ) from error
 
 
-def _runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
+def runtime(model: bytes, policy: str) -> Callable[[Tensor], Tensor]:
+    """A model as a function of a batch of observations.
+
+    Raises:
+        ValueError: if onnxruntime cannot run the model.
+    """
     import onnxruntime
 
     try:

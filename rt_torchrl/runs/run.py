@@ -25,6 +25,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, reference, results
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
+from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, operation_of
 from rt_torchrl.runs.progress import Progress
 from rt_torchrl.runs.real_side import judged_on, physics_known, require_simulation, simulated
 from rt_torchrl.runs.results_table import results_table
@@ -42,6 +43,8 @@ from rt_torchrl.twinning.referees import Role
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # only its type: a run loads Matplotlib when it draws
 
+    from rt_torchrl.systems.operation.operation import Operation
+
 CHECKED_STEPS = 10
 """Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
 PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
@@ -55,7 +58,8 @@ class Run:
     Args:
         config: options of the run.
         plant: the real system in simulation, and the twin's physics.
-        env: the real system, if it is not a plant in simulation. Policies are judged on ``plant`` with ``env.closure``.
+        env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run on
+            the wall clock needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``.
             If that closure is not known, they are judged on real episodes: at most four times ``unseen`` (both policies
             before and after the training, clones once), and one for each of the ``untrained`` random starts.
         believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real
@@ -79,7 +83,7 @@ class Run:
         config: RunConfig,
         plant: Plant,
         *,
-        env: RealSystem | None = None,
+        env: RealSystem | Callable[[], RealSystem] | None = None,
         believed: Plant | None = None,
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
@@ -93,7 +97,9 @@ class Run:
         device = require_device(config.device)
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
-        require_simulation(config, plant, env, baselines)
+        make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
+        real = env if isinstance(env, RealSystem) or env is None else env()
+        require_simulation(config, plant, real, baselines)
         physics = physics_known(plant, believed)
         for one in filter(None, (plant, believed)):
             check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
@@ -103,9 +109,11 @@ class Run:
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:
-            system = simulated(plant, config, first, device=device, compiled=compiled) if env is None else env
-            self._make_algorithm(system, physics, device=device, compiled=compiled)
-            self.unseen = judged_on(plant, env, self.config.unseen, device=device, compiled=compiled)
+            if real is None:
+                make_env = functools.partial(simulated, plant, config, first, device=device, compiled=compiled)
+            system = real or simulated(plant, config, first, device=device, compiled=compiled)
+            self._make_algorithm(system, make_env, physics, device=device, compiled=compiled)
+            self.unseen = judged_on(plant, real, self.config.unseen, device=device, compiled=compiled)
             self.unseen.physics = physics
             self.baselines = {
                 name: law(physics, compiled=compiled).to(device) for name, law in (baselines or {}).items()
@@ -117,21 +125,33 @@ class Run:
             self._held.release()
             raise
 
-    def _make_algorithm(self, env: EnvBase, physics: Plant, *, device: torch.device, compiled: bool) -> None:
+    def _make_algorithm(
+        self,
+        env: EnvBase,
+        make_env: Callable[[], EnvBase] | None,
+        physics: Plant,
+        *,
+        device: torch.device,
+        compiled: bool,
+    ) -> None:
         config = self.config
         generator = torch.Generator(device=device).manual_seed(config.seed)
         self.make_policy = functools.partial(config.make_policy, physics)
         policies = {role: policy.to(device) for role, policy in config.make_policies(physics, generator).items()}
         closure = config.make_closure(physics, generator).to(device)
         policies = config.acting_policies(policies, physics, closure)
+        first = self._start(physics, closure)
+        system: EnvBase | Operation = env
+        if config.asynchronous:
+            system = operation_of(config, env, make_env, physics, acting_by_name(policies, first), folder=self.folder)
         self.algorithm = ReinforcementTwinning(
-            env,
+            system,
             make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine, compiled=compiled),
             model_free=policies["model_free"],
             model_based=policies["model_based"],
             config=config.twinning,
             generator=generator,
-            first=self._start(physics, closure),
+            first=first,
         )
         # Copies made after the algorithm know its learner's critic, where model predictive control needs one.
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)
@@ -161,10 +181,13 @@ class Run:
                 print(f"{how}: {done} episodes done are in {self.folder}; --resume goes on with them")
             raise
         finally:
+            end_operation(self.algorithm)
             self._held.release()
 
     def _train(self) -> dict[str, Any]:
         self._held.begin(self.config)
+        if not self._held.resumes():
+            (self.folder / EVENTS).unlink(missing_ok=True)
         dashboard = Dashboard(self.folder)
         with Progress(self.config.episodes, len(self.episodes)) as bar:
             bar.doing("checking the gradient")
@@ -177,6 +200,7 @@ class Run:
             if not self.episodes:
                 raise SystemExit("interrupted before the first episode was done; nothing to report.")
             self._drop_half_an_episode()
+            end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")
             self._follow_wear()
             flights = of_each_role(self.algorithm.policies, self.unseen.fly)

@@ -16,6 +16,7 @@ from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.referees import Role
@@ -78,6 +79,8 @@ class RunConfig:
         unseen_every: number of episodes after which the live policy is judged on the unseen episodes again; with 0 it
             is judged only at the end.
         noise: standard deviation of the real system's sensors, as a share of the value that they read.
+        asynchronous: whether the real system operates on while the algorithm learns; docs/connect_your_machine.md.
+        operation: how it operates then.
         twinning: hyper-parameters of the six steps.
 
     Raises:
@@ -110,6 +113,8 @@ class RunConfig:
     figures_every: int = 5
     unseen_every: int = 0
     noise: float = 0.0
+    asynchronous: bool = False
+    operation: OperationConfig = field(default_factory=OperationConfig)
     twinning: TwinningConfig = field(default_factory=TwinningConfig)
 
     def __post_init__(self) -> None:
@@ -122,6 +127,8 @@ class RunConfig:
         for argument in ("hidden", "closure_hidden"):
             require_widths(argument, getattr(self, argument))
         self._check_ranges()
+        if not self.asynchronous and self.operation != self.usual_operation():
+            raise ValueError("operation.* says how an asynchronous run operates; give --asynchronous, too.")
 
     def _check_ranges(self) -> None:
         for argument, least in (
@@ -154,6 +161,11 @@ class RunConfig:
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
             raise ValueError("resume needs log_dir, the folder of the run to go on with.")
+
+    @staticmethod
+    def usual_operation() -> OperationConfig:
+        """The default of ``operation``; override this method where a recipe has another one."""
+        return OperationConfig()
 
     def make_policy(self, plant: Plant, generator: torch.Generator) -> nn.Module:
         """The policy that the options ask for, with random initial weights.

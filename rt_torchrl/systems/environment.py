@@ -76,6 +76,7 @@ class PlantEnv(EnvBase):
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
         self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
+        self._goes_on = False
         declare_specs(self, plant)
 
     @property
@@ -91,12 +92,15 @@ class PlantEnv(EnvBase):
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Everything that the next reset depends on."""
         generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
-        return generators | {"episodes": self._episodes}
+        found = generators | {"episodes": self._episodes}
+        return found | {"state": self._state} if self._goes_on else found
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self._generator.set_state(state["generator"])
         self._sensors.set_state(state["sensors"])
-        self._episodes = state["episodes"]
+        self._episodes, self._goes_on = state["episodes"], "state" in state
+        if self._goes_on:
+            self._state = state["state"].to(self.device)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
         """Initial states and exogenous inputs of the next episodes."""
@@ -115,6 +119,7 @@ class PlantEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         batch, (state, exogenous) = self.batch_size[0], self._draw()
+        self._goes_on = False
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():
             self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
@@ -124,9 +129,25 @@ class PlantEnv(EnvBase):
             self._step_count = torch.where(again, 0, self._step_count)
             self._state = torch.where(again[:, None], state, self._state)
             self._exogenous = torch.where(again[:, None, None], exogenous, self._exogenous)
+        return self._begun()
+
+    def _begun(self) -> TensorDict:
+        batch = self.batch_size[0]
         applied = torch.zeros(batch, len(self.plant.actions), dtype=torch.float64, device=self.device)
         false = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
         return self._observed({"applied": applied, "done": false, "terminated": false, "truncated": false.clone()})
+
+    def go_on(self) -> TensorDict:
+        """Begin the next window of operation in the present state: only exogenous inputs are drawn, and t is 0 again.
+
+        Returns:
+            What a reset returns.
+        """
+        batch = self.batch_size[0]
+        self._exogenous = self.plant.draw_exogenous(batch, self._generator)
+        self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
+        self._goes_on = True
+        return self._begun()
 
     def begin_episode(self) -> nn.Module:
         """Count an episode and return its closure.

@@ -89,6 +89,16 @@ class LivePolicy(nn.Module):
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
         self._generator, self._plant, self._config = generator, (plant,), config
 
+    @property
+    def plant(self) -> Plant:
+        """Plant that gives the ranges of the actions and the control interval."""
+        return self._plant[0]
+
+    @property
+    def generator(self) -> torch.Generator:
+        """Source of the noise."""
+        return self._generator
+
     def exploring(self, policy: nn.Module, episode: int) -> nn.Module:
         """What acts in an episode: a policy or, in the first ones if so configured, the policy with drawn weights.
 
@@ -126,11 +136,21 @@ class LivePolicy(nn.Module):
         exogenous: Float[Tensor, "*batch n_z"] | None = None,
     ) -> Float[Tensor, "*batch n_a"]:
         safe_point()
-        if isinstance(self.policy, StateFeedback):
-            if state is None or exogenous is None:
-                raise ValueError(f"{type(self.policy).__name__} acts from state and exogenous input; give both.")
-            command = self.policy.act(self._dt * self._intervals, state, exogenous)
-        else:
-            command = self.policy(observation)
+        command = self.commanded(self.policy, observation, state, exogenous)
         self._intervals += 1
         return (command + self.draw_noise(command.shape)).clamp(self.low, self.high)
+
+    def commanded(
+        self, policy: nn.Module, observation: Tensor, state: Tensor | None, exogenous: Tensor | None
+    ) -> Float[Tensor, "*batch n_a"]:
+        """The command of a policy in the present interval, without noise.
+
+        Raises:
+            ValueError: if state feedback is given no state or exogenous input.
+        """
+        if not isinstance(policy, StateFeedback):
+            found: Tensor = policy(observation)
+            return found
+        if state is None or exogenous is None:
+            raise ValueError(f"{type(policy).__name__} acts from state and exogenous input; give both.")
+        return policy.act(self._dt * self._intervals, state, exogenous)

@@ -177,6 +177,17 @@ class RealSystem(EnvBase):
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
         return self._entries(applied, ended=False)
 
+    @property
+    def pace(self) -> Any:
+        """The pace that the environment keeps, such as the client of a plant; None if it keeps none."""
+        return getattr(self.env, "pace", None)
+
+    def go_on(self) -> TensorDictBase:
+        """Begin the next window of operation without a reset: the present report is its first one, and t is 0 again."""
+        self._step_count = 0
+        applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
+        return self._entries(applied, ended=False)
+
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._episodes += self._step_count == 0

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
+from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -30,6 +31,7 @@ from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
+from rt_torchrl.twinning.operating import Operating
 from rt_torchrl.twinning.own_policies import require_own_policies
 from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Judgement, Planning
@@ -45,7 +47,7 @@ class ReinforcementTwinning:
     """The algorithm; call :meth:`episode` once per real episode.
 
     Args:
-        env: the real system, of batch size 1: a :class:`PlantEnv`, or a :class:`RealSystem` around any environment.
+        env: the real system, of batch size 1: :class:`PlantEnv`, :class:`RealSystem`, or an :class:`Operation` of one.
         twin: the digital twin, whose closure is trained in place.
         model_free: policy π_mf, trained in place; it starts live, except in the arm ``model_based`` or with ``first``.
         model_based: policy π_mb, trained in place, or :class:`PredictiveControl` on the twin's closure.
@@ -63,7 +65,7 @@ class ReinforcementTwinning:
 
     def __init__(
         self,
-        env: EnvBase,
+        env: EnvBase | Operation,
         twin: DigitalTwin,
         *,
         model_free: nn.Module,
@@ -77,8 +79,8 @@ class ReinforcementTwinning:
     ):
         self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        acting: Role = "model_free" if first is None else first.live
-        acting = acting if config.arm == "twinning" else config.arm
+        begun: Role = "model_free" if first is None else first.live
+        acting = begun if config.arm == "twinning" else config.arm
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, acting)
@@ -89,14 +91,16 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
-        self.clearance = Clearance(env, self.policies, self.virtual, config.limits)
+        system = env.system if isinstance(env, Operation) else env
+        self.clearance = Clearance(system, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
-        self.collector = collector_of(env, self.actor, twin.plant)
+        self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)
         self.flights = RealFlights(env, self.actor, lambda: self.collector.rollout(), twin.plant, config.least_sound)
+        self.operating = Operating(env, self) if isinstance(env, Operation) else None
         self.episodes_done = 0
         self.earlier = EarlierClosure(twin, model_based, self.planner, generator)
 
@@ -120,8 +124,7 @@ class ReinforcementTwinning:
         steps = [self.start] if self.first is not None and not self.episodes_done else []
         steps += [self.interact]
         steps += [self.update_model_free] if arm != "model_based" else []
-        on_twin = [self.fit_exogenous, self.assimilate, self.examine, self.plan]
-        steps += on_twin if arm != "model_free" else []
+        steps += [] if arm == "model_free" else [self.fit_exogenous, self.assimilate, self.examine, self.plan]
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:
             safe_point()
@@ -130,6 +133,7 @@ class ReinforcementTwinning:
             merged(report, self.earlier.sound(step) if step in (self.plan, self.switch_policies) else step())
             seconds[step.__name__] = time.perf_counter() - start
         self.episodes_done += 1
+        self.operating.hand_over(self.referee.live, self.episodes_done) if self.operating else None
         return EpisodeReport(report.update({"seconds": findings(**seconds)}))
 
     def start(self) -> TensorDict:
@@ -140,10 +144,10 @@ class ReinforcementTwinning:
             part.restart()
         if not pupils:
             return findings()
-        flights = self.first.flights(lambda policy: self.flights.fly(policy, strength=0.0, whole=True))
+        flights = self.first.flights(self.operating.fly_first if self.operating else self.flights.fly_first)
         on_twin, records = self.config.arm != "model_free", [flight.record for flight in flights]
         for flight in flights:
-            self._keep(flight)
+            self.keep(flight)
             self.virtual.learn(flight.record) if on_twin else None
         if on_twin:
             self.assimilate(records)
@@ -158,25 +162,26 @@ class ReinforcementTwinning:
 
     def interact(self) -> TensorDict:
         """Step 1: one episode on the real system; transitions go to D_L with their TD errors, the record to D_S."""
+        if self.operating is not None:
+            return self.operating.take(self.referee.live, self.episodes_done)
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
         acting = self.actor.exploring(self.policies[live], self.episodes_done)
         self.learning.adopt(acting)
         cleared = self.clearance.choose(live, self.judged)
-        if cleared.policy is not self.policies[live]:
-            acting, live = cleared.policy, cleared.role
+        acting, live = (acting, live) if cleared.policy is self.policies[live] else (cleared.policy, cleared.role)
         # Virtual episodes need the inputs of one whole real episode.
         needed = self.config.arm != "model_free" and not self.virtual.processes
         flight = self.flights.fly(acting, strength=strength, whole=needed)
-        self._keep(flight)
+        self.keep(flight)
         explored = self.actor.strength * self.config.exploration.spread if acting is cleared.policy else 1.0
         if flight.whole:  # costs of parts cannot be compared with those of episodes
-            self.track_record.append(flight.record, live, flight.cost.item(), explored, cleared.policy)
+            self.track_record.append(flight.record, live, flight.cost.item(), explored, cleared.policy.state_dict())
             self.learning.flown(acting, flight.cost.item())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
 
-    def _keep(self, flight: Flight) -> None:
+    def keep(self, flight: Flight) -> None:
         """Both memories hold the sound part of an episode; of those that are refused, none does."""
         self.learning.store(flight.parts(self.twin.plant.dt))
         self.short_term.append(flight.record)
@@ -251,14 +256,10 @@ class ReinforcementTwinning:
         return costs
 
     def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """Clone the live policy into the idle one, unless the referee finds the clone worse than what it replaces.
-
-        The costs are those of both policies over the virtual episodes ``judged_on``.
-        """
+        """Clone the live policy into the idle one, unless the clone is worse; ``costs`` are those on ``judged_on``."""
         live, idle = self.referee.live, self.referee.idle
         report = self.cloning.clone(
-            self.policies[live],
-            self.policies[idle],
+            *(self.policies[role] for role in (live, idle)),
             seen=self.learner.observations,
             record=self.short_term[-1],
             costs=(costs[live].item(), costs[idle].item()),
@@ -286,8 +287,7 @@ class ReinforcementTwinning:
             ValueError: if the state of a component does not fit; it names the component.
         """
         state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
-        parts: dict[str, tuple[Any, Any]]
-        parts = {role: (policy, state["policies"][role]) for role, policy in self.policies.items()}
+        parts: dict[str, tuple[Any, Any]] = {r: (policy, state["policies"][r]) for r, policy in self.policies.items()}
         parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
         load_parts(parts)

@@ -125,6 +125,10 @@ class RealFlights:
         record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
         return Flight(transitions, record, refused, faults, others, found.whole)
 
+    def fly_first(self, policy: nn.Module) -> Flight:
+        """Fly one whole episode without exploration."""
+        return self.fly(policy, strength=0.0, whole=True)
+
     def _attempt(self) -> tuple[TensorDictBase | None, SoundPart, Exception | None]:
         """One episode, its sound part, and the error that ended it."""
         try:

@@ -50,11 +50,16 @@ class TrackRecord:
         self._flown: deque[Flown] = deque(maxlen=KEPT)
 
     def append(
-        self, trajectory: Trajectory, role: Role, cost: float, exploration: float = 0.0, policy: nn.Module | None = None
+        self,
+        trajectory: Trajectory,
+        role: Role,
+        cost: float,
+        exploration: float = 0.0,
+        weights: Mapping[str, Tensor] | None = None,
     ) -> None:
-        """Add an episode that the policy with this role has just flown, or an earlier one of its structure."""
-        flew = self._policies[role] if policy is None else policy
-        weights = {name: weight.detach().clone() for name, weight in flew.state_dict().items()}
+        """Add an episode that the policy with this role has just flown, with its present weights or with others."""
+        weights = self._policies[role].state_dict() if weights is None else weights
+        weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self._flown.append(Flown(trajectory, role, weights, cost, exploration))
 
     @property

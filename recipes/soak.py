@@ -1,0 +1,203 @@
+"""A soak of the served wind turbine: hours of operation in which connections are lost."""
+
+import contextlib
+import dataclasses
+import os
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+
+import numpy as np
+import torch
+from served_turbine import SAFE, server_of
+from served_turbine import Config as Served
+
+from rt_torchrl import check_options, main_of
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.runs.results_file import make_folder, write_results
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Let the served wind turbine operate for hours while twin and policies learn, and lose its connection at random.
+
+    The results hold, for each round of the learner, the cost and the memory and file handles of the three processes:
+    learner, acting process and server. These are read from /proc, so that this needs Linux.
+
+    Args:
+        hours: length of the soak [h].
+        faults: mean time between two lost connections [s]; 0 loses none.
+        protocol: what the server speaks, opcua or modbus.
+        port: port of the server on this machine; the next one is that of the relay, which loses the connections.
+        pace: seconds of the turbine for each second.
+        horizon: length of a window of operation [s of the turbine].
+        seed: seed of the training and of the faults.
+        threads: number of threads of the learner.
+        folder: folder of the results, soak.json, and of the events of the safety layer, safety.jsonl.
+    """
+
+    hours: float = 2.0
+    faults: float = 60.0
+    protocol: Literal["opcua", "modbus"] = "modbus"
+    port: int = 5020
+    pace: float = 25.0
+    horizon: float = 600.0
+    seed: int = 0
+    threads: int = 1
+    folder: Path = Path("runs/soak")
+
+    def __post_init__(self):
+        check_options(self)
+        if not self.hours > 0.0:
+            raise ValueError(f"hours={self.hours} must be positive.")
+        if not self.faults >= 0.0:
+            raise ValueError(f"faults={self.faults} s must not be negative; 0 loses no connection.")
+
+    def served(self) -> Served:
+        """The training whose parts operate."""
+        given = {"protocol": self.protocol, "port": self.port, "pace": self.pace, "horizon": self.horizon}
+        options = {"seed": self.seed, "threads": self.threads, "log_dir": self.folder / "run", "overwrite": True}
+        return dataclasses.replace(Served().defaults(), **given, **options)
+
+
+class Faults:
+    """Lost connections at random times: half of them are cut, half are silent.
+
+    Args:
+        relay: relay that loses them.
+        mean: mean time between two [s].
+        seed: seed of times and lengths.
+    """
+
+    def __init__(self, relay, mean: float, seed: int):
+        self._relay, self._mean, self._draws = relay, mean, np.random.default_rng(seed)
+        self.done: list[dict[str, float | str]] = []
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> "Faults":
+        if self._mean:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._ended.set()
+        if self._mean:
+            self._thread.join()
+
+    def _run(self) -> None:
+        begun = time.monotonic()
+        while not self._ended.wait(self._draws.exponential(self._mean)):
+            kind, seconds = str(self._draws.choice(["cut", "stall"])), float(self._draws.uniform(0.1, 2.0))
+            self.done.append({"at": time.monotonic() - begun, "kind": kind, "seconds": seconds})
+            getattr(self._relay, kind)(seconds)
+
+
+def usage(pid: int) -> tuple[float, int]:
+    """Resident memory of a process [MiB], and its number of file handles."""
+    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
+    return float(line.split()[1]) / 1024.0, len(os.listdir(f"/proc/{pid}/fd"))
+
+
+def summary(rounds: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Growth of memory and handles of each process after the first quarter of the rounds."""
+    found = {}
+    kept = rounds[len(rounds) // 4 :]
+    for process in ("learner", "acting", "server"):
+        memory = np.array([each[f"{process}_MiB"] for each in kept])
+        handles = [each[f"{process}_handles"] for each in kept]
+        third = max(1, len(memory) // 3)
+        found[process] = {
+            "MiB": float(np.median(memory)),
+            "growth": float(np.median(memory[-third:]) / np.median(memory[:third]) - 1.0),
+            "handles_first": handles[0],
+            "handles_last": handles[-1],
+        }
+    return found
+
+
+def operate(config: Config, algorithm, server, until: float) -> tuple[list[dict[str, float]], list[str]]:
+    """Rounds of the learner until a time, and the reasons of those in which nothing could be learned."""
+    rounds, refused = [], []
+    pids = {"learner": os.getpid(), "server": server.pid}
+    while time.monotonic() < until:
+        try:
+            report = algorithm.episode()
+        except ValueError as error:  # several windows in a row were cut up by faults
+            refused.append(str(error))
+            continue
+        pids["acting"] = algorithm.operating.operation.pid
+        found = {"real_cost": report["real_cost"].item(), "windows": report["windows"].item()}
+        for process, pid in pids.items():
+            found[f"{process}_MiB"], found[f"{process}_handles"] = usage(pid)
+        rounds.append(found | {"left": until - time.monotonic()})
+        write_results(config.folder / "soak.json", {"config": config, "rounds": rounds})
+    return rounds, refused
+
+
+def main(config: Config) -> None:
+    # Here, because --help need not wait for TorchRL.
+    from rt_torchrl import Relay, Run, served_system
+
+    if not Path("/proc/self/fd").is_dir():
+        raise ValueError("the soak reads memory and file handles from /proc, which this system does not have.")
+    torch.set_num_threads(config.threads)
+    make_folder("folder", config.folder)
+    log = config.folder / "safety.jsonl"
+    log.unlink(missing_ok=True)
+    served = config.served()
+    plant = served.plant()
+    with server_of(served) as server, contextlib.closing(Relay(config.port, config.port + 1)) as relay:
+        env = partial(
+            served_system,
+            plant,
+            safe=SAFE,
+            protocol=config.protocol,
+            port=relay.port,
+            period=served.period,
+            closure=plant.closure,
+            log=log,
+        )
+        run = Run(served, plant, env=env, first=JonkmanController)
+        try:
+            with Faults(relay, config.faults, config.seed) as faults:
+                until = time.monotonic() + 3600.0 * config.hours
+                rounds, refused = operate(config, run.algorithm, server, until)
+        finally:
+            run.algorithm.operating.operation.close()
+    write(config, rounds, refused, faults.done, log)
+
+
+def write(config: Config, rounds, refused: list[str], faults: list[dict[str, float | str]], log: Path) -> None:
+    """Write the results, and say the most important ones."""
+    events = sum(1 for _ in log.open(encoding="utf-8")) if log.is_file() else 0
+    if not rounds:
+        raise ValueError(f"hours={config.hours} h are too short for one round of the learner; give more.")
+    costs = np.array([each["real_cost"] for each in rounds])
+    found = {
+        "processes": summary(rounds),
+        "faults": faults,
+        "refused": refused,
+        "safety_events": events,
+        "windows": sum(each["windows"] for each in rounds),
+        "cost": {"mean": float(costs.mean()), "standard_error": float(costs.std() / len(costs) ** 0.5)},
+        "rounds": rounds,
+    }
+    path = write_results(config.folder / "soak.json", {"config": config, **found})
+    for process, values in found["processes"].items():
+        told = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
+        print(f"{process}: {told}")
+    print(f"{len(faults)} lost connections, {events} events of the safety layer, {len(refused)} rounds refused")
+    print(f"mean cost {found['cost']['mean']:.4g} ± {found['cost']['standard_error']:.2g} over {len(rounds)} rounds")
+    print(f"results in {path}")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,84 @@
+"""The operation of an asynchronous run, as its configuration asks for it."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from torch import nn
+from torchrl.envs import EnvBase
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.operation.acting import Crew
+from rt_torchrl.systems.operation.event_log import EventLog, read_events
+from rt_torchrl.systems.operation.operation import Operation
+from rt_torchrl.systems.operation.order import FIRST
+from rt_torchrl.systems.operation.process import ProcessOperation
+from rt_torchrl.systems.operation.simulated import SimulatedOperation
+from rt_torchrl.systems.real_system import episode_seed
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.referees import Role
+from rt_torchrl.twinning.starts import Start
+
+EVENTS = "events.jsonl"
+"""File of the operation's events in a run folder."""
+NOISE = 2**20
+"""Number of the seed of the exploration's noise among the seeds of a run; episodes have smaller ones."""
+
+
+def acting_by_name(policies: Mapping[Role, nn.Module], first: Start | None) -> dict[str, nn.Module]:
+    """Everything that may act in a run: the policies by role, and what the training begins with."""
+    found: dict[str, nn.Module] = {str(role): policy for role, policy in policies.items()}
+    teacher = None if first is None else first.teacher
+    return found if teacher is None else found | {FIRST: teacher}
+
+
+def operation_of(
+    config: RunConfig,
+    env: EnvBase,
+    make_env: Callable[[], EnvBase] | None,
+    plant: Plant,
+    policies: dict[str, nn.Module],
+    *,
+    folder: Path,
+) -> Operation:
+    """The operation of a run.
+
+    Args:
+        config: options of the run.
+        env: the real system.
+        make_env: function that makes the real system in another process; None if there is none.
+        plant: physics of the twin.
+        policies: everything that may act, by name.
+        folder: run folder, for the log of the events.
+
+    Raises:
+        ValueError: if the wall clock is asked for and there is no function that makes the real system, the device is
+            not the CPU, or what acts cannot be sent to another process; or the events to be replayed cannot be read.
+    """
+    options = config.operation
+    crew = Crew(
+        make_env or (lambda: env),
+        plant,
+        policies,
+        config.twinning.exploration,
+        options,
+        seed=episode_seed(config.seed, NOISE),
+    )
+    log = EventLog(folder / EVENTS)
+    if options.clock == "simulated":
+        replayed = None if options.replay is None else read_events(options.replay)
+        learning = round(options.learning * plant.n_steps)
+        return SimulatedOperation(crew.operator(env), learning=learning, log=log, replayed=replayed)
+    if make_env is None:
+        raise ValueError(
+            "clock='wall' needs the real system in a process of its own; give Run(..., env=) a function that makes it."
+        )
+    if config.device != "cpu":
+        raise ValueError(f"clock='wall' acts on the CPU alone, and device={config.device!r}; give --device cpu.")
+    return ProcessOperation(crew, env, log=log)
+
+
+def end_operation(algorithm: ReinforcementTwinning) -> None:
+    """End the operation of the real system, if it operates while the algorithm learns."""
+    if algorithm.operating is not None:
+        algorithm.operating.operation.close()

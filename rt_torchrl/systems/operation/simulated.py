@@ -1,0 +1,123 @@
+"""Operation on a simulated clock: one process, in which the same run repeats to the bit."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs import EnvBase
+
+from rt_torchrl.systems.operation.event_log import EventLog, counts_taken, first_intervals
+from rt_torchrl.systems.operation.operation import segments_of
+from rt_torchrl.systems.operation.operator import Operator
+from rt_torchrl.systems.operation.order import Order, OrderBook
+
+
+class SimulatedOperation:
+    """An operation in the process of the learner; see :class:`Operation` for the methods.
+
+    Time is counted in control intervals. The learner learns from a window when it is complete, which takes ``learning``
+    intervals; its policy then takes over, in the middle of a window. Windows that are completed while it learns are
+    taken together. A window is computed when the learner takes it, and not before, so that a checkpoint after an
+    episode never falls within a window.
+
+    With ``replayed`` the events of an earlier run say instead in which interval each policy took over, and which
+    windows the learner took at a time.
+
+    Args:
+        operator: what acts.
+        learning: time from taking a window to handing the next policy over, in control intervals.
+        log: log of the events.
+        replayed: events of an earlier run; None for none.
+
+    Raises:
+        ValueError: if ``learning`` is negative.
+    """
+
+    def __init__(
+        self,
+        operator: Operator,
+        *,
+        learning: int,
+        log: EventLog | None = None,
+        replayed: Sequence[dict[str, Any]] | None = None,
+    ):
+        if learning < 0:
+            raise ValueError(f"learning={learning} control intervals must not be negative.")
+        self.operator, self._learning, self.log = operator, learning, log or EventLog()
+        self._starts = None if replayed is None else first_intervals(replayed)
+        self._taken = None if replayed is None else counts_taken(replayed)
+        self.orders = OrderBook()
+        self._at: dict[int, float] = {}
+        self.version, self._now = -1, 0
+
+    @property
+    def closure(self) -> nn.Module | None:
+        closure: nn.Module | None = self.operator.env.closure
+        return closure
+
+    @property
+    def begun(self) -> bool:
+        return self.version >= 0
+
+    def hand_over(self, name: str, policy: nn.Module, *, strength: float, episode: int) -> None:
+        if self.begun:
+            self._now += self._learning
+        self.version += 1
+        at = self._now if self._starts is None else self._starts.get(self.version, math.inf)
+        self.orders[self.version] = Order.of(self.version, name, policy, strength=strength, episode=episode)
+        self._at[self.version] = at
+        self.log.note("handed over", version=self.version)
+
+    def waiting(self) -> bool:
+        if self._taken is None:
+            return (self.operator.windows + 1) * self.operator.length <= self._now
+        windows = self._taken[self.version + 1] if self.version + 1 < len(self._taken) else []
+        return bool(windows) and self.operator.windows <= windows[-1]
+
+    @property
+    def system(self) -> EnvBase:
+        """See :attr:`Operation.system`."""
+        return self.operator.env
+
+    def rollout(self) -> TensorDict:
+        """See :meth:`Operation.rollout`.
+
+        Raises:
+            ValueError: if the events that are replayed hold no further window.
+        """
+        if self._taken is not None and not self.waiting():
+            raise ValueError(
+                f"replay holds no window {self.operator.windows} after version {self.version}; ask for as many "
+                "episodes as the run had, with its options."
+            )
+        first = self.operator.interval
+        coming: dict[int, list[Order]] = {}
+        for version, at in self._at.items():
+            if at < first + self.operator.length:
+                coming.setdefault(max(int(at), first), []).append(self.orders[version])
+        window = self.operator.fly(coming)
+        self._at = {version: at for version, at in self._at.items() if at >= self.operator.interval}
+        self.orders.forget_before(int(window["version"].min()))
+        self._now = max(self._now, self.operator.interval)
+        self.log.note("taken", window=self.operator.windows - 1, flown=segments_of(window, first))
+        return window
+
+    def close(self) -> None:
+        """Do nothing, because the system stands still between two windows."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "operator": self.operator.state_dict(),
+            "orders": self.orders.state_dict(),
+            "at": [(version, float(at)) for version, at in self._at.items()],
+            "version": self.version,
+            "now": self._now,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.operator.load_state_dict(state["operator"])
+        self.orders.load_state_dict(state["orders"])
+        self._at = dict(state["at"])
+        self.version, self._now = state["version"], state["now"]
