@@ -35,7 +35,11 @@ from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .identification.identification import Identification, IdentificationConfig
+from .identification.estimation import Estimate, Estimation, EstimationConfig
 from .identification.sensor_log import LogConfig, read_log
+from .identification.sensor_record import SensorRecord, sensor_record
+from .identification.sensors import Sensor, sensors_of
+from .identification.uncertainty import Uncertainty
 
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig
@@ -102,6 +106,9 @@ __all__ = [
     "EarlierPolicies",
     "Engine",
     "EpisodeAbandoned",
+    "Estimate",
+    "Estimation",
+    "EstimationConfig",
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
@@ -149,6 +156,8 @@ __all__ = [
     "SaturatedAffine",
     "SaturatedMLP",
     "Scenario",
+    "Sensor",
+    "SensorRecord",
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
@@ -161,6 +170,7 @@ __all__ = [
     "Transition",
     "TrustRatio",
     "TwinningConfig",
+    "Uncertainty",
     "WholeEpisodes",
     "check_options",
     "check_plant",
@@ -179,5 +189,7 @@ __all__ = [
     "require_request",
     "require_stable_step",
     "rk4_step",
+    "sensor_record",
+    "sensors_of",
     "shipped_plants",
 ]

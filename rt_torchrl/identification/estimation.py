@@ -1,0 +1,280 @@
+r"""Identification from what sensors read: weights, initial states, biases and noise levels by maximum likelihood.
+
+The descent over all unknowns and the levels take turns, until the levels rest:
+
+.. math::
+    \sigma_j^2 = \frac{\sum_kr_{kj}^2}{N_j\,(1 - p/N)}, \qquad \Lambda = \frac{\gamma}{\|w - w^0\|^2}, \qquad
+    \gamma = \sum_i\big(1 - \Lambda H^{-1}_{ii}\big)
+
+with N_j samples of sensor j out of N, p unknowns that the data determine, and γ of them among the weights of
+perceptrons (MacKay, Neural Computation 4 (1992) 415).
+"""
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.identification.covariance import inverse_information, named_values
+from rt_torchrl.identification.likelihood import Biases, Likelihood
+from rt_torchrl.identification.output_error import INITIAL_ITERATIONS, NOISE_TOLERANCE, InitialStates
+from rt_torchrl.identification.sensor_record import SensorRecord
+from rt_torchrl.identification.sensors import Sensor
+from rt_torchrl.identification.uncertainty import Errors, Uncertainty
+from rt_torchrl.identification.weight_prior import WeightPrior
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
+from rt_torchrl.options import check_options
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import differences
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+SETTLED = 0.01
+"""Relative change of the noise levels below which they rest."""
+FIRST_NOISE = 0.1
+"""First guess of an unknown noise level, as a share of the scatter of the readings."""
+STIFFNESS = (1e-6, 1e8)
+"""Range of the prior's stiffness Λ where the data choose it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimationConfig:
+    """Parameters of an estimation.
+
+    Args:
+        iterations: trial steps of each descent.
+        rounds: greatest number of rounds in which noise levels and prior follow the residuals.
+        prior: stiffness Λ of the weights of the closure's perceptrons; None lets the data choose it. Other weights
+            have no prior.
+        errors: formula of the standard errors: ``fisher`` for white noise, or ``robust`` for residuals with memory.
+    """
+
+    iterations: int = 30
+    rounds: int = 10
+    prior: float | None = 0.0
+    errors: Errors = "fisher"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument in ("iterations", "rounds"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the estimation must be at least 1.")
+        if self.prior is not None and not self.prior >= 0.0:
+            raise ValueError(f"prior={self.prior} of the estimation must not be negative; None lets the data choose.")
+
+
+class Estimate(NamedTuple):
+    """Result of an estimation; the closure itself is trained in place.
+
+    Args:
+        before, after: named values of the closure.
+        noise: noise level of each sensor, by name, in its unit.
+        biases: bias of each sensor, by name; zero for one without.
+        initial: initial states of the records.
+        stiffness: stiffness Λ of the prior.
+        likelihood: the likelihood at its minimum.
+        uncertainty: standard errors, intervals and warnings.
+        iterations: number of trial steps.
+    """
+
+    before: dict[str, float]
+    after: dict[str, float]
+    noise: dict[str, float]
+    biases: dict[str, float]
+    initial: Float[Tensor, "records n_s"]
+    stiffness: float
+    likelihood: Likelihood
+    uncertainty: Uncertainty
+    iterations: int
+
+
+class Estimation:
+    """Estimates a twin's closure from what sensors read.
+
+    The descent is taken in two ways: over all unknowns together, and over the weights alone before all unknowns. The
+    lower cost stays. The first way can make up for wrong weights by initial states; the second can drive weights away
+    to make up for wrong initial states.
+
+    Args:
+        twin: the twin, whose closure is trained in place.
+        sensors: the sensors of all records.
+        spread: standard deviation of the initial states about their guess: zero for a state that is known, infinite for
+            one of which only the readings tell. None lets all be unknown.
+        config: parameters of the estimation.
+    """
+
+    def __init__(
+        self,
+        twin: DigitalTwin,
+        sensors: Sequence[Sensor],
+        *,
+        spread: Float[Tensor, " n_s"] | None = None,
+        config: EstimationConfig | None = None,
+    ):
+        self.twin, self.sensors, self.config = twin, tuple(sensors), config or EstimationConfig()
+        unknown = torch.full((len(twin.plant.states),), math.inf, dtype=torch.float64)
+        self.spread = unknown if spread is None else spread
+        if self.spread.shape != unknown.shape or not (self.spread >= 0.0).all():
+            raise ValueError(
+                f"spread={self.spread.tolist()} of the initial states must hold one number for each of "
+                f"{', '.join(state.name for state in twin.plant.states)}: 0 for a state that is known, or inf."
+            )
+
+    def run(self, records: Sequence[SensorRecord]) -> Estimate:
+        """Estimate all unknowns from the records.
+
+        Raises:
+            ValueError: if there is no record, or a sensor has no sample.
+            DivergenceError: if the twin diverges under the weights that it starts from.
+        """
+        closure = self.twin.closure
+        before = {name: value.item() for name, value in named_values(closure).items()}
+        prior = WeightPrior(closure, 1.0 if self.config.prior is None else self.config.prior)
+        likelihood, iterations = self._best_start(records, prior)
+        for _ in range(self.config.rounds):
+            rest = self._follow_residuals(likelihood)
+            iterations += self._descend(likelihood)
+            if rest:
+                break
+        names = [sensor.name for sensor in self.sensors]
+        return Estimate(
+            before,
+            {name: value.item() for name, value in named_values(closure).items()},
+            dict(zip(names, likelihood.noise.tolist(), strict=True)),
+            dict(zip(names, likelihood.biases().tolist(), strict=True)),
+            likelihood.initial().detach(),
+            prior.stiffness,
+            likelihood,
+            Uncertainty(likelihood, errors=self.config.errors),
+            iterations,
+        )
+
+    def likelihood(
+        self,
+        records: Sequence[SensorRecord],
+        noise: Float[Tensor, " n_y"] | None = None,
+        *,
+        prior: WeightPrior | None = None,
+        weights: bool = True,
+        known: bool = False,
+    ) -> Likelihood:
+        """The likelihood of records, with initial states at their guess.
+
+        Args:
+            records: the records.
+            noise: noise levels; by default those that are given, and a share of the readings' scatter for others.
+            prior: prior of the weights.
+            weights: whether the weights are unknowns.
+            known: whether to take the initial states as known.
+        """
+        noise = first_noise(self.sensors, records) if noise is None else noise
+        first = torch.stack([record.guess for record in records])
+        free = [] if known else (self.spread > 0.0).nonzero().flatten().tolist()
+        initial = InitialStates(first, free, state_sizes(self.twin.plant, first))
+        biases = None if known else Biases(self.sensors, noise)
+        return Likelihood(
+            self.twin,
+            records,
+            self.sensors,
+            initial,
+            noise,
+            spread=self.spread,
+            biases=biases,
+            prior=prior,
+            weights=weights,
+        )
+
+    def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:
+        """The likelihood of other records under the present weights, at the initial states that suit them best."""
+        likelihood = self.likelihood(records, noise, weights=False)
+        LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE).run(
+            likelihood.normal_equations, 2 * INITIAL_ITERATIONS
+        )
+        return likelihood
+
+    def _best_start(self, records: Sequence[SensorRecord], prior: WeightPrior) -> tuple[Likelihood, int]:
+        """The likelihood at its minimum under the first noise levels, by the better of two ways."""
+        closure = self.twin.closure
+        start = copy.deepcopy(closure.state_dict())
+        together = self.likelihood(records, prior=prior)
+        done = self._descend(together)
+        cost, found = together.normal_equations().cost, copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(start)
+        done += self._descend(self.likelihood(records, prior=prior, known=True))
+        staged = self.likelihood(records, prior=prior)
+        done += self._descend(staged)
+        if staged.normal_equations().cost < cost:
+            return staged, done
+        closure.load_state_dict(found)
+        return together, done
+
+    def _descend(self, likelihood: Likelihood) -> int:
+        optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
+        return optimiser.run(likelihood.normal_equations, self.config.iterations).iterations
+
+    def _follow_residuals(self, likelihood: Likelihood) -> bool:
+        """Set noise levels and prior by the residuals; whether they rest."""
+        blocks = likelihood.residuals()
+        equations = likelihood.normal_equations(blocks)
+        inverse = inverse_information(equations.matrix).matrix.diagonal()
+        rest = True
+        n, prior = likelihood.weight_count, likelihood.prior
+        determined = likelihood.count - _held_back(likelihood, inverse)
+        if self.config.prior is None and prior is not None and prior.held.any():
+            gamma = (prior.held * (1.0 - prior.stiffness * inverse[:n])).sum()
+            moved = (prior.held * (prior.weights() - prior.start).square()).sum()
+            new = float((gamma / moved.clamp_min(1e-300)).clamp(*STIFFNESS))
+            rest = abs(math.log(new / prior.stiffness)) < SETTLED
+            prior.stiffness = new
+        given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)
+        count = torch.stack([record.seen.sum(0) for record in likelihood.records]).sum(0)
+        squares = torch.stack([block.values.square().sum(0) for block in blocks]).sum(0)
+        freedom = count * max(1.0 - determined / int(count.sum()), 1.0 / int(count.sum()))
+        floor = 1e-12 * first_noise(self.sensors, likelihood.records)
+        levels = torch.maximum(likelihood.noise * (squares / freedom).sqrt(), floor)
+        levels = torch.where(given, likelihood.noise, levels)
+        rest &= bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
+        likelihood.noise = levels
+        return rest
+
+
+def _held_back(likelihood: Likelihood, inverse: Float[Tensor, " n"]) -> float:
+    """Number of unknowns that priors determine instead of the data."""
+    n, initial, prior = likelihood.weight_count, likelihood.initial, likelihood.prior
+    stiffness = (initial.unit / likelihood.spread).square().sum(-1).expand_as(initial.offsets).flatten()
+    found = (stiffness * inverse[n : n + len(stiffness)]).sum()
+    if prior is not None:
+        found = found + (prior.stiffness * prior.held * inverse[:n]).sum()
+    return float(found)
+
+
+def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """Noise levels that are given; for others a share of the scatter of the readings.
+
+    Raises:
+        ValueError: if there is no record, or a sensor has no sample.
+    """
+    if not records:
+        raise ValueError("records=[] of the estimation must hold at least one record.")
+    readings = torch.cat([record.readings for record in records])
+    levels = []
+    for sensor, values in zip(sensors, readings.T, strict=True):
+        seen = values[~values.isnan()]
+        if not len(seen):
+            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
+        origin = seen[:1].expand_as(seen)
+        scatter = differences([sensor.measurement], (seen - 0.0)[:, None], origin[:, None]).square().mean().sqrt()
+        guess = FIRST_NOISE * scatter.item() or 1e-6 * max(abs(origin[0].item()), 1.0)
+        levels.append(guess if sensor.noise is None else sensor.noise)
+    return readings.new_tensor(levels)
+
+
+def state_sizes(plant: Plant, first: Float[Tensor, "records n_s"]) -> Float[Tensor, " n_s"]:
+    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it."""
+    drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
+    sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
+    return torch.where(sizes > 0.0, sizes, 1.0)
