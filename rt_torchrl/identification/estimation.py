@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from rt_torchrl.identification.covariance import inverse_information, named_values
 from rt_torchrl.identification.likelihood import Biases, Likelihood
@@ -37,6 +37,8 @@ SETTLED = 0.01
 """Relative change of the noise levels below which they rest."""
 FIRST_NOISE = 0.1
 """First guess of an unknown noise level, as a share of the scatter of the readings."""
+LEAST_NOISE = 1e-9
+"""Least noise level, as a share of its first guess; less is rounding."""
 STIFFNESS = (1e-6, 1e8)
 """Range of the prior's stiffness Λ where the data choose it."""
 
@@ -50,17 +52,20 @@ class EstimationConfig:
         rounds: greatest number of rounds in which noise levels and prior follow the residuals.
         prior: stiffness Λ of the weights of the closure's perceptrons; None lets the data choose it. Other weights
             have no prior.
+        starts: number of first weights that the descent begins with. Beside the present ones it begins with the best
+            ones so far, moved at random: one sensor may leave several local minima.
         errors: formula of the standard errors: ``fisher`` for white noise, or ``robust`` for residuals with memory.
     """
 
     iterations: int = 30
     rounds: int = 10
     prior: float | None = 0.0
+    starts: int = 1
     errors: Errors = "fisher"
 
     def __post_init__(self) -> None:
         check_options(self)
-        for argument in ("iterations", "rounds"):
+        for argument in ("iterations", "rounds", "starts"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the estimation must be at least 1.")
         if self.prior is not None and not self.prior >= 0.0:
@@ -197,20 +202,26 @@ class Estimation:
         return likelihood
 
     def _best_start(self, records: Sequence[SensorRecord], prior: WeightPrior) -> tuple[Likelihood, int]:
-        """The likelihood at its minimum under the first noise levels, by the better of two ways."""
-        closure = self.twin.closure
+        """The likelihood at its minimum under the first noise levels, by the best way."""
+        closure, generator = self.twin.closure, torch.Generator().manual_seed(0)
         start = copy.deepcopy(closure.state_dict())
-        together = self.likelihood(records, prior=prior)
-        done = self._descend(together)
-        cost, found = together.normal_equations().cost, copy.deepcopy(closure.state_dict())
-        closure.load_state_dict(start)
-        done += self._descend(self.likelihood(records, prior=prior, known=True))
-        staged = self.likelihood(records, prior=prior)
-        done += self._descend(staged)
-        if staged.normal_equations().cost < cost:
-            return staged, done
+        best = self.likelihood(records, prior=prior)
+        done = self._descend(best)
+        cost, found = best.normal_equations().cost, copy.deepcopy(closure.state_dict())
+        for number in range(self.config.starts):
+            closure.load_state_dict(found if number else start)
+            if number:
+                _moved(closure, generator)
+            try:
+                done += self._descend(self.likelihood(records, prior=prior, known=True))
+                other = self.likelihood(records, prior=prior)
+                done += self._descend(other)
+            except FloatingPointError:  # weights drawn at random may be nonsense
+                continue
+            if other.normal_equations().cost < cost:
+                best, cost, found = other, other.normal_equations().cost, copy.deepcopy(closure.state_dict())
         closure.load_state_dict(found)
-        return together, done
+        return best, done
 
     def _descend(self, likelihood: Likelihood) -> int:
         optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
@@ -234,7 +245,7 @@ class Estimation:
         count = torch.stack([record.seen.sum(0) for record in likelihood.records]).sum(0)
         squares = torch.stack([block.values.square().sum(0) for block in blocks]).sum(0)
         freedom = count * max(1.0 - determined / int(count.sum()), 1.0 / int(count.sum()))
-        floor = 1e-12 * first_noise(self.sensors, likelihood.records)
+        floor = LEAST_NOISE * first_noise(self.sensors, likelihood.records)
         levels = torch.maximum(likelihood.noise * (squares / freedom).sqrt(), floor)
         levels = torch.where(given, likelihood.noise, levels)
         rest &= bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
@@ -242,10 +253,19 @@ class Estimation:
         return rest
 
 
+@torch.no_grad()
+def _moved(closure: nn.Module, generator: torch.Generator) -> None:
+    """Move the weights at random, each by a normal number of some units; a unit is a factor of e for a logarithm."""
+    far = 3.0 * torch.rand(1, generator=generator, dtype=torch.float64).item()
+    for w in closure.parameters():
+        if w.requires_grad:
+            w.add_(far * torch.randn(w.shape, generator=generator, dtype=torch.float64).to(w.device))
+
+
 def _held_back(likelihood: Likelihood, inverse: Float[Tensor, " n"]) -> float:
     """Number of unknowns that priors determine instead of the data."""
     n, initial, prior = likelihood.weight_count, likelihood.initial, likelihood.prior
-    stiffness = (initial.unit / likelihood.spread).square().sum(-1).expand_as(initial.offsets).flatten()
+    stiffness = likelihood.first_stiffness.expand_as(initial.offsets).flatten()
     found = (stiffness * inverse[n : n + len(stiffness)]).sum()
     if prior is not None:
         found = found + (prior.stiffness * prior.held * inverse[:n]).sum()

@@ -114,6 +114,11 @@ class Likelihood:
         """Number of unknowns."""
         return self._shown + self.initial.offsets.numel() + self.biases.offsets.numel()
 
+    @property
+    def first_stiffness(self) -> Float[Tensor, " n_free"]:
+        """Stiffness of the offsets of a record's initial state, of which the guess is the centre."""
+        return (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
+
     @torch.no_grad()
     def replays(self) -> list[Replays]:
         """Replay every record with the present unknowns.
@@ -184,8 +189,7 @@ class Likelihood:
 
     def _with_first_states(self, found: NormalEquations) -> NormalEquations:
         """The equations with the prior of the initial states."""
-        stiffness = (self.initial.unit / self.spread).square().sum(-1)  # of one offset
-        offsets = self.initial.offsets
+        stiffness, offsets = self.first_stiffness, self.initial.offsets
         held = slice(self._shown, self._shown + offsets.numel())
         found.gradient[held] += (stiffness * offsets).flatten()
         found.matrix.diagonal()[held] += stiffness.expand_as(offsets).flatten()

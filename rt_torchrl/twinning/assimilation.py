@@ -49,6 +49,11 @@ class AssimilationConfig:
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
             make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
+        sensors: names of the states and measurements that sensors read, to which the twin is fitted by maximum
+            likelihood; none for the plant's J_p of the whole state. Noise levels are estimated, and so are first
+            states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
+            the mean square of the residuals in units of the noise, and ``stop_ratio`` has no effect. Sensors need
+            ``levenberg_marquardt``, the inputs of the ``record``, ``initial="estimated"`` and whole records.
         descent: parameters of the closure's descent.
     """
 
@@ -59,6 +64,7 @@ class AssimilationConfig:
     prior: float = 0.0
     segment: int = 0
     initial: Literal["measured", "estimated"] = "measured"
+    sensors: tuple[str, ...] = ()
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self) -> None:
@@ -75,6 +81,11 @@ class AssimilationConfig:
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
+            )
+        if self.sensors and (self.initial != "estimated" or self.segment):
+            raise ValueError(
+                f"sensors={self.sensors} of the assimilation need initial='estimated' and segment=0; they are "
+                f"{self.initial!r} and {self.segment}."
             )
 
 
