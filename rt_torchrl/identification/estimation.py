@@ -238,7 +238,7 @@ class Estimation:
         if self.config.prior is None and prior is not None and prior.held.any():
             gamma = (prior.held * (1.0 - prior.stiffness * inverse[:n])).sum()
             moved = (prior.held * (prior.weights() - prior.start).square()).sum()
-            new = float((gamma / moved.clamp_min(1e-300)).clamp(*STIFFNESS))
+            new = (gamma / moved.clamp_min(1e-300)).clamp(*STIFFNESS).item()
             rest = abs(math.log(new / prior.stiffness)) < SETTLED
             prior.stiffness = new
         given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)

@@ -170,6 +170,13 @@ class Likelihood:
         return [Residuals(values[k], jacobian[k], self._places(i)) for k, i in enumerate(numbers)]
 
     @torch.no_grad()
+    def simulated(self) -> Float[Tensor, "samples n_y"]:
+        """What the sensors would read along the first record, bias included, whether there is a sample or not."""
+        (states, *_), record = self.replays()[0].states, self.records[0]
+        t = record.start + self.plant.dt * torch.arange(len(states), dtype=states.dtype, device=states.device)
+        return read(self.sensors, self.plant, t, states, held_to_the_end(record.exogenous)) + self.biases()
+
+    @torch.no_grad()
     def normal_equations(self, residuals: Sequence[Residuals] | None = None) -> NormalEquations:
         """J, its gradient and its Gauss-Newton matrix by all unknowns.
 

@@ -87,7 +87,6 @@ class SensorAssimilation(Assimilation):
             f"standard_error/{name}": value for name, value in errors.items()
         }
 
-
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"begun": self.begun}
 
