@@ -78,9 +78,9 @@ def test_intervals_of_a_regression_hold_the_truth():
     plant, truth = WindyLine(), Slope()
     sensors = sensors_of(plant, ["position"])
     generator = torch.Generator().manual_seed(0)
-    found = coverage(plant, truth, sensors, simulations=40, share=0.1, generator=generator)
-    # Two times 40 intervals: 95 % within 2 · 2.4 %, and a mean square of 1 within 2 · √(2/80).
-    assert 0.88 <= found.mean <= 1.0 and found.told.tolist() == [1.0, 1.0]
+    found = coverage(plant, truth, sensors, simulations=20, share=0.1, generator=generator)
+    # Two times 20 intervals: 95 % within 3 · 3.4 %, and a mean square of 1 within 2 · √(2/40).
+    assert 0.85 <= found.mean <= 1.0 and found.told.tolist() == [1.0, 1.0]
     assert 0.7 < found.error_over_bound.square().mean().sqrt() < 1.3
     with pytest.raises(ValueError, match="simulations=0"):
         coverage(plant, truth, sensors, simulations=0, generator=generator)

@@ -45,6 +45,7 @@ def blinded(plant, record, names):
     return record._replace(states=states)
 
 
+@pytest.mark.slow
 def test_the_tank_is_identified_from_its_pressure_alone():
     plant = CryogenicTank(horizon=21600.0)
     records = [blinded(plant, record, ["pressure"]) for record in episodes(plant, 2)]

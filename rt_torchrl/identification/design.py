@@ -74,7 +74,7 @@ def next_manoeuvres(
 
     plant, sensors = estimation.twin.plant, estimation.sensors
     found = {name: of([sensor_record(plant, sensors, m)]) for name, m in manoeuvres.items()}
-    size = sum(F.diagonal() for F in found.values())
+    size = torch.stack([F.diagonal() for F in found.values()]).sum(0)
     total = torch.diag(LEAST_INFORMATION * size.clamp_min(1e-300))  # so that weights that nothing shows are no obstacle
     total = total + (of(known) if known else 0.0)
     chosen = []

@@ -26,9 +26,10 @@ from rt_torchrl.identification.output_error import INITIAL_ITERATIONS, NOISE_TOL
 from rt_torchrl.identification.sensor_record import SensorRecord
 from rt_torchrl.identification.sensors import Sensor
 from rt_torchrl.identification.uncertainty import Errors, Uncertainty
-from rt_torchrl.identification.weight_prior import WeightPrior
+from rt_torchrl.identification.weight_prior import BeliefPrior, WeightPrior
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import check_options
+from rt_torchrl.plants.measurement import Component
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -109,6 +110,8 @@ class Estimation:
         sensors: the sensors of all records.
         spread: standard deviation of the initial states about their guess: zero for a state that is known, infinite for
             one of which only the readings tell. None lets all be unknown.
+        process: standard deviation of what process noise does to every state from a record to one that follows it, see
+            :func:`chained`; None if there is none.
         config: parameters of the estimation.
     """
 
@@ -118,6 +121,7 @@ class Estimation:
         sensors: Sequence[Sensor],
         *,
         spread: Float[Tensor, " n_s"] | None = None,
+        process: Float[Tensor, " n_s"] | None = None,
         config: EstimationConfig | None = None,
     ):
         self.twin, self.sensors, self.config = twin, tuple(sensors), config or EstimationConfig()
@@ -128,17 +132,32 @@ class Estimation:
                 f"spread={self.spread.tolist()} of the initial states must hold one number for each of "
                 f"{', '.join(state.name for state in twin.plant.states)}: 0 for a state that is known, or inf."
             )
+        self.process = process
+        if process is not None and not (
+            process.shape == unknown.shape and ((process > 0.0) & self.spread.isinf()).all()
+        ):
+            raise ValueError(
+                f"process={process.tolist()} must hold a positive number for each of "
+                f"{', '.join(state.name for state in twin.plant.states)}, and goes with spread=None alone."
+            )
 
-    def run(self, records: Sequence[SensorRecord]) -> Estimate:
+    def run(self, records: Sequence[SensorRecord], belief: BeliefPrior | None = None) -> Estimate:
         """Estimate all unknowns from the records.
 
+        Args:
+            records: the records.
+            belief: what was believed of the weights before; None for the prior of the configuration.
+
         Raises:
-            ValueError: if there is no record, or a sensor has no sample.
+            ValueError: if there is no record, or a sensor has no sample, or a record follows another one without
+                process noise.
             DivergenceError: if the twin diverges under the weights that it starts from.
         """
         closure = self.twin.closure
         before = {name: value.item() for name, value in named_values(closure).items()}
-        prior = WeightPrior(closure, 1.0 if self.config.prior is None else self.config.prior)
+        self._require_process(records)
+        stiffness = 1.0 if self.config.prior is None else self.config.prior
+        prior = WeightPrior(closure, stiffness) if belief is None else belief
         likelihood, iterations = self._best_start(records, prior)
         for _ in range(self.config.rounds):
             rest = self._follow_residuals(likelihood)
@@ -177,9 +196,9 @@ class Estimation:
             known: whether to take the initial states as known.
         """
         noise = first_noise(self.sensors, records) if noise is None else noise
-        first = torch.stack([record.guess for record in records])
+        first = self._guesses(records)
         free = [] if known else (self.spread > 0.0).nonzero().flatten().tolist()
-        initial = InitialStates(first, free, state_sizes(self.twin.plant, first))
+        initial = InitialStates(first, free, state_sizes(self.twin.plant, first, self.sensors, records))
         biases = None if known else Biases(self.sensors, noise)
         return Likelihood(
             self.twin,
@@ -188,10 +207,32 @@ class Estimation:
             initial,
             noise,
             spread=self.spread,
+            process=None if known else self.process,
             biases=biases,
             prior=prior,
             weights=weights,
         )
+
+    @torch.no_grad()
+    def _guesses(self, records: Sequence[SensorRecord]) -> Float[Tensor, "records n_s"]:
+        """First guesses of the initial states; a record that follows begins where the twin ends the one before."""
+        found: list[Tensor] = []
+        for number, record in enumerate(records):
+            if record.follows and number:
+                before = records[number - 1]
+                given = (found[-1][None], before.exogenous[None], before.actions[None])
+                found.append(self.twin.replay(*given, start=before.start).states[0, -1])
+            else:
+                found.append(record.guess)
+        return torch.stack(found)
+
+    def _require_process(self, records: Sequence[SensorRecord]) -> None:
+        follows = [record.follows for record in records]
+        if any(follows) and (self.process is None or follows[0]):
+            raise ValueError(
+                "a record follows the one before it: give the estimation its process noise, process=..., and begin with a "
+                "record that follows nothing."
+            )
 
     def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:
         """The likelihood of other records under the present weights, at the initial states that suit them best."""
@@ -213,7 +254,8 @@ class Estimation:
             if number:
                 _moved(closure, generator)
             try:
-                done += self._descend(self.likelihood(records, prior=prior, known=True))
+                if self.process is None:
+                    done += self._descend(self.likelihood(records, prior=prior, known=True))
                 other = self.likelihood(records, prior=prior)
                 done += self._descend(other)
             except FloatingPointError:  # weights drawn at random may be nonsense
@@ -231,12 +273,12 @@ class Estimation:
         """Set noise levels and prior by the residuals; whether they rest."""
         blocks = likelihood.residuals()
         equations = likelihood.normal_equations(blocks)
-        inverse = inverse_information(equations.matrix).matrix.diagonal()
+        inverse = inverse_information(equations.matrix).matrix
         rest = True
         n, prior = likelihood.weight_count, likelihood.prior
         determined = likelihood.count - _held_back(likelihood, inverse)
         if self.config.prior is None and prior is not None and prior.held.any():
-            gamma = (prior.held * (1.0 - prior.stiffness * inverse[:n])).sum()
+            gamma = (prior.held * (1.0 - prior.stiffness * inverse.diagonal()[:n])).sum()
             moved = (prior.held * (prior.weights() - prior.start).square()).sum()
             new = (gamma / moved.clamp_min(1e-300)).clamp(*STIFFNESS).item()
             rest = abs(math.log(new / prior.stiffness)) < SETTLED
@@ -262,14 +304,15 @@ def _moved(closure: nn.Module, generator: torch.Generator) -> None:
             w.add_(far * torch.randn(w.shape, generator=generator, dtype=torch.float64).to(w.device))
 
 
-def _held_back(likelihood: Likelihood, inverse: Float[Tensor, " n"]) -> float:
+def _held_back(likelihood: Likelihood, inverse: Float[Tensor, "n n"]) -> float:
     """Number of unknowns that priors determine instead of the data."""
-    n, initial, prior = likelihood.weight_count, likelihood.initial, likelihood.prior
-    stiffness = likelihood.first_stiffness.expand_as(initial.offsets).flatten()
-    found = (stiffness * inverse[n : n + len(stiffness)]).sum()
-    if prior is not None:
-        found = found + (prior.stiffness * prior.held * inverse[:n]).sum()
-    return float(found)
+    n, prior = likelihood.weight_count, likelihood.prior
+    stiffness = likelihood.first_stiffness.flatten()
+    found = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
+    for push in likelihood.pushes():
+        A, places = push.jacobian[0], push.places
+        found = found + (A.T @ A * inverse[places[:, None], places]).sum()
+    return float(found if prior is None else found + prior.determined(inverse))
 
 
 def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
@@ -293,8 +336,21 @@ def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> F
     return readings.new_tensor(levels)
 
 
-def state_sizes(plant: Plant, first: Float[Tensor, "records n_s"]) -> Float[Tensor, " n_s"]:
-    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it."""
+def state_sizes(
+    plant: Plant, first: Float[Tensor, "records n_s"], sensors: Sequence[Sensor], records: Sequence[SensorRecord]
+) -> Float[Tensor, " n_s"]:
+    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it.
+
+    It is the greatest of the scatter of the states that the plant draws, that of what a sensor reads of it, and a tenth
+    of the guess.
+    """
     drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
     sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
+    for column, sensor in enumerate(sensors):
+        place = sensor.measurement.read
+        if isinstance(place, Component) and place.of == "state":
+            values = torch.cat([record.readings[:, column] for record in records])
+            values = values[~values.isnan()]
+            scatter = (values - values.mean()).square().mean().sqrt()
+            sizes[place.index] = torch.maximum(sizes[place.index], scatter)
     return torch.where(sizes > 0.0, sizes, 1.0)

@@ -2,10 +2,12 @@ r"""The likelihood of sensor readings under a twin, and its derivatives by all u
 
 .. math::
     J(w, s_0, b) = \frac12\sum_{i,k,j}\Big(\frac{y^i_{kj} - h_j(s^i_k) - b_j}{\sigma_j}\Big)^2
-        + \frac12\sum_i\Big\|\frac{s^i_0 - \hat s^i_0}{\rho}\Big\|^2 + \frac12\Lambda\|w - w^0\|^2
+        + \frac12\sum_i\Big\|\frac{s^i_0 - \hat s^i_0}{\rho}\Big\|^2
+        + \frac12\sum_i\Big\|\frac{s^i_0 - s^{i-1}_n}{q}\Big\|^2 + \frac12\Lambda\|w - w^0\|^2
 
 The first sum is over the samples that exist. The unknowns are the closure's weights w, the initial states of all
-records, of which no sensor needs to read any component, and the biases b. J is the negative logarithm of the posterior,
+records, of which no sensor needs to read any component, and the biases b. The second sum is over records with a start of their
+own, the third over records that follow another one, from whose end process noise q parts them (weak constraint). J is the negative logarithm of the posterior,
 so that its Gauss-Newton matrix is the Fisher information of the unknowns.
 """
 
@@ -77,6 +79,8 @@ class Likelihood:
         initial: initial states of the records; their offsets come next.
         noise: standard deviation σ of each sensor.
         spread: standard deviation ρ of the initial states about their guess; infinite for none.
+        process: standard deviation q of what process noise does to every state between two records that follow each
+            other; None if no record follows.
         biases: offsets of the sensors, which come last; None for none.
         prior: prior of the closure's weights; None for none.
         weights: whether the closure's weights are unknowns.
@@ -91,6 +95,7 @@ class Likelihood:
         noise: Float[Tensor, " n_y"],
         *,
         spread: Float[Tensor, " n_s"] | None = None,
+        process: Float[Tensor, " n_s"] | None = None,
         biases: Biases | None = None,
         prior: WeightPrior | None = None,
         weights: bool = True,
@@ -98,7 +103,7 @@ class Likelihood:
         self.twin, self.records, self.sensors = twin, list(records), tuple(sensors)
         self.initial, self.noise, self.prior = initial, noise, prior
         self.spread = torch.full_like(initial.measured[0], math.inf) if spread is None else spread
-        self.biases = biases or Biases((), noise)
+        self.biases, self.process = biases or Biases((), noise), process
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
         self._shown = self.weight_count if weights else 0
         self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), initial, self.biases])
@@ -115,9 +120,11 @@ class Likelihood:
         return self._shown + self.initial.offsets.numel() + self.biases.offsets.numel()
 
     @property
-    def first_stiffness(self) -> Float[Tensor, " n_free"]:
-        """Stiffness of the offsets of a record's initial state, of which the guess is the centre."""
-        return (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
+    def first_stiffness(self) -> Float[Tensor, "records n_free"]:
+        """Stiffness of the offsets of every initial state, of which the guess is the centre; zero for one that follows."""
+        each = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
+        own = [float(not record.follows) for record in self.records]
+        return each.new_tensor(own)[:, None] * each
 
     @torch.no_grad()
     def replays(self) -> list[Replays]:
@@ -186,7 +193,9 @@ class Likelihood:
         like = self.initial.measured
         gradient, matrix = like.new_zeros(self.count), like.new_zeros(self.count, self.count)
         cost = like.new_zeros(())
-        for block in self.residuals() if residuals is None else residuals:
+        replays = self.replays() if residuals is None or self.process is not None else []
+        blocks = self.residuals(replays) if residuals is None else residuals
+        for block in (*blocks, *self.pushes(replays)):
             r, A = block.values.flatten(), block.jacobian.flatten(0, 1)
             cost = cost + 0.5 * (r @ r)
             gradient[block.places] += A.T @ r
@@ -199,8 +208,31 @@ class Likelihood:
         stiffness, offsets = self.first_stiffness, self.initial.offsets
         held = slice(self._shown, self._shown + offsets.numel())
         found.gradient[held] += (stiffness * offsets).flatten()
-        found.matrix.diagonal()[held] += stiffness.expand_as(offsets).flatten()
+        found.matrix.diagonal()[held] += stiffness.flatten()
         return found._replace(cost=found.cost + 0.5 * (stiffness * offsets.square()).sum())
+
+    @torch.no_grad()
+    def pushes(self, replays: Sequence[Replays] | None = None) -> list[Residuals]:
+        """What process noise does to the states between records that follow each other, in units of q."""
+        if self.process is None:
+            return []
+        states: dict[int, tuple[Tensor, Tensor]] = {}
+        for replay in self.replays() if replays is None else replays:
+            ends = zip(replay.states[:, [0, -1]], replay.sensitivity[:, [0, -1]], strict=True)
+            states |= dict(zip(replay.numbers, ends, strict=True))
+        found, biases = [], self.biases.offsets.numel()
+        for number, record in enumerate(self.records):
+            if not record.follows:
+                continue
+            (s, S), (before, S_before) = states[number], states[number - 1]
+            values = (s[0] - before[1]) / self.process
+            own, places = S[0][:, self._shown :], self._places(number)
+            rest = self._places(number - 1)
+            jacobian = torch.cat([-S_before[1], own], -1) / self.process[:, None]
+            kept = slice(len(rest) - biases)
+            joined = torch.cat([rest[kept], places[self._shown : len(places) - biases]])
+            found.append(Residuals(values[None], jacobian[None], joined))
+        return found
 
     def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)

@@ -3,8 +3,8 @@ r"""Profile likelihood of one weight: the least cost that all other unknowns can
 .. math:: J_p(\omega) = \min_{\theta:\,w_i = \omega} J(\theta), \qquad
     \{\omega: 2(J_p(\omega) - J) \le \chi^2_1\} \text{ is its confidence interval}
 
-Unlike a standard error it needs no parabola: it shows an interval that is lopsided, or open to one side, because no data
-bounds the weight there.
+Unlike a standard error it needs no parabola: it shows an interval that is lopsided, or open to one side, because no
+data bounds the weight there.
 """
 
 import copy

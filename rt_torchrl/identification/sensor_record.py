@@ -24,6 +24,7 @@ class SensorRecord(NamedTuple):
         exogenous: exogenous inputs z, held over the same intervals.
         guess: first guess of the state in t_0.
         start: time t_0 on the plant's clock [s].
+        follows: whether the record begins where the one before it in a list ends, up to process noise.
     """
 
     readings: Float[Tensor, "n+1 n_y"]
@@ -31,6 +32,7 @@ class SensorRecord(NamedTuple):
     exogenous: Float[Tensor, "n n_z"]
     guess: Float[Tensor, " n_s"]
     start: float = 0.0
+    follows: bool = False
 
     @property
     def seen(self) -> Bool[Tensor, "samples n_y"]:
@@ -68,6 +70,33 @@ def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -
     with torch.no_grad():
         readings = read(sensors, plant, t.to(inputs.device), record.states, inputs)
     return SensorRecord(readings, record.actions, record.exogenous, record.states[0], float(record.start))
+
+
+def chained(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
+    """A record cut into parts, of which each follows the one before.
+
+    An estimation with process noise then finds by how much the states are pushed from part to part. The sample at a cut
+    belongs to the part that ends there.
+
+    Args:
+        record: the record.
+        length: number of control intervals of a part; the last part takes what is left.
+        dt: control interval [s].
+
+    Raises:
+        ValueError: if the length is below 1.
+    """
+    if length < 1:
+        raise ValueError(f"length={length} of the parts of a record must be at least 1 control interval.")
+    n, parts = len(record.actions), []
+    for first in range(0, n, length):
+        part = record.part(first, min(first + length, n), dt)
+        if first:
+            readings = part.readings.clone()
+            readings[0] = torch.nan
+            part = part._replace(readings=readings, follows=True)
+        parts.append(part)
+    return parts
 
 
 def held_to_the_end(exogenous: Float[Tensor, "*batch n n_z"]) -> Float[Tensor, "*batch samples n_z"]:

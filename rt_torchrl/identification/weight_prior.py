@@ -3,7 +3,10 @@ r"""A Gaussian prior of a closure's weights, which holds what no record shows at
 .. math:: \tfrac12\sum_i\Lambda_i(w_i - w_i^0)^2
 """
 
+from typing import NamedTuple
+
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
@@ -39,6 +42,11 @@ class WeightPrior:
         """The cost, differentiable by the weights."""
         return 0.5 * self.stiffness * (self.held * (self.weights() - self.start).square()).sum()
 
+    def determined(self, inverse: Tensor) -> Tensor:
+        """Number of weights that the prior determines instead of the data, by the inverse of the information."""
+        n = len(self.start)
+        return (self.stiffness * self.held * inverse.diagonal()[:n]).sum()
+
     def added(self, found: NormalEquations) -> NormalEquations:
         """Normal equations, whose first unknowns are the weights, with the prior."""
         if not self.stiffness:
@@ -48,3 +56,54 @@ class WeightPrior:
         pull = pad(each * (self.weights() - self.start), (0, rest))
         matrix = found.matrix + torch.diag(pad(each, (0, rest)))
         return NormalEquations(found.cost + self.cost(), found.gradient + pull, matrix)
+
+
+class Belief(NamedTuple):
+    """What is believed of a closure's trained weights: their mean and covariance."""
+
+    mean: Float[Tensor, " n_w"]
+    covariance: Float[Tensor, "n_w n_w"]
+
+
+class BeliefPrior(WeightPrior):
+    r"""The prior of weights that drift, from what was believed of them before.
+
+    .. math:: \tfrac12(w - \bar w)^\top(C + q^2I)^{-1}(w - \bar w)
+
+    Args:
+        closure: closure with the weights.
+        belief: mean and covariance of the weights before.
+        drift: standard deviation q by which each weight may have changed since.
+
+    Raises:
+        ValueError: if the drift is not positive and finite, or the belief is of other weights.
+    """
+
+    def __init__(self, closure: nn.Module, belief: Belief, drift: float):
+        super().__init__(closure, 1.0)
+        if not 0.0 < drift < float("inf"):
+            raise ValueError(f"drift={drift} of the weights must be positive and finite.")
+        if belief.mean.shape != self.start.shape:
+            raise ValueError(f"the belief is of {len(belief.mean)} weights; the closure has {len(self.start)}.")
+        self.start = belief.mean
+        unit = torch.eye(len(belief.mean), dtype=belief.mean.dtype, device=belief.mean.device)
+        self.precision = torch.linalg.inv(belief.covariance + drift**2 * unit)
+        self.held = torch.zeros_like(belief.mean)  # nothing that the data could make stiffer
+
+    def cost(self) -> Tensor:
+        """The cost, differentiable by the weights."""
+        change = self.weights() - self.start
+        return 0.5 * change @ self.precision @ change
+
+    def determined(self, inverse: Tensor) -> Tensor:
+        """Number of weights that the belief determines instead of the data."""
+        n = len(self.start)
+        return (self.precision * inverse[:n, :n]).sum()
+
+    def added(self, found: NormalEquations) -> NormalEquations:
+        """Normal equations, whose first unknowns are the weights, with the prior."""
+        n = len(self.start)
+        gradient, matrix = found.gradient.clone(), found.matrix.clone()
+        gradient[:n] += self.precision @ (self.weights() - self.start)
+        matrix[:n, :n] += self.precision
+        return NormalEquations(found.cost + self.cost(), gradient, matrix)
