@@ -80,6 +80,8 @@ from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
+from .systems.fmu_environment import FMUEnvironment, FMUError
+from .export.fmu import export_policy_fmu, export_twin_fmu
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
 __version__: str
@@ -113,6 +115,8 @@ __all__ = [
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
+    "FMUEnvironment",
+    "FMUError",
     "FirstController",
     "Forecast",
     "Foreseen",
@@ -181,8 +185,10 @@ __all__ = [
     "export_c",
     "export_controller",
     "export_onnx",
+    "export_policy_fmu",
     "export_program",
     "export_twin",
+    "export_twin_fmu",
     "identification_cost",
     "load_run",
     "main_of",

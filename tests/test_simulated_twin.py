@@ -1,4 +1,4 @@
-"""The ensemble smoother of twins without gradients: exact where the twin is linear, near Levenberg-Marquardt elsewhere."""
+"""The ensemble smoother of twins without gradients: its sensitivities, and what it finds beside Levenberg-Marquardt."""
 
 import pytest
 import torch

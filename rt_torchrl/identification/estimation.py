@@ -133,9 +133,8 @@ class Estimation:
                 f"{', '.join(state.name for state in twin.plant.states)}: 0 for a state that is known, or inf."
             )
         self.process = process
-        if process is not None and not (
-            process.shape == unknown.shape and ((process > 0.0) & self.spread.isinf()).all()
-        ):
+        fits = process is None or (process.shape == unknown.shape and bool((process > 0.0).all()))
+        if process is not None and not (fits and bool(self.spread.isinf().all())):
             raise ValueError(
                 f"process={process.tolist()} must hold a positive number for each of "
                 f"{', '.join(state.name for state in twin.plant.states)}, and goes with spread=None alone."
@@ -230,8 +229,8 @@ class Estimation:
         follows = [record.follows for record in records]
         if any(follows) and (self.process is None or follows[0]):
             raise ValueError(
-                "a record follows the one before it: give the estimation its process noise, process=..., and begin with a "
-                "record that follows nothing."
+                "a record follows the one before it: give the estimation its process noise, process=..., and begin "
+                "with a record that follows nothing."
             )
 
     def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:

@@ -6,9 +6,10 @@ r"""The likelihood of sensor readings under a twin, and its derivatives by all u
         + \frac12\sum_i\Big\|\frac{s^i_0 - s^{i-1}_n}{q}\Big\|^2 + \frac12\Lambda\|w - w^0\|^2
 
 The first sum is over the samples that exist. The unknowns are the closure's weights w, the initial states of all
-records, of which no sensor needs to read any component, and the biases b. The second sum is over records with a start of their
-own, the third over records that follow another one, from whose end process noise q parts them (weak constraint). J is the negative logarithm of the posterior,
-so that its Gauss-Newton matrix is the Fisher information of the unknowns.
+records, of which no sensor needs to read any component, and the biases b. The second sum is over records with a start
+of their own, the third over records that follow another one, from whose end process noise q parts them (weak
+constraint). J is the negative logarithm of the posterior, so that its Gauss-Newton matrix is the Fisher information of
+the unknowns.
 """
 
 import math
@@ -121,7 +122,7 @@ class Likelihood:
 
     @property
     def first_stiffness(self) -> Float[Tensor, "records n_free"]:
-        """Stiffness of the offsets of every initial state, of which the guess is the centre; zero for one that follows."""
+        """Stiffness of the offsets of every initial state about its guess; zero for a record that follows another."""
         each = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
         own = [float(not record.follows) for record in self.records]
         return each.new_tensor(own)[:, None] * each

@@ -5,8 +5,8 @@ iterative ensemble Kalman smoother): of members :math:`x \pm \epsilon\xi_m` with
 
 .. math:: S = D\,\Xi^\top(\Xi\,\Xi^\top)^{-1}, \qquad D_m = \frac{s^+_m - s^-_m}{2\epsilon}.
 
-Members in pairs cancel the curvature, so that the iteration ends where the gradient does. Everything that asks a twin for
-sensitivities, such as an estimation with its uncertainty, then works without gradients.
+Members in pairs cancel the curvature, so that the iteration ends where the gradient does. Everything that asks a twin
+for sensitivities, such as an estimation with its uncertainty, then works without gradients.
 
 Source: Bocquet and Sakov, Q. J. R. Meteorol. Soc. 140 (2014) 1521.
 """
