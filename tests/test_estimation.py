@@ -7,6 +7,7 @@ import pytest
 import torch
 from hidden_wall import Envelope, Room, room_records
 from linear_quadratic import LinearQuadratic
+from printed_commands import blocks
 from straight_line import Line, Slope, flown, line_segment, noise_of
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -169,3 +170,14 @@ def test_what_cannot_be_estimated_is_refused():
 def test_the_usual_initial_state_is_the_mean_of_draws():
     found = usual_initial_state(Room())
     assert (found - 20.0).abs().max() < 4 * 3.0 / math.sqrt(100)
+
+
+def test_the_example_of_the_documentation_runs():
+    (code,) = blocks("partial_measurements.md", "python")
+    names = {}
+    exec(code, names)
+    found, plant = names["found"], names["plant"]
+    assert found.noise["sensed_level"] < 1e-5  # nothing has disturbed the record
+    true = plant.closure.named_coefficients()
+    for name in ("lower_outlet", "lower_loss", "upper_outlet"):
+        assert found.after[name] == pytest.approx(true[name].item(), rel=1e-3)

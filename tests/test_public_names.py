@@ -22,6 +22,8 @@ HOMES = {
 """The module that each public name comes from."""
 ROOMS_OF = {
     "benchmark.py": {"trajectories"},
+    "cascaded_tanks.py": {"figures", "identification"},
+    "coverage.py": {"identification"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
     "limit.py": {"evaluation", "optimal_control", "runs", "study"},

@@ -19,7 +19,12 @@ def legacy(plant):
     def simulate(closure, state, exogenous, actions, start):
         ends = []
         for z, a in zip(exogenous, actions, strict=True):
-            state = rk4_step(lambda t, s, a=a, z=z: plant.vector_field(t, s, a, z, closure), start, state, plant.dt)
+            state = rk4_step(
+                lambda t, s, a=a, z=z: plant.vector_field(t, s, a, z, closure),
+                torch.tensor(start).double(),
+                state,
+                plant.dt,
+            )
             ends.append(torch.tensor(state.tolist(), dtype=torch.float64))
             state = ends[-1]
         return torch.stack(ends)

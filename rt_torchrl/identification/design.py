@@ -79,7 +79,7 @@ def next_manoeuvres(
     total = total + (of(known) if known else 0.0)
     chosen = []
     for _ in range(count):
-        gains = {name: _volume(total + F) - _volume(total) for name, F in found.items()}
+        gains = {name: volume(total + F) - volume(total) for name, F in found.items()}
         name = max(gains, key=lambda one: gains[one])
         total = total + found[name]
         errors = torch.linalg.pinv(total, hermitian=True, rtol=1e-15).diagonal().clamp_min(0.0).sqrt()
@@ -87,7 +87,7 @@ def next_manoeuvres(
     return chosen
 
 
-def _volume(F: Tensor) -> float:
+def volume(F: Tensor) -> float:
     """ln det F, by a scaling to unit diagonal that keeps weights of any size apart from rounding."""
     unit = F.diagonal().sqrt()
     values = torch.linalg.eigvalsh(F / torch.outer(unit, unit)).clamp_min(LEAST_INFORMATION)

@@ -53,8 +53,8 @@ class EstimationConfig:
         rounds: greatest number of rounds in which noise levels and prior follow the residuals.
         prior: stiffness Λ of the weights of the closure's perceptrons; None lets the data choose it. Other weights
             have no prior.
-        starts: number of first weights that the descent begins with. Beside the present ones it begins with the best
-            ones so far, moved at random: one sensor may leave several local minima.
+        starts: number of first weights that the descent begins with. Beside the present ones these are the present ones
+            and the best ones so far in turns, moved at random: one sensor may leave several local minima.
         errors: formula of the standard errors: ``fisher`` for white noise, or ``robust`` for residuals with memory.
     """
 
@@ -249,7 +249,8 @@ class Estimation:
         done = self._descend(best)
         cost, found = best.normal_equations().cost, copy.deepcopy(closure.state_dict())
         for number in range(self.config.starts):
-            closure.load_state_dict(found if number else start)
+            # In turns from the best weights and from the first ones: the best may have run to where nothing shows them.
+            closure.load_state_dict(start if number % 2 or not number else found)
             if number:
                 _moved(closure, generator)
             try:

@@ -27,6 +27,7 @@ from rt_torchrl.twinning.evidence.examination import Examination
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, fly
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
+from rt_torchrl.twinning.informative_memory import InformativeMemory
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.own_policies import require_own_policies
@@ -85,6 +86,7 @@ class ReinforcementTwinning:
         share_critic(self.learner, model_based)
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses)
         self.short_term = ShortTermMemory(config.records)
+        self.informative = InformativeMemory(self.assimilation, config.informative)
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
@@ -171,6 +173,8 @@ class ReinforcementTwinning:
 
     def _keep(self, flight: Flight) -> None:
         self.learner.store(flight.transitions)
+        if len(self.short_term) == self.short_term.maxlen:
+            self.informative.consider(self.short_term[0], [*list(self.short_term)[1:], flight.record])
         self.short_term.append(flight.record)
 
     def update_model_free(self) -> TensorDict:
@@ -188,9 +192,8 @@ class ReinforcementTwinning:
         records = list(records or self.short_term)
         processes = list(self.virtual.processes)[-len(records) :]
         self.earlier.remember()
-        found = self.assimilation.update(
-            records[-len(processes) :], processes, self.config.realisations, self.generator
-        )
+        records = self.informative.with_latest(records[-len(processes) :])
+        found = self.assimilation.update(records, processes, self.config.realisations, self.generator)
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
         return merged(fit, findings(**self.assimilation.report()))
 
@@ -289,5 +292,10 @@ class ReinforcementTwinning:
         self.episodes_done = state["episodes_done"]
 
 
-KEPT = ("virtual", "short_term", "track_record")  # components that leave the tensors of their state on their device
+KEPT = (
+    "virtual",
+    "short_term",
+    "informative",
+    "track_record",
+)  # components that leave the tensors of their state on their device
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)

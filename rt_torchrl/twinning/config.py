@@ -26,6 +26,9 @@ class TwinningConfig:
         realisations: number N_z of samples of the exogenous process, for each record in step 4 and in all in step 5.
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
+        informative: number of earlier real episodes that step 4 also trains the twin on, chosen by what they tell about
+            its weights; it needs the inputs of the record. A closure of many weights, such as a perceptron, has a
+            matrix of as many rows and columns for each record.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
         judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse on the twin, in the
             arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
@@ -43,6 +46,7 @@ class TwinningConfig:
     arm: Arm = "twinning"
     realisations: int = 5
     records: int = 1
+    informative: int = 0
     virtual_episodes: int = 20
     judged_updates: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
