@@ -114,7 +114,9 @@ def cross_validated(parts: list[Fold], config: Config) -> dict[str, Any]:
     for k, part in enumerate(parts):
         print(f"fold {k + 1} of {len(parts)}", file=sys.stderr)
         one = Identified(part.training, config)
-        found.setdefault("physics", []).append(error(predict(one.physics, one.of_physics, part.held_out)))
+        found.setdefault("physics", []).append(
+            error(predict(one.physics, one.of_physics, part.held_out, first=config.first))
+        )
         for prior in config.priors:
             prediction = predict(*one.with_perceptron(prior), part.held_out, first=config.first)
             found.setdefault(f"{prior:g}", []).append(error(prediction))

@@ -73,8 +73,9 @@ def test_the_profile_of_a_linear_weight_is_its_parabola():
     error = found.uncertainty.standard_errors()["w[0]"]
     before = found.likelihood.twin.closure.w.detach().clone()
     shown = profile(found.likelihood, 0, error)
-    np.testing.assert_allclose(shown.rise.numpy(), 0.5 * ((shown.values - before[0]) / error).numpy() ** 2, atol=1e-6)
-    assert shown.interval == pytest.approx(found.uncertainty.intervals()["w[0]"], rel=1e-5)
+    # The estimate is within 1e-5 standard errors or so of the minimum, and the profile goes out to two of them.
+    np.testing.assert_allclose(shown.rise.numpy(), 0.5 * ((shown.values - before[0]) / error).numpy() ** 2, atol=1e-4)
+    assert shown.interval == pytest.approx(found.uncertainty.intervals()["w[0]"], rel=1e-4)
     assert torch.equal(found.likelihood.twin.closure.w, before)
 
 
@@ -140,6 +141,7 @@ def curve_estimate(seed):
     return Estimation(twin, sensors, config=EstimationConfig(iterations=40, prior=None)).run(records)
 
 
+@pytest.mark.slow
 def test_the_band_of_a_perceptron_widens_where_no_data_was():
     found = curve_estimate(0)
     x = torch.linspace(-3.0, 3.0, 61).double()
