@@ -60,7 +60,8 @@ class InformativeMemory:
         total = torch.stack([*information, *(self._information(one) for one in latest)]).diagonal(dim1=1, dim2=2)
         known = torch.diag(LEAST_INFORMATION * total.sum(0).clamp_min(1e-300))
         known = known + sum((self._information(one) for one in latest), start=torch.zeros_like(known))
-        left, chosen = list(range(len(candidates))), []
+        left = list(range(len(candidates)))
+        chosen: list[int] = []
         while len(chosen) < self.capacity:
             best = max(left, key=lambda k: volume(known + information[k]))
             known = known + information[best]
