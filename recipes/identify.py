@@ -177,8 +177,7 @@ def main(config: Config) -> None:
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
     print(shown(metrics))
-    shares = {name: share for name, share in metrics["held_back"].items() if share}
-    for name, share in shares.items():
+    for name, share in filter(lambda entry: entry[1], metrics["held_back"].items()):
         print(f"  the plant's actuators hold back {name} in {share:.1%} of the log")
     print(f"results in {folder}")
 

@@ -29,15 +29,13 @@ def planned_under_uncertainty(
     """
     generator = torch.Generator().manual_seed(seed)
     policy = SaturatedMLP(len(plant.observations), plant.actions, hidden=(16, 16), generator=generator)
-    held = [closure.requires_grad_(False) for closure in closures]
-    rollouts = [Rollout(plant, closure, policy) for closure in held]
+    rollouts = [Rollout(plant, closure.requires_grad_(False), policy) for closure in closures]
     drawn = [(plant.draw_initial_state(n, generator), plant.draw_exogenous(n, generator)) for n in (VIRTUAL, UNSEEN)]
 
     def costs(which: int) -> torch.Tensor:
         return torch.stack([rollout.costs(*drawn[which]).mean() for rollout in rollouts])
 
-    with torch.no_grad():
-        before = costs(1)
+    before = costs(1).detach()
     optimiser = torch.optim.LBFGS(policy.parameters(), max_iter=iterations, line_search_fn="strong_wolfe")
 
     def closure() -> torch.Tensor:
@@ -47,8 +45,7 @@ def planned_under_uncertainty(
         return cost
 
     optimiser.step(closure)
-    with torch.no_grad():
-        after = costs(1)
+    after = costs(1).detach()
     return {
         "J_a before [V^2]": before[0].item(),
         "J_a after [V^2]": after[0].item(),

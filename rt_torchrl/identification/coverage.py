@@ -83,11 +83,16 @@ def coverage(
         found = Estimation(twin, sensors, config=config).run([record])
         errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
         bounds_found.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
-    scatter = torch.stack(bounds_found)
-    z, known = torch.stack(errors) / scatter, scatter.isfinite() & (scatter > 0.0)  # without scatter it is a constant
+    return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(bounds_found))
+
+
+def _counted(
+    names: list[str], errors: Float[Tensor, "simulations n"], scatter: Float[Tensor, "simulations n"]
+) -> Coverage:
+    z, known = errors / scatter, scatter.isfinite() & (scatter > 0.0)  # without scatter it is a constant
     inside = torch.where(known, (z.abs() <= 1.959964).double(), torch.nan).nanmean(0)
     ratio = torch.where(known, z, torch.nan).square().nanmean(0).sqrt()
-    return Coverage(list(named_values(closure)), inside, known.double().mean(0), ratio)
+    return Coverage(names, inside, known.double().mean(0), ratio)
 
 
 @torch.no_grad()

@@ -63,8 +63,7 @@ def next_manoeuvres(
         known: records that there are already.
 
     Raises:
-        ValueError: if there is no manoeuvre, or ``count`` is below 1.
-        DivergenceError: if the twin diverges in a manoeuvre.
+        ValueError: if there is no manoeuvre, or ``count`` is below 1; DivergenceError if the twin diverges in one.
     """
     if not manoeuvres or count < 1:
         raise ValueError(f"manoeuvres={list(manoeuvres)}, count={count}: there must be one of each at least.")
@@ -72,13 +71,12 @@ def next_manoeuvres(
     def of(records: Sequence[SensorRecord]) -> Tensor:
         return weight_information(estimation.likelihood(records, noise))
 
-    plant, sensors = estimation.twin.plant, estimation.sensors
-    found = {name: of([sensor_record(plant, sensors, m)]) for name, m in manoeuvres.items()}
+    found = {name: of([sensor_record(estimation.twin.plant, estimation.sensors, m)]) for name, m in manoeuvres.items()}
     size = torch.stack([F.diagonal() for F in found.values()]).sum(0)
     total = torch.diag(LEAST_INFORMATION * size.clamp_min(1e-300))  # so that weights that nothing shows are no obstacle
     total = total + (of(known) if known else 0.0)
-    chosen = []
-    for _ in range(count):
+    chosen: list[Choice] = []
+    while len(chosen) < count:
         gains = {name: volume(total + F) - volume(total) for name, F in found.items()}
         name = max(gains, key=lambda one: gains[one])
         total = total + found[name]

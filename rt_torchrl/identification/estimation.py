@@ -18,9 +18,10 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from rt_torchrl.identification.covariance import inverse_information, named_values
+from rt_torchrl.identification.first_values import first_noise, move, state_sizes
 from rt_torchrl.identification.likelihood import Biases, Likelihood
 from rt_torchrl.identification.output_error import INITIAL_ITERATIONS, NOISE_TOLERANCE, InitialStates
 from rt_torchrl.identification.sensor_record import SensorRecord
@@ -29,15 +30,10 @@ from rt_torchrl.identification.uncertainty import Errors, Uncertainty
 from rt_torchrl.identification.weight_prior import BeliefPrior, WeightPrior
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
 from rt_torchrl.options import check_options
-from rt_torchrl.plants.measurement import Component
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 SETTLED = 0.01
 """Relative change of the noise levels below which they rest."""
-FIRST_NOISE = 0.1
-"""First guess of an unknown noise level, as a share of the scatter of the readings."""
 LEAST_NOISE = 1e-9
 """Least noise level, as a share of its first guess; less is rounding."""
 STIFFNESS = (1e-6, 1e8)
@@ -148,8 +144,7 @@ class Estimation:
             belief: what was believed of the weights before; None for the prior of the configuration.
 
         Raises:
-            ValueError: if there is no record, or a sensor has no sample, or a record follows another one without
-                process noise.
+            ValueError: if there is no record, a sensor has no sample, or a record follows one without process noise.
             DivergenceError: if the twin diverges under the weights that it starts from.
         """
         closure = self.twin.closure
@@ -164,11 +159,12 @@ class Estimation:
             if rest:
                 break
         names = [sensor.name for sensor in self.sensors]
+        levels, biases = likelihood.noise.tolist(), likelihood.biases().tolist()
         return Estimate(
             before,
             {name: value.item() for name, value in named_values(closure).items()},
-            dict(zip(names, likelihood.noise.tolist(), strict=True)),
-            dict(zip(names, likelihood.biases().tolist(), strict=True)),
+            dict(zip(names, levels, strict=True)),
+            dict(zip(names, biases, strict=True)),
             likelihood.initial().detach(),
             prior.stiffness,
             likelihood,
@@ -236,9 +232,8 @@ class Estimation:
     def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:
         """The likelihood of other records under the present weights, at the initial states that suit them best."""
         likelihood = self.likelihood(records, noise, weights=False)
-        LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE).run(
-            likelihood.normal_equations, 2 * INITIAL_ITERATIONS
-        )
+        method = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
+        method.run(likelihood.normal_equations, 2 * INITIAL_ITERATIONS)
         return likelihood
 
     def _best_start(self, records: Sequence[SensorRecord], prior: WeightPrior) -> tuple[Likelihood, int]:
@@ -252,7 +247,7 @@ class Estimation:
             # In turns from the best weights and from the first ones: the best may have run to where nothing shows them.
             closure.load_state_dict(start if number % 2 or not number else found)
             if number:
-                _moved(closure, generator)
+                move(closure, generator)
             try:
                 if self.process is None:
                     done += self._descend(self.likelihood(records, prior=prior, known=True))
@@ -274,8 +269,7 @@ class Estimation:
         blocks = likelihood.residuals()
         equations = likelihood.normal_equations(blocks)
         inverse = inverse_information(equations.matrix).matrix
-        rest = True
-        n, prior = likelihood.weight_count, likelihood.prior
+        rest, n, prior = True, likelihood.weight_count, likelihood.prior
         determined = likelihood.count - _held_back(likelihood, inverse)
         if self.config.prior is None and prior is not None and prior.held.any():
             gamma = (prior.held * (1.0 - prior.stiffness * inverse.diagonal()[:n])).sum()
@@ -285,23 +279,14 @@ class Estimation:
             prior.stiffness = new
         given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)
         count = torch.stack([record.seen.sum(0) for record in likelihood.records]).sum(0)
-        squares = torch.stack([block.values.square().sum(0) for block in blocks]).sum(0)
-        freedom = count * max(1.0 - determined / int(count.sum()), 1.0 / int(count.sum()))
+        squares, total = torch.stack([block.values.square().sum(0) for block in blocks]).sum(0), int(count.sum())
+        freedom = count * max(1.0 - determined / total, 1.0 / total)
         floor = LEAST_NOISE * first_noise(self.sensors, likelihood.records)
         levels = torch.maximum(likelihood.noise * (squares / freedom).sqrt(), floor)
         levels = torch.where(given, likelihood.noise, levels)
         rest &= bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
         likelihood.noise = levels
         return rest
-
-
-@torch.no_grad()
-def _moved(closure: nn.Module, generator: torch.Generator) -> None:
-    """Move the weights at random, each by a normal number of some units; a unit is a factor of e for a logarithm."""
-    far = 3.0 * torch.rand(1, generator=generator, dtype=torch.float64).item()
-    for w in closure.parameters():
-        if w.requires_grad:
-            w.add_(far * torch.randn(w.shape, generator=generator, dtype=torch.float64).to(w.device))
 
 
 def _held_back(likelihood: Likelihood, inverse: Float[Tensor, "n n"]) -> float:
@@ -313,44 +298,3 @@ def _held_back(likelihood: Likelihood, inverse: Float[Tensor, "n n"]) -> float:
         A, places = push.jacobian[0], push.places
         found = found + (A.T @ A * inverse[places[:, None], places]).sum()
     return float(found if prior is None else found + prior.determined(inverse))
-
-
-def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
-    """Noise levels that are given; for others a share of the scatter of the readings.
-
-    Raises:
-        ValueError: if there is no record, or a sensor has no sample.
-    """
-    if not records:
-        raise ValueError("records=[] of the estimation must hold at least one record.")
-    readings = torch.cat([record.readings for record in records])
-    levels = []
-    for sensor, values in zip(sensors, readings.T, strict=True):
-        seen = values[~values.isnan()]
-        if not len(seen):
-            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
-        origin = seen[:1].expand_as(seen)
-        scatter = differences([sensor.measurement], (seen - 0.0)[:, None], origin[:, None]).square().mean().sqrt()
-        guess = FIRST_NOISE * scatter.item() or 1e-6 * max(abs(origin[0].item()), 1.0)
-        levels.append(guess if sensor.noise is None else sensor.noise)
-    return readings.new_tensor(levels)
-
-
-def state_sizes(
-    plant: Plant, first: Float[Tensor, "records n_s"], sensors: Sequence[Sensor], records: Sequence[SensorRecord]
-) -> Float[Tensor, " n_s"]:
-    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it.
-
-    It is the greatest of the scatter of the states that the plant draws, that of what a sensor reads of it, and a tenth
-    of the guess.
-    """
-    drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
-    sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
-    for column, sensor in enumerate(sensors):
-        place = sensor.measurement.read
-        if isinstance(place, Component) and place.of == "state":
-            values = torch.cat([record.readings[:, column] for record in records])
-            values = values[~values.isnan()]
-            scatter = (values - values.mean()).square().mean().sqrt()
-            sizes[place.index] = torch.maximum(sizes[place.index], scatter)
-    return torch.where(sizes > 0.0, sizes, 1.0)

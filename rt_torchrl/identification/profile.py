@@ -63,7 +63,7 @@ def profile(
     reach: int = 12,
     iterations: int = 15,
 ) -> Profile:
-    """The profile of one trained weight of the closure; the unknowns are as before when it is done.
+    """The profile of one trained weight of the closure, which leaves all unknowns as they are.
 
     Args:
         likelihood: the likelihood at its minimum.
@@ -86,16 +86,16 @@ def profile(
     least, start = likelihood.normal_equations().cost.item(), copy.deepcopy(likelihood.unknowns.state_dict())
     middle = _weight(likelihood, place)
     sides = []
-    for sign in (-1.0, 1.0):
-        sides.append(_march(likelihood, place, sign * width, reach, iterations, least + threshold))
+    for step in (-width, width):
+        sides.append(_march(likelihood, place, step, reach, iterations, least + threshold))
         likelihood.unknowns.load_state_dict(start)
-    below, above = sides
-    points = [*reversed(below), (middle, least), *above]
+    points = [*reversed(sides[0]), (middle, least), *sides[1]]
     values, costs = (torch.tensor(column, dtype=torch.float64) for column in zip(*points, strict=True))
-    ends = [_crossing([(middle, least), *side], least, threshold) for side in sides]
-    low = -float("inf") if ends[0] is None else ends[0]
-    high = float("inf") if ends[1] is None else ends[1]
-    return Profile(values, costs - least, Interval(low, high))
+    ends = [
+        _crossing([(middle, least), *side], least, threshold, beyond)
+        for side, beyond in zip(sides, (-float("inf"), float("inf")), strict=True)
+    ]
+    return Profile(values, costs - least, Interval(*ends))
 
 
 def _march(
@@ -116,15 +116,15 @@ def _march(
     return found
 
 
-def _crossing(points: list[tuple[float, float]], least: float, threshold: float) -> float | None:
-    """Where the root of the rise crosses that of the threshold, which is linear for a parabola; None if nowhere."""
+def _crossing(points: list[tuple[float, float]], least: float, threshold: float, beyond: float) -> float:
+    """Where the root of the rise crosses that of the threshold, which is linear for a parabola; else ``beyond``."""
     roots = [(value, max(cost - least, 0.0) ** 0.5) for value, cost in points]
     target = threshold**0.5
     for (first, before), (second, after) in zip(roots[:-1], roots[1:], strict=True):
         if after >= target:
             share = (target - before) / (after - before) if after < float("inf") else 1.0
             return first + share * (second - first)
-    return None
+    return beyond
 
 
 def _weights(likelihood: Likelihood) -> list[tuple[Tensor, int]]:

@@ -292,10 +292,6 @@ class ReinforcementTwinning:
         self.episodes_done = state["episodes_done"]
 
 
-KEPT = (
-    "virtual",
-    "short_term",
-    "informative",
-    "track_record",
-)  # components that leave the tensors of their state on their device
+# Components that leave the tensors of their state on their device.
+KEPT = ("virtual", "short_term", "informative", "track_record")
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", *KEPT)
