@@ -77,10 +77,7 @@ def profile(
     Raises:
         ValueError: if there is no such weight, the level is no probability, or a number is not positive.
     """
-    if not 0 <= place < likelihood.weight_count:
-        raise ValueError(f"place={place} of the profile: the closure has {likelihood.weight_count} trained weights.")
-    if not step > 0.0 or reach < 1 or iterations < 1:
-        raise ValueError(f"step={step}, reach={reach} and iterations={iterations} of the profile must be positive.")
+    _require(likelihood, place, step, reach, iterations)
     threshold = 0.5 * normal_factor(level) ** 2
     width = step * error if 0.0 < error < float("inf") else FREE_STEP
     least, start = likelihood.normal_equations().cost.item(), copy.deepcopy(likelihood.unknowns.state_dict())
@@ -96,6 +93,13 @@ def profile(
         for side, beyond in zip(sides, (-float("inf"), float("inf")), strict=True)
     ]
     return Profile(values, costs - least, Interval(*ends))
+
+
+def _require(likelihood: Likelihood, place: int, step: float, reach: int, iterations: int) -> None:
+    if not 0 <= place < likelihood.weight_count:
+        raise ValueError(f"place={place} of the profile: the closure has {likelihood.weight_count} trained weights.")
+    if not step > 0.0 or reach < 1 or iterations < 1:
+        raise ValueError(f"step={step}, reach={reach} and iterations={iterations} of the profile must be positive.")
 
 
 def _march(
