@@ -12,13 +12,27 @@ from typing import Annotated, Any
 if __name__ == "__main__":
     print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
+import numpy as np
 import torch
 import tyro
 
-from rt_torchrl import Identification, IdentificationConfig, Plant, check_options, main_of, read_log
+from rt_torchrl import (
+    DigitalTwin,
+    Estimation,
+    EstimationConfig,
+    Identification,
+    IdentificationConfig,
+    Plant,
+    check_options,
+    main_of,
+    read_log,
+)
+from rt_torchrl.identification.estimate_table import metrics_of_sensors, table_of_sensors
 from rt_torchrl.identification.identification import Identified, held_back, measured_states
+from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
-from rt_torchrl.identification.sensor_log import Column, checked
+from rt_torchrl.identification.sensor_identification import identify
+from rt_torchrl.identification.sensor_log import Column, SensorLog, checked
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.shipped_plants import plant_class
 
@@ -35,6 +49,10 @@ class Config:
         columns: columns with another name than their signal or another unit, as HEADER=SIGNAL[UNIT] or
             HEADER=SIGNAL*FACTOR+OFFSET.
         drop: leave out rows with a value that is missing or out of range; they become gaps.
+        missing: keep rows in which a sensor lacks its sample; only that sample is left out.
+        sensors: states and measurements whose columns the twin is fitted to by maximum likelihood; by default the
+            plant's own J_p is used, or all columns of sensors if a state is not measured or a sample is missing.
+        guess: first guesses of the initial values of states that are not measured, as STATE=VALUE.
         dt: control interval of the twin [s]; by default the plant's own.
         gap: longest time between two rows that is bridged [s]; by default three sampling intervals.
         shortest: least number of control intervals of a part between gaps; shorter parts are left out.
@@ -42,6 +60,7 @@ class Config:
         seed: seed of the closure's first weights, if these are random.
         log_dir: folder of the results; by default runs/identify/PLANT/TIME.
         identification: options of the search for the weights.
+        estimation: options of the search by maximum likelihood.
     """
 
     log: Annotated[Path, tyro.conf.Positional]
@@ -49,6 +68,9 @@ class Config:
     recipe: Path | None = None
     columns: tuple[str, ...] = ()
     drop: bool = False
+    missing: bool = False
+    sensors: tuple[str, ...] = ()
+    guess: tuple[str, ...] = ()
     dt: float | None = None
     gap: float | None = None
     shortest: int = 10
@@ -58,6 +80,7 @@ class Config:
     identification: Annotated[IdentificationConfig, tyro.conf.arg(name="")] = field(
         default_factory=IdentificationConfig
     )
+    estimation: EstimationConfig = field(default_factory=lambda: EstimationConfig(errors="robust"))
 
     def __post_init__(self):
         check_options(self)
@@ -91,6 +114,22 @@ class Config:
             raise ValueError(f"recipe={self.recipe}: its Config has no method plant(); write one, or give --plant.")
         return config.plant()
 
+    def guesses(self) -> dict[str, float]:
+        """First guesses of hidden states, by name."""
+        found = {}
+        for text in self.guess:
+            name, _, value = text.partition("=")
+            try:
+                found[name] = float(value)
+            except ValueError:
+                raise ValueError(f"guess={text!r} is not understood; write STATE=VALUE, such as wall=15.") from None
+        return found
+
+    def by_likelihood(self, plant: Plant, log: SensorLog) -> bool:
+        """Whether the twin is fitted by maximum likelihood."""
+        holes = any(np.isnan(values).any() for values in log.columns.values())
+        return bool(self.sensors or self.guess or holes or hidden_states(plant, log))
+
     def make_folder(self, plant: str) -> Path:
         """Create the folder of the results and return its path."""
         folder = self.log_dir or Path("runs") / "identify" / plant / time.strftime("%Y%m%d-%H%M%S")
@@ -105,34 +144,47 @@ def main(config: Config) -> None:
     # Here, because --help need not wait for Matplotlib.
     from rt_torchrl.figures import identification as charts
     from rt_torchrl.figures import save_figure
+    from rt_torchrl.figures import uncertainty as uncertain
 
     plant = config.make_plant()
-    log = checked(read_log(config.log, plant, [Column.parse(text) for text in config.columns]), plant, drop=config.drop)
-    parts = resample(log, plant, gap=config.gap, shortest=config.shortest)
-    training, held_out = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
+    columns = [Column.parse(text) for text in config.columns]
+    log = checked(read_log(config.log, plant, columns), plant, drop=config.drop, missing=config.missing)
+    parts = resample(filled(log, plant, config.guesses()), plant, gap=config.gap, shortest=config.shortest)
+    split = hold_out(parts.segments, plant.dt, config.held_out, shortest=config.shortest)
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
-    measured = measured_states(plant, log)
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
-    task = Identification(plant, closure, free=measured, config=config.identification)
-    found = task.run(training, held_out)
-    metrics = metrics_of(plant, measured, found, parts) | {
-        "config": dataclasses.asdict(config),
-        "held_back": held_back(plant, parts.segments),
-    }
+    if config.by_likelihood(plant, log):
+        sensors = sensors_in(plant, log, config.sensors)
+        task = Estimation(
+            DigitalTwin(plant, closure), sensors, spread=initial_spread(plant, log), config=config.estimation
+        )
+        records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
+        judged = identify(task, *records)
+        metrics, shown = metrics_of_sensors(judged), table_of_sensors
+        drawn = {"twin_and_log": uncertain.twin_and_sensors(plant.dt, sensors, *records, judged)}
+        drawn |= {"correlations": uncertain.correlations(judged.estimate.uncertainty)}
+    else:
+        measured = measured_states(plant, log)
+        found = Identification(plant, closure, free=measured, config=config.identification).run(*split)
+        metrics, shown = metrics_of(plant, measured, found), table
+        drawn = {"twin_and_log": charts.twin_and_log(plant, measured, *split, found), "weights": charts.weights(found)}
+    described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
+    metrics = {"plant": plant.name} | metrics | {"log": described, "config": dataclasses.asdict(config)}
+    metrics["held_back"] = held_back(plant, parts.segments)
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2, default=str) + "\n")
     torch.save({"closure": closure.state_dict()}, folder / "weights.pt")
-    drawn = {"twin_and_log": charts.twin_and_log(plant, measured, training, held_out, found)}
-    drawn["weights"] = charts.weights(found)
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
-    print(table(metrics))
+    print(shown(metrics))
+    for name, share in filter(lambda entry: entry[1], metrics["held_back"].items()):
+        print(f"  the plant's actuators hold back {name} in {share:.1%} of the log")
     print(f"results in {folder}")
 
 
-def metrics_of(plant: Plant, measured: list[int], found: Identified, parts: Resampled) -> dict[str, Any]:
+def metrics_of(plant: Plant, measured: list[int], found: Identified) -> dict[str, Any]:
     """The content of ``metrics.json``, with the errors of the measured states; unknown numbers are null."""
-    summary: dict[str, Any] = {"plant": plant.name, "iterations": found.iterations}
+    summary: dict[str, Any] = {"iterations": found.iterations}
     for name in ("training", "held_out"):
         before, after = getattr(found, name)
         rms = {
@@ -150,8 +202,7 @@ def metrics_of(plant: Plant, measured: list[int], found: Identified, parts: Resa
         name: {key: value if math.isfinite(value) else None for key, value in entry.items()}
         for name, entry in found.weights.items()
     }
-    described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
-    return summary | {"log": described}
+    return summary
 
 
 def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
@@ -182,8 +233,6 @@ def table(metrics: dict[str, Any]) -> str:
     for name, entry in metrics["weights"].items():
         error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
         lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
-    shares = {name: share for name, share in metrics["held_back"].items() if share}
-    lines += [f"  the plant's actuators hold back {name} in {share:.1%} of the log" for name, share in shares.items()]
     return "\n".join(lines)
 
 

@@ -36,6 +36,7 @@ from .evaluation.baseline import RealController
 
 # Trajectories and the twin
 from .trajectories.rollout import DivergenceError, Engine, Rollout
+from .trajectories.simulated_twin import SimulatedTwin
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
@@ -46,7 +47,11 @@ from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .identification.identification import Identification, IdentificationConfig
+from .identification.estimation import Estimate, Estimation, EstimationConfig
 from .identification.sensor_log import LogConfig, read_log
+from .identification.sensor_record import SensorRecord, sensor_record
+from .identification.sensors import Sensor, sensors_of
+from .identification.uncertainty import Uncertainty
 
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig
@@ -88,6 +93,8 @@ from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
 from .figures.snapshot import Snapshot
 from .export.exported_policy import ExportedPolicy, load_policy
+from .systems.fmu_environment import FMUEnvironment, FMUError
+from .export.fmu import export_policy_fmu, export_twin_fmu
 from .export import export_c, export_controller, export_onnx, export_program, export_twin
 
 __version__: str
@@ -116,10 +123,15 @@ __all__ = [
     "EarlierPolicies",
     "Engine",
     "EpisodeAbandoned",
+    "Estimate",
+    "Estimation",
+    "EstimationConfig",
     "Evidence",
     "ExogenousConfig",
     "ExplorationConfig",
     "ExportedPolicy",
+    "FMUEnvironment",
+    "FMUError",
     "FaultySystem",
     "FirstController",
     "Forecast",
@@ -175,10 +187,13 @@ __all__ = [
     "SaturatedAffine",
     "SaturatedMLP",
     "Scenario",
+    "Sensor",
+    "SensorRecord",
     "ServerProcess",
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
+    "SimulatedTwin",
     "SmoothClip",
     "Snapshot",
     "Start",
@@ -188,6 +203,7 @@ __all__ = [
     "Transition",
     "TrustRatio",
     "TwinningConfig",
+    "Uncertainty",
     "WholeEpisodes",
     "check_options",
     "check_plant",
@@ -196,8 +212,10 @@ __all__ = [
     "export_c",
     "export_controller",
     "export_onnx",
+    "export_policy_fmu",
     "export_program",
     "export_twin",
+    "export_twin_fmu",
     "identification_cost",
     "load_policy",
     "load_run",
@@ -207,6 +225,8 @@ __all__ = [
     "require_request",
     "require_stable_step",
     "rk4_step",
+    "sensor_record",
+    "sensors_of",
     "served_system",
     "shipped_plants",
 ]

@@ -39,7 +39,10 @@ class Line(Plant):
     def discrepancy(self, state, measured):
         return 0.5 * ((state - measured) ** 2).sum(-1)
 
-    observe = running_cost = draw_initial_state = draw_exogenous = make_closure = None
+    def draw_initial_state(self, batch, generator):
+        return torch.zeros(batch, 1, dtype=torch.float64)
+
+    observe = running_cost = draw_exogenous = make_closure = None
 
 
 def line_segment(values, wind=0.0, start=0.0):

@@ -12,7 +12,7 @@ from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.identification.covariance import covariance, named_values, newey_west, standard_errors
 from rt_torchrl.identification.identification import Identification, IdentificationConfig
-from rt_torchrl.identification.output_error import InitialStates, OutputError
+from rt_torchrl.identification.output_error import InitialStates, OutputError, first_states
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -28,7 +28,7 @@ def regression_error(n, dt, *, smooth):
 
 def slope_output_error(segments, free=(0,)):
     plant = Line()
-    initial = InitialStates(segments, free, torch.ones(1).double())
+    initial = InitialStates(first_states(segments), free, torch.ones(1).double())
     return OutputError(DigitalTwin(plant, Slope()), segments, initial)
 
 
@@ -84,7 +84,9 @@ def test_named_errors_follow_from_those_of_the_logarithms():
     closure = QuasiSteadyPolar.true().requires_grad_(True)
     noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     noisy = [segments[0]._replace(states=segments[0].states + noise, start=0.0)]
-    output_error = OutputError(DigitalTwin(plant, closure), noisy, InitialStates(noisy, (), torch.ones(4).double()))
+    output_error = OutputError(
+        DigitalTwin(plant, closure), noisy, InitialStates(first_states(noisy), (), torch.ones(4).double())
+    )
     expected = closure.coefficients.detach() * covariance(output_error).diagonal().sqrt()
     found = standard_errors(output_error)
     assert list(found) == ["a", "b", "c"]

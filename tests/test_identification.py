@@ -19,7 +19,7 @@ from rt_torchrl.identification.identification import (
     lag_one,
     measured_states,
 )
-from rt_torchrl.identification.output_error import InitialStates, OutputError
+from rt_torchrl.identification.output_error import InitialStates, OutputError, first_states
 from rt_torchrl.identification.resampling import hold_out, resample
 from rt_torchrl.identification.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -34,7 +34,7 @@ def test_derivatives_are_those_of_backpropagation(kind):
     generator = torch.Generator().manual_seed(0)
     segments = flown(plant, generator, (12, 7, 20))
     scale = torch.linspace(0.5, 2.0, len(plant.states)).double()
-    initial = InitialStates(segments, range(1, len(plant.states)), scale)
+    initial = InitialStates(first_states(segments), range(1, len(plant.states)), scale)
     output_error = OutputError(DigitalTwin(plant, plant.make_closure(generator), engine="autograd"), segments, initial)
     with torch.no_grad():
         initial.offsets.normal_(0.0, 0.1, generator=generator)
@@ -56,7 +56,7 @@ def test_a_segment_is_replayed_on_the_plants_clock():
         output_error = OutputError(
             DigitalTwin(plant, QuasiSteadyPolar.true().requires_grad_(True)),
             [segment],
-            InitialStates([segment], (), torch.ones(4).double()),
+            InitialStates(first_states([segment]), (), torch.ones(4).double()),
         )
         (replayed,) = output_error.replays()
         errors.append((replayed.states - second.states).abs().max().item())

@@ -23,6 +23,8 @@ HOMES = {
 ROOMS_OF = {
     "asynchronous.py": {"runs"},
     "benchmark.py": {"trajectories"},
+    "cascaded_tanks.py": {"figures", "identification"},
+    "coverage.py": {"identification"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
     "in_service.py": {"runs", "systems"},

@@ -16,10 +16,11 @@ Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.identification.output_error import OutputError
@@ -42,17 +43,35 @@ def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
         places = replayed.places
         M[places[:, None], places] += newey_west(scores)
         samples += len(scores)
+    inverse, null = inverse_information(H)
+    freedom = samples / max(samples - len(H), 1)
+    found = freedom * inverse @ M @ inverse
+    found.diagonal()[touched(null)] = math.inf
+    n = output_error.weight_count
+    return found[:n, :n]
+
+
+class InverseInformation(NamedTuple):
+    """The pseudo-inverse of an information matrix, and the directions of which the matrix says nothing, in columns."""
+
+    matrix: Float[Tensor, "n n"]
+    null: Float[Tensor, "n n_null"]
+
+
+def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
+    """The inverse of an information matrix in the directions that it shows."""
     diagonal = H.diagonal().clamp_min(0.0).sqrt()
     unit = torch.where(diagonal > 0.0, diagonal, 1.0)
     values, vectors = torch.linalg.eigh(H / unit / unit[:, None])
     shown = values > LEAST_EIGENVALUE
     inverse = (vectors[:, shown] / values[shown]) @ vectors[:, shown].T / unit / unit[:, None]
-    freedom = samples / max(samples - len(H), 1)
-    found = freedom * inverse @ M @ inverse
-    hidden = (vectors[:, ~shown] ** 2).sum(-1) > 1e-6
-    found.diagonal()[hidden] = math.inf
-    n = output_error.weight_count
-    return found[:n, :n]
+    null = vectors[:, ~shown] / unit[:, None]
+    return InverseInformation(inverse, null / null.norm(dim=0))
+
+
+def touched(null: Float[Tensor, "n n_null"]) -> Bool[Tensor, " n"]:
+    """Whether each unknown takes part in a direction of which nothing is known."""
+    return (null**2).sum(-1) > 1e-6
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
@@ -70,19 +89,25 @@ def standard_errors(output_error: OutputError) -> dict[str, float]:
 
     It is infinite for a value of which the segments say nothing.
     """
-    closure = output_error.twin.closure
-    weights = [w for w in closure.parameters() if w.requires_grad]
     found = covariance(output_error)
     unknown = found.diagonal().isinf()
     found = torch.where(unknown | unknown[:, None], 0.0, found)
-    errors = {}
+    names, slopes = named_slopes(output_error.twin.closure)
+    hidden = (slopes[:, unknown] != 0.0).any(-1)
+    errors = (slopes @ found * slopes).sum(-1).clamp_min(0.0).sqrt()
+    return dict(zip(names, torch.where(hidden, math.inf, errors).tolist(), strict=True))
+
+
+def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named n_w"]]:
+    """Names of the closure's values, and their derivatives by its trained weights."""
+    weights, rows = [w for w in closure.parameters() if w.requires_grad], []
     with torch.enable_grad():
-        for name, value in named_values(closure).items():
+        named = named_values(closure)
+        for value in named.values():
             slopes = torch.autograd.grad(value, weights, retain_graph=True, allow_unused=True, materialize_grads=True)
-            slope = torch.cat([s.flatten() for s in slopes])
-            hidden = bool((slope[unknown] != 0.0).any())
-            errors[name] = math.inf if hidden else (slope @ found @ slope).clamp_min(0.0).sqrt().item()
-    return errors
+            rows.append(torch.cat([slope.flatten() for slope in slopes]))
+    count = sum(w.numel() for w in weights)
+    return list(named), torch.stack(rows) if rows else torch.empty(0, count, dtype=torch.float64)
 
 
 def named_values(closure: nn.Module) -> dict[str, Tensor]:

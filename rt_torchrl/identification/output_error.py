@@ -31,10 +31,10 @@ REMEDY = "Check the units of what was recorded, use a smaller dt, or start from 
 
 
 class InitialStates(nn.Module):
-    """Initial state s_0 of every segment: the measured state plus trainable offsets.
+    """Initial state s_0 of every segment: a first guess, such as the measured state, plus trainable offsets.
 
     Args:
-        segments: segments of the log.
+        first: first guess of the initial state of every segment.
         free: indices of the states that have an offset.
         scale: unit of the offset of each state; it is about the noise, so that a step of 1 is neither long nor short.
     """
@@ -42,12 +42,12 @@ class InitialStates(nn.Module):
     measured: Tensor
     unit: Tensor
 
-    def __init__(self, segments: Sequence[Trajectory], free: Sequence[int], scale: Float[Tensor, " n_s"]):
+    def __init__(self, first: Float[Tensor, "segments n_s"], free: Sequence[int], scale: Float[Tensor, " n_s"]):
         super().__init__()
-        self.register_buffer("measured", torch.stack([segment.states[0] for segment in segments]))
+        self.register_buffer("measured", first)
         self.register_buffer("unit", torch.diag(scale)[list(free)])
         self.free = tuple(free)
-        self.offsets = nn.Parameter(scale.new_zeros(len(segments), len(self.free)))
+        self.offsets = nn.Parameter(scale.new_zeros(len(first), len(self.free)))
 
     def forward(self) -> Float[Tensor, "segments n_s"]:
         return self.measured + self.offsets @ self.unit
@@ -55,7 +55,8 @@ class InitialStates(nn.Module):
     @classmethod
     def as_measured(cls, segments: Sequence[Trajectory]) -> "InitialStates":
         """Initial states without offsets."""
-        return cls(segments, (), torch.ones_like(segments[0].states[0]))
+        first = first_states(segments)
+        return cls(first, (), torch.ones_like(first[0]))
 
     @classmethod
     def estimated(
@@ -72,7 +73,12 @@ class InitialStates(nn.Module):
         replayed = torch.cat([found.states for found in fixed.replays()])
         residual = differences(twin.plant.states, replayed, measured).square().mean(0).sqrt()
         # A residual of zero would leave no unit to measure an offset in.
-        return cls(segments, free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
+        return cls(first_states(segments), free, residual.clamp_min(1e-9 * measured.abs().amax(0).clamp_min(1e-9)))
+
+
+def first_states(segments: Sequence[Trajectory]) -> Float[Tensor, "segments n_s"]:
+    """The measured initial states of segments."""
+    return torch.stack([segment.states[0] for segment in segments])
 
 
 class Replayed(NamedTuple):

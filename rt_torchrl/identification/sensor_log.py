@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.bounded_file import require_bounded
+from rt_torchrl.identification.sensors import known_sensors
 from rt_torchrl.identification.units import converted
 from rt_torchrl.options import array_of, check_options
 from rt_torchrl.plants.plant import Plant
@@ -172,8 +173,11 @@ def logged_states(plant: Plant | type[Plant]) -> tuple[Signal, ...]:
 
 
 def logged_signals(plant: Plant) -> tuple[Signal, ...]:
-    """Signals that a log of this plant can hold: its states, actions and exogenous inputs."""
-    return (*logged_states(plant), *plant.actions, *plant.inputs)
+    """Signals that a log of this plant can hold: its states and measurements, actions and exogenous inputs."""
+    states = logged_states(plant)
+    names = {state.name for state in states}
+    others = tuple(one.measurement.signal for name, one in known_sensors(plant).items() if name not in names)
+    return (*states, *plant.actions, *plant.inputs, *others)
 
 
 def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
@@ -209,24 +213,26 @@ def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> Sensor
     return SensorLog(times=values.pop(TIME), columns=values)
 
 
-def checked(log: SensorLog, plant: Plant, *, drop: bool = False) -> SensorLog:
+def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool = False) -> SensorLog:
     """The log, once it is certain that it can drive a twin of this plant.
 
     Args:
         log: log as it was read.
         plant: plant that gives the signals that are needed and the range of each signal.
         drop: whether to leave out rows in which a value is missing or out of range, instead of refusing the log.
+        missing: whether a sensor may lack samples; its row stays, with NaN. An action or input must have every value.
 
     Raises:
         ValueError: if an action or input has no column; without ``drop`` also if a value is missing or out of range.
     """
-    missing = [signal.name for signal in (*plant.actions, *plant.inputs) if signal.name not in log.columns]
-    if missing:
+    absent = [signal.name for signal in (*plant.actions, *plant.inputs) if signal.name not in log.columns]
+    if absent:
         raise ValueError(
-            f"log of plant {plant.name!r} has no column {', '.join(missing)}; it has {', '.join(log.columns)}. Actions "
+            f"log of plant {plant.name!r} has no column {', '.join(absent)}; it has {', '.join(log.columns)}. Actions "
             "and inputs drive the twin, so each is needed: log it, or name its column, such as --columns "
-            f"HEADER={missing[0]}."
+            f"HEADER={absent[0]}."
         )
+    driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
     good = np.ones(len(log.times), dtype=bool)
     for signal in logged_signals(plant):
         if signal.name not in log.columns:
@@ -234,13 +240,14 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False) -> SensorLog:
         values = log.columns[signal.name]
         # A sensor of a periodic state may count its turns.
         inside = np.isfinite(values) & (signal.periodic | ((values >= signal.low) & (values <= signal.high)))
+        inside |= np.isnan(values) & (missing and signal.name not in driven)
         if not (drop or inside.all()):
             k = int(np.argmin(inside))
             raise ValueError(
                 f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log (counted from 0, t = "
                 f"{log.times[k]:g} s), {int((~inside).sum())} such rows; it must be a number from {signal.low:g} to "
                 f"{signal.high:g} {signal.unit}. Mend the log or the column's unit, or leave such rows out with "
-                "--drop (of a training: --log.drop)."
+                "--drop (of a training: --log.drop). Where a sensor lacks samples, --missing keeps the row."
             )
         good &= inside
     return log if good.all() else log.chosen(good)

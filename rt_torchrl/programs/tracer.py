@@ -124,7 +124,7 @@ class Tracer(TorchDispatchMode):
             if not known and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
                     return func.decompose(*args, **kwargs)
-            if func.is_view:  # a view shares the cells
+            if func.is_view or torch.Tag.inplace_view in func.tags:  # a view shares the cells
                 self.cells(args[0])
                 out = func(*args, **kwargs)
                 if any(o.dtype != args[0].dtype for o in tensors_in([out])):

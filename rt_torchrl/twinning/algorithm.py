@@ -29,6 +29,7 @@ from rt_torchrl.twinning.evidence.examination import Examination
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
+from rt_torchrl.twinning.informative_memory import InformativeMemory
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.operating import Operating
@@ -88,6 +89,7 @@ class ReinforcementTwinning:
         share_critic(self.learner, model_based)
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses)
         self.short_term = ShortTermMemory(config.records)
+        self.informative = InformativeMemory(self.assimilation, config.informative)
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
@@ -169,9 +171,7 @@ class ReinforcementTwinning:
         self.learning.adopt(acting)
         cleared = self.clearance.choose(live, self.judged)
         acting, live = (acting, live) if cleared.policy is self.policies[live] else (cleared.policy, cleared.role)
-        # Virtual episodes need the inputs of one whole real episode.
-        needed = self.config.arm != "model_free" and not self.virtual.processes
-        flight = self.flights.fly(acting, strength=strength, whole=needed)
+        flight = self.flights.fly(acting, strength=strength, whole=self.virtual.wanting(self.config.arm))
         self.keep(flight)
         explored = self.actor.strength * self.config.exploration.spread if acting is cleared.policy else 1.0
         if flight.whole:  # costs of parts cannot be compared with those of episodes
@@ -184,6 +184,7 @@ class ReinforcementTwinning:
     def keep(self, flight: Flight) -> None:
         """Both memories hold the sound part of an episode; of those that are refused, none does."""
         self.learning.store(flight.parts(self.twin.plant.dt))
+        self.informative.before(self.short_term, flight.record)
         self.short_term.append(flight.record)
 
     def update_model_free(self) -> TensorDict:
@@ -201,6 +202,7 @@ class ReinforcementTwinning:
         """Step 4: n_G gradient steps on J_p over virtual trajectories with stored actions, of D_S or ``records``."""
         latest, processes = self.virtual.paired(list(records or self.short_term))
         self.earlier.remember()
+        latest = self.informative.with_latest(latest)
         found = self.assimilation.update(latest, processes, self.config.realisations, self.generator)
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
         return merged(fit, findings(**self.assimilation.report()))
@@ -288,12 +290,11 @@ class ReinforcementTwinning:
         """
         state = state | on_device({name: state[name] for name in KEPT}, self.generator.device)
         parts: dict[str, tuple[Any, Any]] = {r: (policy, state["policies"][r]) for r, policy in self.policies.items()}
-        parts |= {"closure": (self.twin.closure, state["closure"])}
         parts |= {name: (getattr(self, name), state[name]) for name in COMPONENTS}
-        load_parts(parts)
+        load_parts(parts | {"closure": (self.twin.closure, state["closure"])})
         self.generator.set_state(state["generator"].cpu())
         self.episodes_done = state["episodes_done"]
 
 
-KEPT = ("virtual", "short_term", "track_record")  # components that leave the tensors of their state on their device
+KEPT = ("virtual", "short_term", "informative", "track_record")  # they leave the tensors of their state on their device
 COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", "clearance", *KEPT)

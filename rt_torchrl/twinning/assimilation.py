@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from rt_torchrl.identification.output_error import (
     NOISE_TOLERANCE,
@@ -17,10 +16,10 @@ from rt_torchrl.identification.output_error import (
     compared,
     discrepancy_derivatives,
 )
+from rt_torchrl.identification.weight_prior import WeightPrior
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
-from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
@@ -50,6 +49,11 @@ class AssimilationConfig:
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
             make up for it. The choice ``estimated`` needs ``levenberg_marquardt`` and the inputs of the ``record``.
+        sensors: names of the states and measurements that sensors read, to which the twin is fitted by maximum
+            likelihood; none for the plant's J_p of the whole state. Noise levels are estimated, and so are first
+            states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
+            the mean square of the residuals in units of the noise, and ``stop_ratio`` has no effect. Sensors need
+            ``levenberg_marquardt``, the inputs of the ``record``, ``initial="estimated"`` and whole records.
         descent: parameters of the closure's descent.
     """
 
@@ -60,6 +64,7 @@ class AssimilationConfig:
     prior: float = 0.0
     segment: int = 0
     initial: Literal["measured", "estimated"] = "measured"
+    sensors: tuple[str, ...] = ()
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self) -> None:
@@ -76,6 +81,11 @@ class AssimilationConfig:
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
+            )
+        if self.sensors and (self.initial != "estimated" or self.segment):
+            raise ValueError(
+                f"sensors={self.sensors} of the assimilation need initial='estimated' and segment=0; they are "
+                f"{self.initial!r} and {self.segment}."
             )
 
 
@@ -101,8 +111,8 @@ class Assimilation:
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
         self.second_order = LevenbergMarquardt(twin.closure)
-        self._start = self._weights().detach().clone()
-        self._stiffness = self._prior_stiffness()
+        device = next((x.device for x in twin.plant.buffers()), "cpu")
+        self.prior = WeightPrior(twin.closure, config.prior, device=device)
         self._first = copy.deepcopy(twin.closure.state_dict())
 
     def update(
@@ -154,12 +164,12 @@ class Assimilation:
 
     def _descend(self, replayed: Trajectory) -> Descended:
         def equations() -> NormalEquations:
-            return self._with_prior(self.normal_equations(replayed))
+            return self.prior.added(self.normal_equations(replayed))
 
         def cost() -> Tensor:
-            return self._identification_cost(replayed) + self._prior_cost()
+            return self._identification_cost(replayed) + self.prior.cost()
 
-        before = self._prior_cost().item()
+        before = self.prior.cost().item()
         iterations, stop_below = self.config.iterations, self.config.stop_ratio
         if self.config.initial == "estimated":
             output_error = self._output_error(replayed)
@@ -169,7 +179,7 @@ class Assimilation:
             found = self.second_order.run(equations, iterations, stop_below=stop_below)
         else:
             found = self.descent.run(cost, iterations, stop_below=stop_below)
-        return found._replace(start=found.start - before, best=found.best - self._prior_cost().item())
+        return found._replace(start=found.start - before, best=found.best - self.prior.cost().item())
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
         measured, actions, exogenous, start = replayed
@@ -197,35 +207,7 @@ class Assimilation:
 
     def _mean_equations(self, output_error: OutputError) -> NormalEquations:
         found = output_error.normal_equations()
-        return self._with_prior(NormalEquations(*(part / len(output_error.segments) for part in found)))
-
-    def _weights(self) -> Tensor:
-        trained = [w.flatten() for w in self.twin.closure.parameters() if w.requires_grad]
-        return torch.cat(trained) if trained else self._nothing()
-
-    def _prior_cost(self) -> Tensor:
-        return 0.5 * (self._stiffness * (self._weights() - self._start).square()).sum()
-
-    def _prior_stiffness(self) -> Tensor:
-        """The factor ρ of every trained weight, in the order of :meth:`_weights`."""
-        closure, rho = self.twin.closure, self.config.prior
-        held = {id(w) for m in closure.modules() if isinstance(m, BoundedPerceptron) for w in m.parameters()}
-        trained = [w for w in closure.parameters() if w.requires_grad]
-        each = [torch.full_like(w.detach().flatten(), rho if id(w) in held else 0.0) for w in trained]
-        return torch.cat(each) if each else self._nothing()
-
-    def _nothing(self) -> Tensor:
-        """The empty weight vector of a closure without trained weights."""
-        device = next((x.device for x in self.twin.plant.buffers()), "cpu")
-        return torch.empty(0, dtype=torch.float64, device=device)
-
-    def _with_prior(self, found: NormalEquations) -> NormalEquations:
-        if not self.config.prior:
-            return found
-        n = len(found.gradient) - len(self._start)  # number of initial states, which are the last unknowns
-        pull = pad(self._stiffness * (self._weights() - self._start), (0, n))
-        matrix = found.matrix + torch.diag(pad(self._stiffness, (0, n)))
-        return NormalEquations(found.cost + self._prior_cost(), found.gradient + pull, matrix)
+        return self.prior.added(NormalEquations(*(part / len(output_error.segments) for part in found)))
 
     def normal_equations(self, replayed: Trajectory) -> NormalEquations:
         """J_p, its gradient and its Gauss-Newton matrix by the closure's weights."""

@@ -99,8 +99,7 @@ class Operating:
         return self._report(flights)
 
     def _taken(self) -> Flight:
-        # Virtual episodes need the inputs of one whole window.
-        needed = self.trainer.config.arm != "model_free" and not self.trainer.virtual.processes
+        needed = self.trainer.virtual.wanting(self.trainer.config.arm)
         return self.trainer.flights.fly(self.trainer.policies["model_free"], strength=0.0, whole=needed)
 
     def _order_of(self, flight: Flight) -> Order:

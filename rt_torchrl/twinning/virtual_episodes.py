@@ -27,6 +27,10 @@ class VirtualEpisodes:
         self.twin, self.config, self.generator = twin, config, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
 
+    def wanting(self, arm: str) -> bool:
+        """Whether an arm with a twin still needs the inputs of one whole real episode."""
+        return arm != "model_free" and not self.processes
+
     def learn(self, record: Trajectory) -> None:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
         self.processes.append(self._process(record))

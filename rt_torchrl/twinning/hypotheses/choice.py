@@ -13,6 +13,7 @@ from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
+from rt_torchrl.twinning.sensor_assimilation import SensorAssimilation
 
 
 def make_twin(
@@ -58,7 +59,15 @@ def extended(suspect: Plant, closure: nn.Module) -> nn.Module:
 
 
 def make_assimilation(twin: DigitalTwin, config: AssimilationConfig, hypotheses: HypothesesConfig) -> Assimilation:
-    """Step 4 for a twin, or for an ensemble of them."""
+    """Step 4 for a twin, or for an ensemble of them.
+
+    Raises:
+        ValueError: if hypotheses are to be fitted to some sensors alone, or the plant has no such sensor.
+    """
+    if config.sensors and isinstance(twin, TwinEnsemble):
+        raise ValueError(f"sensors={config.sensors} of the assimilation do not go with hypotheses; leave one out.")
+    if config.sensors:
+        return SensorAssimilation(twin, config)
     if isinstance(twin, TwinEnsemble):
         return EnsembleAssimilation(twin, config, hypotheses)
     return Assimilation(twin, config)

@@ -1,0 +1,1 @@
+"""Two tanks, one above the other: the Cascaded Tanks benchmark of nonlinear system identification."""

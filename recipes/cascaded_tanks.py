@@ -1,0 +1,243 @@
+"""Identify the Cascaded Tanks benchmark from its record, and plan a controller on the identified twin."""
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+
+import numpy as np
+import torch
+
+from rt_torchrl import (
+    DigitalTwin,
+    Estimate,
+    Estimation,
+    EstimationConfig,
+    SensorRecord,
+    check_options,
+    main_of,
+    sensors_of,
+)
+from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
+from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
+from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
+from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
+from rt_torchrl.identification.cross_validation import Fold, folds, pooled
+from rt_torchrl.identification.prediction import Prediction, predict, residual_tests
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Identify the Cascaded Tanks benchmark: physics, physics with a perceptron, and a controller on the twin.
+
+    Args:
+        data: CSV file with the columns uEst, uVal, yEst, yVal; by default the package nonlinear-benchmarks loads the
+            record, and downloads it at its first use.
+        folds: number of parts of the estimation record, each of which is simulated by a twin of the others.
+        hidden: widths of the perceptron's hidden layers.
+        priors: stiffnesses of the perceptron's prior, of which the folds choose one.
+        starts: number of first weights of the physics.
+        iterations: trial steps of each descent.
+        first: number of samples that the initial state of a simulation is estimated from; they count as well.
+        test: whether to simulate the test record. Every look is counted in looks.json beside the results.
+        plan: gradients of the policy that is planned on the twin; 0 plans none.
+        draws: number of twins drawn from the uncertainty that the policy is planned on.
+        seed: seed of the perceptron's weights and of the virtual episodes.
+        log_dir: folder of the results.
+    """
+
+    data: Path | None = None
+    folds: int = 4
+    hidden: tuple[int, ...] = (5,)
+    priors: tuple[float, ...] = (100.0, 300.0, 1000.0, 3000.0)
+    starts: int = 6
+    iterations: int = 40
+    first: int = 50
+    test: bool = False
+    plan: int = 0
+    draws: int = 5
+    seed: int = 0
+    log_dir: Path = Path("runs/cascaded_tanks")
+
+    def __post_init__(self):
+        check_options(self)
+        for argument in ("starts", "iterations", "first", "draws"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+        if self.plan < 0 or self.seed < 0:
+            raise ValueError(f"plan={self.plan} and seed={self.seed} must not be negative.")
+        if not self.priors or min(self.priors) < 0.0:
+            raise ValueError(f"priors={self.priors} must hold stiffnesses that are not negative, one at least.")
+
+
+class Identified:
+    """Twins of one set of records: the physics, then the physics with a perceptron.
+
+    Args:
+        records: records to identify from.
+        config: options of the recipe.
+    """
+
+    def __init__(self, records: list[SensorRecord], config: Config):
+        self.plant, self.records, self.config = CascadedTanks(), records, config
+        law = self.plant.make_closure(torch.Generator())
+        assert isinstance(law, Hydraulics)
+        self.law, self.physics = law, self._estimation(law, starts=config.starts)
+        self.of_physics = self.physics.run(records)
+
+    def _estimation(self, closure: Any, **options: Any) -> Estimation:
+        config = EstimationConfig(iterations=self.config.iterations, errors="robust", **options)
+        return Estimation(DigitalTwin(self.plant, closure), sensors_of(self.plant, ["sensed_level"]), config=config)
+
+    def with_perceptron(self, prior: float) -> tuple[Estimation, Estimate]:
+        """The physics with a perceptron, which starts from the identified physics."""
+        law = Hydraulics(self.law.coefficients.detach())
+        generator = torch.Generator().manual_seed(self.config.seed)
+        closure = NeuralHydraulics(law, hidden=self.config.hidden, generator=generator)
+        estimation = self._estimation(closure, prior=prior, rounds=3)
+        return estimation, estimation.run(self.records)
+
+
+def guess(readings: torch.Tensor) -> torch.Tensor:
+    """A first guess of both levels; the upper one has no sensor."""
+    return torch.stack([torch.tensor(20.0, dtype=torch.float64), readings[0]])
+
+
+def cross_validated(parts: list[Fold], config: Config) -> dict[str, Any]:
+    """RMS error over all parts, of the physics and of every prior of the perceptron [V]."""
+    found: dict[str, list[float]] = {}
+    for k, part in enumerate(parts):
+        print(f"fold {k + 1} of {len(parts)}", file=sys.stderr)
+        one = Identified(part.training, config)
+        found.setdefault("physics", []).append(
+            error(predict(one.physics, one.of_physics, part.held_out, first=config.first))
+        )
+        for prior in config.priors:
+            prediction = predict(*one.with_perceptron(prior), part.held_out, first=config.first)
+            found.setdefault(f"{prior:g}", []).append(error(prediction))
+    held_out = [part.held_out for part in parts]
+    return {name: {"rms": pooled(each, held_out), "folds": each} for name, each in found.items()}
+
+
+def error(prediction: Prediction) -> float:
+    """RMS error of the level [V]."""
+    return prediction.rms[0].item()
+
+
+def main(config: Config) -> None:
+    from rt_torchrl.figures import save_figure
+    from rt_torchrl.figures.simulation import simulated_and_measured
+
+    benchmark = read_benchmark(config.data)
+    record = sensor_record_of(benchmark.voltage, benchmark.level)
+    config.log_dir.mkdir(parents=True, exist_ok=True)
+    found: dict[str, Any] = {"folds": cross_validated(folds(record, config.folds, 4.0, guess), config)}
+    scores = {prior: found["folds"][f"{prior:g}"]["rms"] for prior in config.priors}
+    found["prior"] = min(scores, key=lambda prior: scores[prior])
+    twins = Identified([record], config)
+    neural = twins.with_perceptron(found["prior"])
+    estimates = {"physics": (twins.physics, twins.of_physics), "physics and perceptron": neural}
+    found["looks"] = look(config.log_dir) if config.test else looks(config.log_dir)
+    judged = {"estimation": record}
+    judged |= {"test": sensor_record_of(benchmark.test_voltage, benchmark.test_level)} if config.test else {}
+    for name, pair in estimates.items():
+        found[name] = summary(pair[1])
+        for which, one in judged.items():
+            prediction = predict(*pair, one, first=config.first)
+            found[name][which] = judgement(prediction, one)
+            title = f"{name}, {which} record"
+            file = f"{which}_{name.split()[-1]}.png"
+            save_figure(simulated_and_measured(prediction, one, twins.plant.dt, title=title), config.log_dir / file)
+    if config.plan:
+        closures = list(drawn_closures(neural[1], config.draws, config.seed))
+        found["plan"] = planned_under_uncertainty(twins.plant, closures, iterations=config.plan, seed=config.seed)
+    (config.log_dir / "results.json").write_text(json.dumps(found, indent=2) + "\n")
+    print(table(found))
+    print(f"results in {config.log_dir}")
+
+
+def sensor_record_of(voltage: np.ndarray, level: np.ndarray) -> SensorRecord:
+    """A record of the benchmark; the voltage of the last sample acts on nothing."""
+    readings = torch.from_numpy(np.ascontiguousarray(level)).double()[:, None]
+    actions = torch.from_numpy(np.ascontiguousarray(voltage)).double()[:-1, None]
+    return SensorRecord(readings, actions, torch.zeros_like(actions), guess(readings[0]))
+
+
+def drawn_closures(estimate: Estimate, count: int, seed: int):
+    """The identified closure, and closures drawn from its uncertainty."""
+    import copy
+
+    closure = estimate.likelihood.twin.closure
+    yield closure
+    generator = torch.Generator().manual_seed(seed)
+    values, vectors = torch.linalg.eigh(estimate.uncertainty.weights_covariance)
+    for _ in range(count):
+        normal = torch.randn(len(values), generator=generator, dtype=torch.float64)
+        change = vectors @ (values.clamp_min(0.0).sqrt() * normal)
+        drawn = copy.deepcopy(closure)
+        with torch.no_grad():
+            for w, part in zip(drawn.parameters(), change.split([w.numel() for w in drawn.parameters()]), strict=True):
+                w.add_(part.view_as(w))
+        yield drawn
+
+
+def summary(estimate: Estimate) -> dict[str, Any]:
+    """Weights with their intervals, noise level, and what the data cannot tell."""
+    errors, intervals = estimate.uncertainty.standard_errors(), estimate.uncertainty.intervals()
+    weights = {
+        name: {"value": value, "standard_error": errors[name], "interval": list(intervals[name])}
+        for name, value in estimate.after.items()
+    }
+    return {"weights": weights, "noise": estimate.noise, "warnings": estimate.uncertainty.warnings()}
+
+
+def judgement(prediction: Prediction, record: SensorRecord) -> dict[str, Any]:
+    """RMS error [V] with its interval, the share of samples within their interval, and the residual tests."""
+    total = (prediction.deviation**2 + prediction.noise**2).sqrt()
+    inside = (prediction.errors.abs() <= 1.96 * total).double().mean().item()
+    return {
+        "rms": error(prediction),
+        "interval": list(prediction.rms_interval(64)),
+        "inside": inside,
+        "residuals": residual_tests(prediction, record).describe(),
+    }
+
+
+def looks(folder: Path) -> list[str]:
+    """When the test record was looked at."""
+    file = folder / "looks.json"
+    return json.loads(file.read_text()) if file.exists() else []
+
+
+def look(folder: Path) -> list[str]:
+    """Count one more look at the test record."""
+    found = [*looks(folder), time.strftime("%Y-%m-%d %H:%M:%S")]
+    (folder / "looks.json").write_text(json.dumps(found, indent=2) + "\n")
+    return found
+
+
+def table(found: dict[str, Any]) -> str:
+    """The results, for the terminal."""
+    lines = ["RMS error of the simulated level [V]", "  over the folds of the estimation record:"]
+    lines += [f"    {name:<12}{entry['rms']:8.4f}" for name, entry in found["folds"].items()]
+    lines.append(f"  the folds choose the prior {found['prior']:g}")
+    for name in ("physics", "physics and perceptron"):
+        for which in ("estimation", "test"):
+            if which in found[name]:
+                one = found[name][which]
+                low, high = one["interval"]
+                lines.append(f"  {name}, {which} record: {one['rms']:.4f} ({low:.3f} ... {high:.3f})")
+                lines.append(f"    {one['inside']:.1%} of the samples within their 95 % interval; {one['residuals']}")
+        lines += [f"  note on {name}: {warning}" for warning in found[name]["warnings"]]
+    lines.append(f"  the test record was looked at {len(found['looks'])} times")
+    lines += [f"  {name}: {value:.4g}" for name, value in found.get("plan", {}).items()]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main_of(Config, main)

@@ -1,0 +1,107 @@
+"""Figures of an identification from sensors: readings and replays, correlations, ellipses, intervals of a curve."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rt_torchrl.figures.style import REAL, SAMPLES, TWIN, array, caption, legend_below, panels, time_unit, with_unit
+from rt_torchrl.identification.curve import Band
+from rt_torchrl.identification.sensor_identification import SensorIdentified, SensorJudgement
+from rt_torchrl.identification.sensor_record import SensorRecord
+from rt_torchrl.identification.sensors import Sensor
+from rt_torchrl.identification.uncertainty import Uncertainty
+
+
+def twin_and_sensors(
+    dt: float,
+    sensors: Sequence[Sensor],
+    training: Sequence[SensorRecord],
+    held_out: Sequence[SensorRecord],
+    found: SensorIdentified,
+) -> Figure:
+    """What every sensor has read over time, and what the twin says it reads, after the estimation; held out is shaded.
+
+    The notes give the root mean square errors on the held-out records.
+    """
+    begin, last = training[0].start, held_out[-1].start
+    unit, length = time_unit(last + dt * len(held_out[-1].actions) - begin)
+    size = (9.0, 1.2 + 2.2 * len(sensors))
+    figure, axes = panels(len(sensors), title="Twin and sensors", size=size, sharex=True)
+    parts = ((training, found.training[1]), (held_out, found.held_out[1]))
+    for k, (ax, sensor) in enumerate(zip(axes.flat, sensors, strict=True)):
+        for records, judgement in parts:
+            for record, replayed in zip(records, judgement.readings, strict=True):
+                t = (record.start + dt * np.arange(len(record.readings))) / length
+                ax.plot(t, array(record.readings[:, k]), ".", color=REAL, markersize=2.5, label="read")
+                ax.plot(t, array(replayed[:, k]), color=TWIN, linewidth=1.3, label="twin")
+        for record in held_out:
+            ends = record.start, record.start + dt * len(record.actions)
+            ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
+        before, after = (_rms(judged, k, sensor.measurement.unit) for judged in found.held_out)
+        caption(ax, sensor.measurement.label, f"RMS held out {before} before, {after} after")
+    axes.flat[-1].set_xlabel(f"time [{unit}]")
+    legend_below(figure, list(axes.flat))
+    return figure
+
+
+def _rms(judged: SensorJudgement, k: int, unit: str) -> str:
+    return with_unit(judged.rms[k].item(), unit)
+
+
+def correlations(uncertainty: Uncertainty) -> Figure:
+    """The correlations of a closure's values as numbers on colours; those that the data cannot tell are left out."""
+    names, R = uncertainty.names, array(uncertainty.correlations())
+    side = 1.8 + 0.55 * len(names)
+    figure, axes = panels(1, title="Correlations of the weights", size=(side, side))
+    ax = axes[0, 0]
+    ax.grid(False)
+    ax.imshow(R, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    for (i, j), value in np.ndenumerate(R):
+        if np.isfinite(value):
+            ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7.5)
+    ax.set_xticks(range(len(names)), names, rotation=60, ha="right")
+    ax.set_yticks(range(len(names)), names)
+    return figure
+
+
+def ellipses(uncertainty: Uncertainty, *, level: float = 0.95) -> Figure:
+    """Joint confidence regions of all pairs of a closure's values, which are few."""
+    names = uncertainty.names
+    n = max(len(names) - 1, 1)
+    title = f"Joint {level:.0%} regions of the weights"
+    figure, axes = panels(n, n, title=title, size=(2.2 * n + 1.0, 2.2 * n + 0.8))
+    for i in range(n):
+        for j in range(n):
+            ax, pair = axes[i, j], (names[j], names[i + 1]) if len(names) > 1 else (names[0], names[0])
+            if j > i:
+                ax.set_axis_off()
+                continue
+            ax.plot(*array(uncertainty.ellipse(*pair, level=level)).T, color=TWIN)
+            ax.plot(*(uncertainty.values[names.index(name)].item() for name in pair), "+", color=REAL)
+            ax.set_xlabel(pair[0] if i == n - 1 else "")
+            ax.set_ylabel(pair[1] if j == 0 else "")
+    return figure
+
+
+def curve(band: Band, *, xlabel: str, ylabel: str, data: np.ndarray, true: np.ndarray | None = None) -> Figure:
+    """A learned curve with its pointwise interval, where data was, and the true curve if it is known.
+
+    Args:
+        band: the curve and its interval.
+        xlabel, ylabel: labels of the axes.
+        data: values of the abscissa that the records visited.
+        true: the true curve at the band's abscissae.
+    """
+    figure, axes = panels(1, title="Learned curve and where data was", size=(7.0, 4.4))
+    ax, x = axes[0, 0], array(band.x)
+    ax.fill_between(x, array(band.low), array(band.high), color=TWIN, alpha=0.25, linewidth=0, label="95 % interval")
+    ax.plot(x, array(band.middle), color=TWIN, label="twin")
+    if true is not None:
+        ax.plot(x, true, color=REAL, linestyle="--", label="true")
+    below = ax.get_xaxis_transform()
+    ax.plot(data, np.full(len(data), 0.02), "|", color=SAMPLES, transform=below, alpha=0.5, label="data")
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    legend_below(figure, [ax])
+    return figure

@@ -1,0 +1,113 @@
+"""How often intervals hold the truth: an estimation from many simulated records with noise."""
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.identification.covariance import named_values
+from rt_torchrl.identification.estimation import Estimation, EstimationConfig
+from rt_torchrl.identification.sensor_record import SensorRecord, sensor_record
+from rt_torchrl.identification.sensors import Sensor
+from rt_torchrl.interruption import safe_point
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+HELD = 20
+"""Number of control intervals for which a random command is held."""
+
+
+class Coverage(NamedTuple):
+    """Result over all simulations, for each named value of the closure.
+
+    Args:
+        names: names of the values.
+        inside: share of the simulations in which the 95 % interval holds the truth, of those with an interval.
+        told: share of the simulations in which the data tell the value, so that it has an interval.
+        error_over_bound: RMS error over the RMS standard error, which is the Cramér-Rao bound.
+    """
+
+    names: list[str]
+    inside: Float[Tensor, " n"]
+    told: Float[Tensor, " n"]
+    error_over_bound: Float[Tensor, " n"]
+
+    @property
+    def mean(self) -> float:
+        """Share of all intervals that hold the truth."""
+        return ((self.inside * self.told).nansum() / self.told.sum()).item()
+
+
+def coverage(
+    plant: Plant,
+    closure: nn.Module,
+    sensors: Sequence[Sensor],
+    *,
+    simulations: int = 200,
+    share: float = 0.01,
+    generator: torch.Generator,
+    config: EstimationConfig | None = None,
+) -> Coverage:
+    """Simulate records under the closure, add noise, estimate, and compare with the closure.
+
+    Every estimation begins with the true weights, because this is about intervals and not about local minima.
+
+    Args:
+        plant: the plant.
+        closure: closure of the simulated system, which the twin can represent exactly.
+        sensors: sensors; their noise levels are estimated.
+        simulations: number of simulated records.
+        share: standard deviation of the noise, as a share of the RMS deviation of each reading from its mean.
+        generator: source of initial states, inputs, commands and noise.
+        config: parameters of the estimation.
+
+    Raises:
+        ValueError: if there is no simulation, or the noise is no positive share.
+    """
+    if simulations < 1 or not 0.0 < share < 1.0:
+        raise ValueError(f"simulations={simulations} must be at least 1, and the share={share} of the noise in (0, 1).")
+    truth = torch.stack(list(named_values(closure).values())).detach()
+    errors, bounds_found = [], []
+    twin = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True))
+    start = copy.deepcopy(twin.closure.state_dict())
+    for _ in range(simulations):
+        safe_point()
+        record = with_noise(sensor_record(plant, sensors, random_flight(plant, closure, generator)), share, generator)
+        twin.closure.load_state_dict(start)
+        found = Estimation(twin, sensors, config=config).run([record])
+        errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
+        bounds_found.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
+    return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(bounds_found))
+
+
+def _counted(
+    names: list[str], errors: Float[Tensor, "simulations n"], scatter: Float[Tensor, "simulations n"]
+) -> Coverage:
+    z, known = errors / scatter, scatter.isfinite() & (scatter > 0.0)  # without scatter it is a constant
+    inside = torch.where(known, (z.abs() <= 1.959964).double(), torch.nan).nanmean(0)
+    ratio = torch.where(known, z, torch.nan).square().nanmean(0).sqrt()
+    return Coverage(names, inside, known.double().mean(0), ratio)
+
+
+@torch.no_grad()
+def random_flight(plant: Plant, closure: nn.Module, generator: torch.Generator) -> Trajectory:
+    """One episode of the plant under random commands in the middle of their ranges, each held for some intervals."""
+    start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    low, high = bounds(plant.actions)
+    drawn = torch.rand(1, -(-plant.n_steps // HELD), len(low), generator=generator, dtype=torch.float64)
+    share = 0.3 + 0.4 * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
+    return Rollout(plant, closure)(start, inputs, low + share * (high - low)).each()[0]
+
+
+def with_noise(record: SensorRecord, share: float, generator: torch.Generator) -> SensorRecord:
+    """The record with white noise, whose guess of the first state stays the true one."""
+    readings = record.readings
+    scale = share * (readings - readings.mean(0)).square().mean(0).sqrt()
+    noise = torch.randn(readings.shape, generator=generator, dtype=torch.float64)
+    return record._replace(readings=readings + scale * noise)

@@ -1,0 +1,119 @@
+r"""Sensors: what is measured of a real system, as the likelihood of an identification sees it.
+
+.. math:: y_k = h(t_k, s_k, z_k) + b + e_k, \qquad e_k \sim \mathcal N(0, \sigma^2)
+
+The plant knows nothing of its sensors here: they belong to the log or to the real system.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.plants.measurement import Component, Measurement, Preview
+from rt_torchrl.plants.plant import Plant
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """A sensor with white noise and, if wanted, a constant bias that is estimated.
+
+    Args:
+        measurement: signal that the sensor gives, and the function h that reads it from time, state and input.
+        noise: standard deviation σ of the noise, in the unit of the signal; None estimates it from the residuals.
+        bias: whether a constant offset b of the sensor is an unknown.
+
+    Raises:
+        ValueError: if the noise is not positive and finite.
+    """
+
+    measurement: Measurement
+    noise: float | None = None
+    bias: bool = False
+
+    def __post_init__(self) -> None:
+        if self.noise is not None and not 0.0 < self.noise < math.inf:
+            raise ValueError(
+                f"noise={self.noise} of sensor {self.name!r} must be positive and finite [{self.measurement.unit}]; "
+                "None estimates it."
+            )
+
+    @property
+    def name(self) -> str:
+        """Name of the signal, and of its column in a log."""
+        return self.measurement.name
+
+
+def known_sensors(plant: Plant) -> dict[str, Sensor]:
+    """A sensor for every signal of a plant that can be measured, by name: its states and its ``measurements``.
+
+    What drives the plant, its actions and inputs, is known and is no sensor.
+    """
+    driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
+    lacking = len(plant.states)  # states from here on are there only if they are asked for
+    found = {
+        m.name: Sensor(measurement=m)
+        for m in plant.measurements
+        if m.name not in driven
+        and not isinstance(m.read, Preview)
+        and not (isinstance(m.read, Component) and m.read.of == "state" and m.read.index >= lacking)
+    }
+    states = {
+        signal.name: Sensor(measurement=Measurement.of(signal, Component("state", k)))
+        for k, signal in enumerate(plant.states)
+        if signal.name not in driven
+    }
+    return found | states
+
+
+def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:
+    """The sensors of the named states and measurements of a plant, with unknown noise.
+
+    Raises:
+        ValueError: if a name is no state and no measurement of the plant, or there is no name.
+    """
+    known = known_sensors(plant)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        raise ValueError(
+            f"sensors={tuple(names)} of plant {plant.name!r}: {', '.join(unknown) or 'nothing'} cannot be measured; "
+            f"choose among {', '.join(known)}."
+        )
+    return tuple(known[name] for name in names)
+
+
+def read(
+    sensors: Sequence[Sensor],
+    plant: Plant,
+    t: Float[Tensor, "*batch"],
+    state: Float[Tensor, "*batch n_s"],
+    exogenous: Float[Tensor, "*batch n_z"],
+) -> Float[Tensor, "*batch n_y"]:
+    """What the sensors would read without noise and bias."""
+    found = [sensor.measurement.read(plant, t, state, exogenous) for sensor in sensors]
+    return torch.stack([value.expand(state.shape[:-1]) for value in found], -1)
+
+
+def read_slopes(
+    sensors: Sequence[Sensor],
+    plant: Plant,
+    t: Float[Tensor, "batch n"],
+    states: Float[Tensor, "batch n n_s"],
+    exogenous: Float[Tensor, "batch n n_z"],
+) -> Float[Tensor, "batch n n_y n_s"]:
+    """Derivatives of the readings by the state, in every sample."""
+
+    places = [sensor.measurement.read for sensor in sensors]
+    if all(isinstance(place, Component) and place.of == "state" for place in places):
+        rows = [place.index for place in places if isinstance(place, Component)]
+        unit = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)[rows]
+        return unit.expand(*states.shape[:2], -1, -1)
+
+    def one(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
+        return read(sensors, plant, t, state, z)
+
+    slopes: Tensor = torch.func.vmap(torch.func.vmap(torch.func.jacrev(one, argnums=1)))(t, states, exogenous)
+    return slopes

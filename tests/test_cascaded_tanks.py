@@ -1,0 +1,187 @@
+"""The cascaded tanks: balances of the plant, and the recipe on a synthetic record of the tests' own."""
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
+from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
+from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
+from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
+from rt_torchrl.identification.cross_validation import folds, pooled
+from rt_torchrl.trajectories.rollout import Rollout
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+
+
+class ThroughATube(nn.Module):
+    """Both tanks drain in proportion to their levels: a linear system with a closed form."""
+
+    def forward(self, features):
+        upper, lower, voltage = features.unbind(-1)
+        return torch.stack([0.05 * voltage - 0.01 * upper, 0.01 * upper - 0.02 * lower], -1)
+
+
+def test_linear_tanks_follow_their_closed_form():
+    plant = CascadedTanks(horizon=400.0, closure=ThroughATube())
+    start, n = torch.tensor([[8.0, 5.0]]).double(), plant.n_steps
+    inputs = torch.full((1, n, 1), 5.0).double()
+    with torch.no_grad():
+        states = Rollout(plant, plant.closure)(start, inputs, torch.full((1, n, 1), 2.0).double()).states[0]
+    t = 4.0 * np.arange(n + 1)
+    # h_1 → 10 with the rate 0.01/s, and h_2 follows with 0.02/s; the edge at 10 V is some 5 V away.
+    upper = 10.0 - 2.0 * np.exp(-0.01 * t)
+    lower = 5.0 - 2.0 * np.exp(-0.01 * t) + 2.0 * np.exp(-0.02 * t)
+    np.testing.assert_allclose(states[:, 0].numpy(), upper, atol=1e-8)  # Runge-Kutta with 4 s: (0.08)⁵/120 a step
+    np.testing.assert_allclose(states[:, 1].numpy(), lower, atol=1e-7)
+
+
+def test_water_is_lost_at_the_edges_alone():
+    law, plant = Hydraulics.true(), CascadedTanks()
+    pump, down, out, over = law.flows(torch.tensor([10.0, 4.0, 2.0]).double())
+    c = law.named_coefficients()
+    assert pump.item() == pytest.approx(2.0 * c["pump"].item()) and over.item() < 1e-12
+    assert down.item() == pytest.approx(10.0 * c["upper_outlet"].item())
+    assert out.item() == pytest.approx(2.0 * c["lower_outlet"].item() - 4.0 * c["lower_loss"].item(), rel=1e-5)
+    rates = law(torch.tensor([c["overflow_level"].item() + 2.0, 4.0, 6.0]).double())
+    _, down, out, over = law.flows(torch.tensor([c["overflow_level"].item() + 2.0, 4.0, 6.0]).double())
+    assert over.item() == pytest.approx(0.5, abs=1e-6)  # 2 V above the edge at 0.25/s
+    assert rates[1].item() == pytest.approx((down + c["overflow_share"] * over - out).item())
+    full = plant.vector_field(torch.tensor(0.0), torch.tensor([0.0, 12.0]).double(), *_still(), ThroughATube())
+    assert full[1].item() == pytest.approx(-0.02 * 12.0 - 0.25 * 2.0, abs=1e-6)
+
+
+def _still():
+    return torch.zeros(1).double(), torch.full((1,), 5.0).double()
+
+
+def test_the_sensor_ends_at_ten_volts():
+    plant = CascadedTanks(observe=("sensed_level", "level_error"))
+    seen = plant.observe(torch.tensor(0.0), torch.tensor([20.0, 10.5]).double(), torch.tensor([6.0]).double())
+    assert seen.tolist() == pytest.approx([2.5, -2.25])
+
+
+def test_a_perceptron_moves_water_and_makes_none_in_between():
+    closure = NeuralHydraulics(Hydraulics.true(), hidden=(3,), generator=torch.Generator().manual_seed(0))
+    features = torch.tensor([[15.0, 5.0, 3.0], [28.0, 9.0, 6.0]]).double()
+    torch.testing.assert_close(closure(features), closure.law(features), rtol=0, atol=0)
+    with torch.no_grad():
+        closure.correction.network[-1].bias.copy_(torch.tensor([0.4, 0.0]))
+    change = closure(features) - closure.law(features)
+    torch.testing.assert_close(change.sum(-1), torch.zeros(2).double())  # what leaves one tank reaches the other
+    assert (change[:, 1] > 0.0).all()
+
+
+def test_a_plan_under_uncertainty_lowers_the_cost_on_every_twin():
+    plant = CascadedTanks(horizon=512.0)
+    other = Hydraulics(1.05 * Hydraulics.true().coefficients)
+    found = planned_under_uncertainty(plant, [Hydraulics.true(), other], iterations=15)
+    assert found["J_a after, least twin [V^2]"] <= found["J_a after [V^2]"] <= found["J_a after, worst twin [V^2]"]
+    assert found["J_a after, worst twin [V^2]"] < 0.7 * found["J_a before [V^2]"]
+
+
+def synthetic(path, *, samples=420, noise=0.02):
+    """A record of tanks whose hydraulics nobody has told the recipe, as the benchmark's file has it."""
+    plant, generator, columns = CascadedTanks(), torch.Generator().manual_seed(5), {}
+    truth = Hydraulics(torch.tensor([0.055, 0.007, 0.09, 0.008, 24.0, 0.7]))
+    for name in ("Est", "Val"):
+        steps = torch.rand(1, samples // 25 + 1, 1, generator=generator, dtype=torch.float64)
+        voltage = (0.5 + 5.5 * steps).repeat_interleave(25, 1)[:, :samples]
+        with torch.no_grad():
+            start, inputs = torch.tensor([[18.0, 5.0]]).double(), torch.full_like(voltage, 5.0)
+            level = Rollout(plant, truth)(start, inputs, voltage).states[0, :-1, 1].clamp(max=10.0)
+        columns[f"u{name}"] = voltage[0, :, 0].numpy()
+        columns[f"y{name}"] = (level + noise * torch.randn(samples, generator=generator).double()).numpy()
+    names = ["uEst", "uVal", "yEst", "yVal"]
+    header = ",".join(f'"{name}"' for name in names) + ',"Ts",'
+    rows = np.stack([columns[name] for name in names], -1)
+    path.write_text(header + "\n" + "".join(",".join(f"{x:.6f}" for x in row) + ",,\n" for row in rows))
+    return columns
+
+
+def recipe():
+    spec = importlib.util.spec_from_file_location("recipe_cascaded_tanks", RECIPES / "cascaded_tanks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_the_recipe_identifies_a_synthetic_record_and_counts_its_looks(tmp_path, capsys):
+    made, options = recipe(), {"folds": 2, "priors": (1000.0,), "starts": 2, "iterations": 20}
+    columns = synthetic(tmp_path / "data.csv")
+    given = {"data": tmp_path / "data.csv", "log_dir": tmp_path / "results", **options}
+    made.main(made.Config(**given))
+    found = json.loads((tmp_path / "results" / "results.json").read_text())
+    assert "test" not in found["physics"] and found["looks"] == []
+    made.main(made.Config(**given, test=True, plan=2, draws=1))
+    found = json.loads((tmp_path / "results" / "results.json").read_text())
+    assert len(found["looks"]) == 1 and "looked at 1 times" in capsys.readouterr().out
+    # What is left of the physics, which is the right one, is the sensor's noise of 20 mV.
+    assert found["physics"]["test"]["rms"] < 0.03
+    # A fold knows half of a short record, with two or three overflows.
+    assert found["folds"]["physics"]["rms"] < 0.15
+    assert found["physics and perceptron"]["test"]["rms"] < 0.05 and set(found["plan"]) > {"J_a after [V^2]"}
+    pump = found["physics"]["weights"]["pump"]
+    assert pump["interval"][0] - 0.002 < 0.055 < pump["interval"][1] + 0.002
+    figures = {path.name for path in (tmp_path / "results").glob("*.png")}
+    assert figures == {f"{which}_{name}.png" for which in ("estimation", "test") for name in ("physics", "perceptron")}
+    assert len(columns["uEst"]) == 420
+
+
+def test_the_record_is_read_from_a_file_or_the_package(tmp_path, monkeypatch):
+    columns = synthetic(tmp_path / "data.csv", samples=30)
+    read = read_benchmark(tmp_path / "data.csv")
+    for part, name in zip(read, ("uEst", "yEst", "uVal", "yVal"), strict=True):
+        np.testing.assert_allclose(part, columns[name], atol=1e-6)
+    package = pytest.importorskip("nonlinear_benchmarks")
+    parts = [SimpleNamespace(u=columns[f"u{name}"], y=columns[f"y{name}"]) for name in ("Est", "Val")]
+    monkeypatch.setattr(package, "Cascaded_Tanks", lambda: parts)
+    np.testing.assert_array_equal(read_benchmark(None).test_level, columns["yVal"])
+
+    def refuse():
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(package, "Cascaded_Tanks", refuse)
+    with pytest.raises(ValueError, match="cannot load the record .no route to host.; give a file, --data FILE"):
+        read_benchmark(None)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (None, "cannot be read"),
+        ("uEst,uVal\n1,2\n", "needs yEst, yVal, too"),
+        ("uEst,uVal,yEst,yVal\n1,,2,3\n", "missing"),
+    ],
+)
+def test_a_file_that_is_no_record_is_refused(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "data.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_benchmark(tmp_path / "data.csv")
+
+
+@pytest.mark.parametrize("option", [{"starts": 0}, {"plan": -1}, {"priors": ()}, {"priors": (-1.0,)}, {"first": 0}])
+def test_options_out_of_range_are_refused(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        recipe().Config(**option)
+
+
+def test_every_part_of_a_record_is_held_out_once():
+    made = recipe()
+    record = made.sensor_record_of(np.linspace(1.0, 2.0, 401), np.linspace(3.0, 5.0, 401))
+    parts = folds(record, 4, 4.0, made.guess)
+    assert [len(part.held_out.actions) for part in parts] == [100] * 4
+    assert [len(part.training) for part in parts] == [1, 2, 2, 1]
+    assert parts[1].held_out.start == 400.0 and parts[1].held_out.guess[1] == record.readings[100, 0]
+    assert pooled([1.0, 3.0], [parts[0].held_out, parts[1].held_out]) == pytest.approx(math.sqrt(5.0))
+    with pytest.raises(ValueError, match="folds=5"):
+        folds(record, 5, 4.0, made.guess)

@@ -1,0 +1,184 @@
+"""Estimation from partial and noisy readings: against regression, backpropagation and known truths."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hidden_wall import Envelope, Room, room_records
+from linear_quadratic import LinearQuadratic
+from printed_commands import blocks
+from straight_line import Line, Slope, flown, line_segment, noise_of
+
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.identification.estimation import Estimation, EstimationConfig
+from rt_torchrl.identification.first_values import first_noise
+from rt_torchrl.identification.sensor_record import sensor_record, usual_initial_state
+from rt_torchrl.identification.sensors import Sensor, read, sensors_of
+from rt_torchrl.plants.measurement import Measurement
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+FAST = EstimationConfig(iterations=30)
+
+
+def test_derivatives_are_those_of_backpropagation():
+    """Of a nonlinear sensor with a bias, over records of two lengths with holes, against the adjoint's."""
+    plant, generator = LinearQuadratic(), torch.Generator().manual_seed(0)
+    product = Measurement(
+        symbol="p", name="product", unit="m^2/s", read=lambda plant, t, s, z: s[..., 0] * s[..., 1] + t + z[..., 0]
+    )
+    sensors = (*sensors_of(plant, ["position"]), Sensor(measurement=product, bias=True))
+    twin = DigitalTwin(plant, plant.make_closure(generator), engine="autograd")
+    records = [sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (12, 7))]
+    records[0].readings[3:5, 0] = math.nan
+    spread = torch.tensor([math.inf, 2.0]).double()
+    task = Estimation(twin, sensors, spread=spread)
+    likelihood = task.likelihood(records, torch.tensor([0.1, 0.3]).double())
+    unknowns = list(likelihood.unknowns.parameters())
+    with torch.no_grad():
+        for x in unknowns[1:]:
+            x.normal_(0.0, 0.1, generator=generator)
+
+    first, cost = likelihood.initial(), 0.0
+    for k, record in enumerate(records):
+        flown_again = twin.replay(first[k : k + 1], record.exogenous[None], record.actions[None], start=record.start)
+        t = record.start + plant.dt * torch.arange(len(record.readings)).double()
+        inputs = torch.cat([record.exogenous, record.exogenous[-1:]])
+        error = read(sensors, plant, t, flown_again.states[0], inputs) + likelihood.biases() - record.readings
+        cost = cost + 0.5 * ((error / likelihood.noise).nan_to_num() ** 2).sum()
+    cost = cost + 0.5 * (((first - likelihood.initial.measured) / spread) ** 2).sum()
+    gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, unknowns)])
+    found = likelihood.normal_equations()
+    # The same derivatives, forward instead of backward.
+    assert found.cost.item() == pytest.approx(cost.item(), rel=1e-12)
+    assert ((found.gradient - gradient).norm() / gradient.norm()).item() < 1e-9
+
+
+def test_a_line_with_holes_is_fitted_as_by_regression():
+    """Weights, starts, noise level and standard errors of two records of unequal length, against least squares."""
+    times, X, y, records = 0.1 * np.arange(60), np.zeros((100, 4)), np.zeros(100), []
+    sensors = sensors_of(Line(), ["position"])
+    for k, (n, wind) in enumerate(((60, 1.0), (40, -2.0))):
+        values = 2.0 + 0.5 * times[:n] + 0.3 * wind * times[:n] + 0.2 * noise_of(n, n)
+        record = sensor_record(Line(), sensors, line_segment(values, wind=wind))
+        record.readings[5:15] = math.nan
+        records.append(record)
+        rows = slice(0, 60) if k == 0 else slice(60, 100)
+        X[rows, k], X[rows, 2], X[rows, 3], y[rows] = 1.0, times[:n], wind * times[:n], values
+    kept = ~np.isin(np.arange(100), [*range(5, 15), *range(65, 75)])
+    solution, residual, *_ = np.linalg.lstsq(X[kept], y[kept], rcond=None)
+    level = math.sqrt(residual[0] / (80 - 4))
+    errors = level * np.sqrt(np.diag(np.linalg.inv(X[kept].T @ X[kept])))
+    closure = Slope()
+    found = Estimation(DigitalTwin(Line(), closure), sensors, config=FAST).run(records)
+    # The descent ends where J can fall by 1e-8 of it; the noise level rests within one per cent.
+    np.testing.assert_allclose(list(found.after.values()), solution[2:], atol=1e-3 * errors[2:].min())
+    np.testing.assert_allclose(found.initial[:, 0].numpy(), solution[:2], atol=1e-3 * errors[:2].min())
+    assert found.noise["position"] == pytest.approx(level, rel=0.01)
+    np.testing.assert_allclose(list(found.uncertainty.standard_errors().values()), errors[2:], rtol=0.01)
+    np.testing.assert_allclose(found.uncertainty.initial_errors()[:, 0].numpy(), errors[:2], rtol=0.01)
+
+
+def test_a_bias_is_told_from_the_state():
+    """Two sensors of one position, one of which is off by a constant: the difference of their means."""
+    plant, values = Line(), 1.0 + 0.05 * np.arange(50)
+    sensors = (*sensors_of(plant, ["position"]), Sensor(measurement=sensors_of(plant, ["position"])[0].measurement))
+    sensors = (sensors[0], Sensor(measurement=sensors[1].measurement, noise=0.1, bias=True))
+    record = sensor_record(plant, sensors, line_segment(values))
+    noise = torch.stack([0.1 * torch.from_numpy(noise_of(50, k)) for k in (0, 1)], -1)
+    readings = record.readings + noise + torch.tensor([0.0, 0.7])
+    found = Estimation(DigitalTwin(plant, Slope()), sensors).run([record._replace(readings=readings)])
+    expected = (readings[:, 1] - readings[:, 0]).mean().item()
+    assert found.likelihood.biases()[1].item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_room_is_identified_through_its_air_with_its_uncertainty():
+    """The hidden start of the wall is an unknown: 60, 90 and 4 come out, as a fit that guesses it does not find."""
+    plant, sensors, records = room_records()
+    start = torch.tensor([30.0, 150.0, 8.0])
+    closure = Envelope(start)
+    found = Estimation(DigitalTwin(plant, closure), sensors, config=FAST).run(records)
+    errors = found.uncertainty.standard_errors()
+    for name, true in zip(Envelope.names, Envelope.true_coefficients, strict=True):
+        assert abs(found.after[name] - true) < 3.0 * errors[name] < 0.1 * true
+    assert found.noise["air"] == pytest.approx(0.05, rel=0.15)  # 280 samples: ±4 % is one standard error
+    assert ((found.initial[:, 1] - 14.5).abs() < 3.5).all() and not found.uncertainty.warnings()
+    known = torch.zeros(2).double()
+    guessed = Envelope(start)
+    Estimation(DigitalTwin(plant, guessed), sensors, spread=known, config=FAST).run(records)
+    wrong = (guessed.coefficients - torch.tensor(Envelope.true_coefficients).double()).abs()
+    assert wrong[1] > 10.0 * errors["outdoors"]
+
+
+def test_the_errors_of_the_room_are_those_over_many_draws():
+    """Scatter of 12 fits over their standard errors: 36 numbers of unit mean square, correlated three at a time."""
+    z = []
+    for seed in range(12):
+        plant, sensors, records = room_records(seed, lengths=(150,))
+        closure = Envelope(Envelope.true().coefficients)
+        found = Estimation(DigitalTwin(plant, closure), sensors, config=FAST).run(records)
+        errors = found.uncertainty.standard_errors()
+        truths = zip(Envelope.names, Envelope.true_coefficients, strict=True)
+        z += [(found.after[name] - true) / errors[name] for name, true in truths]
+    assert 0.4 < np.mean(np.square(z)) < 2.2
+
+
+def test_what_one_sensor_cannot_tell_is_said():
+    """Of ẍ only two coefficients follow from x: the velocity may be any combination v + βx, scaled by any factor."""
+    plant, generator = LinearQuadratic(noise=0.5), torch.Generator().manual_seed(0)
+    sensors = sensors_of(plant, ["position"])
+    records = [sensor_record(plant, sensors, segment) for segment in flown(plant, generator, (50,))]
+    records = [r._replace(readings=r.readings + 0.01 * torch.randn(51, 1, generator=generator)) for r in records]
+    found = Estimation(DigitalTwin(plant, plant.make_closure(generator)), sensors, config=FAST).run(records)
+    # The force enters ẍ with a known factor, so that the scale is known and only β is free.
+    (message,) = (text for text in found.uncertainty.warnings() if "cannot tell" in text)
+    assert "1 combination(s)" in message and "fix 1 of them" in message
+    unknown = [name for name, error in found.uncertainty.standard_errors().items() if math.isinf(error)]
+    assert unknown == ["matrix[0,0]", "matrix[1,0]", "matrix[1,1]"]
+
+
+@pytest.mark.parametrize(
+    "kind, name",
+    [(FlappingWing, "error_x"), (FlappingWing, "height"), (WindTurbine, "rotor_speed")],
+)
+def test_states_and_measurements_of_a_plant_are_sensors(kind, name):
+    plant = kind()
+    state = usual_initial_state(plant)[None]
+    (found,) = read(sensors_of(plant, [name]), plant, torch.zeros(1).double(), state, torch.ones(1, 1).double())[0]
+    names = [signal.name for signal in plant.states]
+    expected = state[0, names.index(name)].item() if name in names else 5.0  # the way from the origin to the target
+    assert found.item() == pytest.approx(expected)
+
+
+def test_what_cannot_be_estimated_is_refused():
+    plant, sensors, records = room_records(lengths=(40,))
+    twin = DigitalTwin(plant, Envelope.true())
+    for wrong, message in (
+        (lambda: sensors_of(plant, ["roof"]), r"sensors=\('roof',\) .* choose among air, wall"),
+        (lambda: sensors_of(plant, []), "nothing cannot be measured"),
+        (lambda: Sensor(measurement=sensors[0].measurement, noise=0.0), "noise=0.0 of sensor 'air'"),
+        (lambda: Estimation(twin, sensors, spread=-torch.ones(2).double()), r"spread=\[-1.0, -1.0\]"),
+        (lambda: first_noise(sensors, []), r"records=\[\]"),
+        (lambda: first_noise(sensors, [records[0].masked(0, 0)]), "sensor 'air' has no sample"),
+        (lambda: EstimationConfig(prior=-1.0), "prior=-1.0"),
+        (lambda: EstimationConfig(rounds=0), "rounds=0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            wrong()
+
+
+def test_the_usual_initial_state_is_the_mean_of_draws():
+    found = usual_initial_state(Room())
+    assert (found - 20.0).abs().max() < 4 * 3.0 / math.sqrt(100)
+
+
+def test_the_example_of_the_documentation_runs():
+    (code,) = blocks("partial_measurements.md", "python")
+    names = {}
+    exec(code, names)
+    found, plant = names["found"], names["plant"]
+    assert found.noise["sensed_level"] < 1e-5  # nothing has disturbed the record
+    true = plant.closure.named_coefficients()
+    for name in ("lower_outlet", "lower_loss", "upper_outlet"):
+        assert found.after[name] == pytest.approx(true[name].item(), rel=1e-3)

@@ -1,0 +1,144 @@
+"""FMUs: a twin taken away as one is the real system of a plant again, and a policy gives its own actions."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from c_build import needs_compiler
+
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export.fmu import export_policy_fmu, export_twin_fmu
+from rt_torchrl.systems.fmu_environment import FMUEnvironment, FMUError
+from rt_torchrl.systems.reading import Reading
+from rt_torchrl.systems.real_system import RealSystem
+from rt_torchrl.trajectories.rollout import Rollout
+
+fmpy = pytest.importorskip("fmpy")
+PLANT = WindTurbine(horizon=20.0)
+
+
+@pytest.fixture(scope="module")
+def turbine(tmp_path_factory):
+    """The true turbine as an FMU."""
+    path = tmp_path_factory.mktemp("fmu") / "turbine.fmu"
+    export_twin_fmu(PLANT.closure, path, PLANT)
+    return path
+
+
+def environment(path, **options):
+    given = {
+        "actions": [f"command.{s.name}" for s in PLANT.actions],
+        "outputs": [f"state.{s.name}" for s in PLANT.states],
+        "exogenous": ["exogenous.wind_speed"],
+    }
+    return FMUEnvironment(path, PLANT, **given | options)
+
+
+@needs_compiler
+def test_a_turbine_in_an_fmu_is_the_plants_own(turbine):
+    """As the real system of an episode under random torque and pitch, against the plant's trajectory."""
+    names = [f"state.{s.name}" for s in PLANT.states]
+
+    def start(generator):
+        return dict(zip(names, PLANT.draw_initial_state(1, generator)[0].tolist(), strict=True))
+
+    real = RealSystem(
+        environment(turbine, start=start),
+        PLANT,
+        state=Reading(keys=("outputs",)),
+        exogenous=Reading(keys=("exogenous",)),
+        closure=PLANT.closure,
+    )
+    generator = torch.Generator().manual_seed(3)
+    commands = torch.rand(PLANT.n_steps, 2, generator=generator).double() * torch.tensor([4e4, 10.0])
+    entries = real.reset()
+    states, inputs = [entries["state"]], []
+    for command in commands:
+        inputs.append(entries["exogenous"])
+        entries = real.step(entries.set("action", command[None]))["next"]
+        states.append(entries["state"])
+        entries = entries.exclude("reward")
+    with torch.no_grad():
+        expected = Rollout(PLANT, PLANT.closure)(states[0], torch.stack(inputs, 1), commands[None]).states[0]
+    # The same arithmetic in C: rounding over forty steps.
+    np.testing.assert_allclose(torch.cat(states).numpy(), expected.numpy(), rtol=1e-9, atol=1e-9)
+    real.close()
+
+
+@needs_compiler
+def test_a_policy_in_an_fmu_gives_its_own_actions(tmp_path):
+    policy = PLANT.make_policy(torch.Generator().manual_seed(0))
+    export_policy_fmu(policy, tmp_path / "policy.fmu", PLANT)
+    observations = torch.randn(20, 2, generator=torch.Generator().manual_seed(1)).double()
+    names = [f"observation.{signal.name}" for signal in PLANT.observations]
+    rows = np.array(
+        [(0.5 * k, *row) for k, row in enumerate(observations.tolist())],
+        dtype=[("time", float), *((name, float) for name in names)],
+    )
+    found = fmpy.simulate_fmu(
+        str(tmp_path / "policy.fmu"),
+        stop_time=9.5,
+        output_interval=0.5,
+        input=rows,
+        output=[f"action.{signal.name}" for signal in PLANT.actions],
+        validate=True,
+    )
+    with torch.no_grad():
+        expected = policy(observations).numpy()
+    actions = np.array([list(row)[1:] for row in found.tolist()])
+    # An output of an FMU is read after the step that its inputs were set for.
+    np.testing.assert_allclose(actions[1:], expected[:-1], rtol=1e-9)
+
+
+SLAVE = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+class Barrel(Fmi2Slave):
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.u, self.v, self.h = 0.0, 0.0, 1.0
+        for name in "uv":
+            self.register_variable(Real(name, causality=Fmi2Causality.input))
+        self.register_variable(Real("h", causality=Fmi2Causality.output))
+
+    def do_step(self, t, dt):
+        if self.u > 40000.0:
+            raise ValueError("the barrel bursts")
+        self.h += dt * (1e-4 * self.u - 0.1 * self.h)
+        return True
+"""
+
+
+def test_an_fmu_of_somebody_else_is_stepped_and_its_errors_are_named(tmp_path):
+    pytest.importorskip("pythonfmu")
+    from pythonfmu.builder import FmuBuilder
+
+    (tmp_path / "barrel.py").write_text(SLAVE)
+    path = Path(FmuBuilder.build_FMU(tmp_path / "barrel.py", dest=tmp_path))
+    made = environment(path, actions=["u", "v"], outputs=["h"], exogenous=[])
+    entries, level = made.reset(), 1.0
+    assert entries["outputs"].tolist() == [1.0]
+    for _ in range(5):
+        entries = made.step(entries.set("action", torch.tensor([1000.0, 0.0]).double()))["next"]
+        level += 0.5 * (0.1 - 0.1 * level)
+        assert entries["outputs"].item() == pytest.approx(level, abs=1e-12)
+        entries = entries.exclude("reward")
+    with pytest.raises(FMUError, match=r"the FMU Barrel.fmu refuses to doStep at t = 2.5 s"):
+        made.step(entries.set("action", torch.tensor([41000.0, 0.0]).double()))
+    assert made.reset()["outputs"].tolist() == [1.0]
+    made.close()
+
+
+@needs_compiler
+def test_what_does_not_fit_an_fmu_is_refused(turbine, tmp_path):
+    (tmp_path / "no.fmu").write_text("nothing")
+    for wrong, message in (
+        (lambda: environment(tmp_path / "no.fmu"), "is no FMU that can be read"),
+        (lambda: environment(turbine, outputs=["omega"]), r"outputs \['omega'\] do not exist in turbine.fmu"),
+        (lambda: environment(turbine, actions=["command.blade_pitch"]), "must name 2 variables"),
+        (lambda: environment(turbine, exogenous=["a", "b"]), "must name 1 variables, or none"),
+        (lambda: export_twin_fmu(PLANT.closure, tmp_path / "twin.zip", PLANT), "must end in .fmu"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            wrong()

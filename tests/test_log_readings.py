@@ -1,0 +1,134 @@
+"""Logs of which some states have no sensor and some samples are missing."""
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hidden_wall import Room, room_records
+
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
+from rt_torchrl.identification.resampling import resample
+from rt_torchrl.identification.sensor_log import SensorLog, checked
+
+pd = pytest.importorskip("pandas")
+TESTS = Path(__file__).parent
+
+
+def log_of(plant, states, rows=40):
+    """A log with constants for the drive and a ramp for each of these states."""
+    driven = {signal.name: np.full(rows, max(signal.low, 1.0)) for signal in (*plant.actions, *plant.inputs)}
+    ramps = {name: np.linspace(1.0, 1.2, rows) for name in states}
+    return SensorLog(times=plant.dt * np.arange(rows), columns=driven | ramps)
+
+
+@pytest.mark.parametrize(
+    "kind, states, hidden, unknown",
+    [
+        (WindTurbine, ["rotor_speed"], [], ["rotor_speed"]),
+        (FlappingWing, ["forward_position", "height"], ["forward_speed", "climb_speed"], None),
+        (CryogenicTank, ["pressure"], ["wall_temperature", "liquid_volume"], None),
+    ],
+)
+def test_hidden_states_are_those_that_the_plant_cannot_complete(kind, states, hidden, unknown):
+    plant = kind()
+    log = log_of(plant, states)
+    assert hidden_states(plant, log) == hidden
+    free = [state.name for state, s in zip(plant.states, initial_spread(plant, log), strict=True) if s > 0.0]
+    assert sorted(free) == sorted(unknown or [*states, *hidden])
+
+
+def test_the_drones_last_angle_is_that_of_the_record():
+    plant = FlappingWing(stroke_plane_rate=3000.0)
+    log = log_of(plant, ["forward_position", "height"])
+    assert hidden_states(plant, log) == ["forward_speed", "climb_speed"] and initial_spread(plant, log)[4] == 0.0
+
+
+def test_samples_between_rows_that_are_too_far_apart_are_missing():
+    plant = Room()
+    log = log_of(plant, ["air"], rows=30)
+    times = log.times + np.where(np.arange(30) % 2 == 1, 60.0, 0.0)
+    air = 20.0 + 1e-3 * times
+    air[10:14] = np.nan  # rows 9 and 14: 1 440 s and more
+    log = checked(SensorLog(times=times, columns=log.columns | {"air": air}), plant, missing=True)
+    whole = filled(log, plant, {"wall": 11.0})
+    parts = resample(whole, plant)
+    record = logged_readings(log, plant, sensors_in(plant, log), parts.segments[0], parts.gap)
+    expected = 20.0 + 1e-3 * plant.dt * np.arange(len(record.readings))
+    seen = record.seen[:, 0].numpy()
+    assert np.flatnonzero(~seen).tolist() == [10, 11, 12, 13]
+    np.testing.assert_allclose(record.readings[:, 0].numpy()[seen], expected[seen], rtol=1e-12)
+    assert record.guess.tolist() == [20.0, 11.0] and len(record.actions) == 29
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda log, plant: filled(log, plant, {"air": 3.0}), "guess air=3.0: .* wall"),
+        (lambda log, plant: filled(log, plant, {"wall": math.inf}), "guess wall=inf"),
+        (lambda log, plant: sensors_in(plant, log, ["wall"]), r"sensors=\('wall',\): the log has no column wall"),
+        (lambda log, plant: sensors_in(plant, log.without(["air"])), "nothing cannot be measured"),
+    ],
+)
+def test_what_does_not_fit_a_log_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        change(log_of(Room(), ["air"]), Room())
+
+
+def test_missing_values_of_the_drive_are_refused():
+    log = log_of(Room(), ["air"])
+    log.columns["heater"][3] = np.nan
+    with pytest.raises(ValueError, match="heater is nan W in row 3"):
+        checked(log, Room(), missing=True)
+
+
+@pytest.fixture
+def room_log(tmp_path):
+    """The first record of the room as a file, and the class of the room beside it."""
+    _, _, (record, _) = room_records()
+    rows = {"time": 300.0 * np.arange(200), "air": record.readings[:200, 0]}
+    rows |= {"heater": record.actions[:, 0], "outside": record.exogenous[:, 0]}
+    pd.DataFrame(rows).to_csv(tmp_path / "log.csv", index=False)
+    text = (TESTS / "hidden_wall.py").read_text()
+    made = "    def make_closure(self, generator):\n        return Envelope(torch.tensor([30.0, 150.0, 8.0]))\n\n"
+    text = text.replace(
+        "    observe = running_cost = draw_exogenous = make_closure = None", made + "    observe = None"
+    )
+    held = "    def running_cost(self): ...\n    def draw_exogenous(self): ...\n    def observe(self): ...\n"
+    (tmp_path / "own_room.py").write_text(text.replace("    observe = None", held))
+    return tmp_path
+
+
+def identify_recipe():
+    spec = importlib.util.spec_from_file_location("recipe_identify", TESTS.parent / "recipes" / "identify.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_room_is_identified_from_a_file(room_log, capsys):
+    identify = identify_recipe()
+    given = {"log": room_log / "log.csv", "plant": f"{room_log}/own_room.py:Room", "log_dir": room_log / "results"}
+    with pytest.raises(ValueError, match="--missing keeps the row"):
+        identify.main(identify.Config(**given))
+    identify.main(identify.Config(**given, missing=True, guess=("wall=20",)))
+    metrics = json.loads((room_log / "results" / "metrics.json").read_text())
+    weights = metrics["weights"]
+    for name, true in (("to_wall", 60.0), ("outdoors", 90.0), ("capacity", 4.0)):
+        entry = weights[name]
+        assert abs(entry["after"] - true) < 4.0 * entry["standard_error"] < 0.2 * true
+        assert entry["interval"][0] < entry["after"] < entry["interval"][1]
+    assert metrics["held_out"]["rms"]["air"]["after"] == pytest.approx(0.05, rel=0.4)  # 50 samples
+    assert 0.0 < metrics["initial_states"][0]["wall"][1] < 1.0
+    assert {path.name for path in (room_log / "results/figures").iterdir()} == {"twin_and_log.png", "correlations.png"}
+    shown = capsys.readouterr().out
+    assert "noise of the sensors: air 0.0" in shown and "to_wall" in shown
+    torch.load(room_log / "results" / "weights.pt", weights_only=True)
+    with pytest.raises(ValueError, match="guess='wall' is not understood"):
+        identify.main(identify.Config(**given, missing=True, guess=("wall",)))

@@ -1,0 +1,109 @@
+"""Step 4 from some sensors: the closure is that of the whole state, and plans cost the same."""
+
+import pytest
+import torch
+from linear_quadratic import LinearQuadratic
+
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.identification.sensor_record import sensor_record
+from rt_torchrl.identification.sensors import sensors_of
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.sensor_assimilation import FirstStates, SensorAssimilation
+
+NONE = HypothesesConfig()
+
+
+def config(*sensors, **options):
+    given = {"method": "levenberg_marquardt", "inputs": "record", "initial": "estimated", "iterations": 30}
+    return AssimilationConfig(sensors=sensors, **given | options)
+
+
+def episodes(plant, count, seed=0):
+    """Real episodes under random commands, each held for some intervals."""
+    generator, found = torch.Generator().manual_seed(seed), []
+    for _ in range(count):
+        start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+        n, low = plant.n_steps, torch.tensor([a.low for a in plant.actions]).double()
+        high = torch.tensor([a.high for a in plant.actions]).double()
+        held = torch.rand(1, n // 20 + 1, len(low), generator=generator, dtype=torch.float64)
+        share = 0.3 + 0.4 * held.repeat_interleave(20, 1)[:, :n]
+        with torch.no_grad():
+            found.append(Rollout(plant, plant.closure)(start, inputs, low + share * (high - low)).each()[0])
+    return found
+
+
+def blinded(plant, record, names):
+    """The record with NaN in every state that no sensor reads."""
+    hidden = [k for k, state in enumerate(plant.states) if state.name not in names]
+    states = record.states.clone()
+    states[:, hidden] = torch.nan
+    return record._replace(states=states)
+
+
+@pytest.mark.slow
+def test_the_tank_is_identified_from_its_pressure_alone():
+    plant = CryogenicTank(horizon=21600.0)
+    records = [blinded(plant, record, ["pressure"]) for record in episodes(plant, 2)]
+    closure = plant.make_closure(torch.Generator())
+    step = make_assimilation(DigitalTwin(plant, closure), config("pressure"), NONE)
+    found = step.update(records, [], 1, torch.Generator())
+    # From [1, 1, 10]: without noise only the wall's start, which follows p to 1e-5 K or so, is uncertain.
+    true = plant.closure.coefficients
+    assert ((closure.coefficients / true - 1.0).abs() < 1e-4).all()
+    assert found.best < 1e-3 * found.start
+    report = step.report()
+    assert report["noise/pressure"] < 100.0 and set(report) > {"standard_error/U_s", "standard_error/K_JT"}
+
+
+def test_first_states_follow_from_what_is_read():
+    """The tank's wall is as cold as the fluid, whose temperature follows from the pressure; its fill is always 70 %."""
+    plant = CryogenicTank(horizon=3600.0)
+    (record,) = episodes(plant, 1, seed=3)
+    sensors = sensors_of(plant, ["pressure"])
+    first = FirstStates(plant, sensors)
+    guess = first.guess(sensor_record(plant, sensors, blinded(plant, record, ["pressure"])))
+    # The saturation curve is straight to some mK over ±50 kPa.
+    assert guess[0].item() == pytest.approx(record.states[0, 0].item(), abs=0.02)
+    assert guess[1:].tolist() == pytest.approx(record.states[0, 1:].tolist())
+    assert first.spread[1] == 0.0 and 0.0 < first.spread[0] < 0.02 and first.spread[2] == torch.inf
+
+
+def test_a_turbine_needs_its_rotor_speed_alone():
+    plant = WindTurbine(horizon=60.0)
+    spread = FirstStates(plant, sensors_of(plant, ["rotor_speed"])).spread
+    # The wind's filter and the integral begin with the same value; the torque is a kinked function of the speed.
+    assert spread[[1, 2, 3, 5]].tolist() == [0.0] * 4
+
+
+def test_nothing_is_fitted_in_no_iteration_and_a_start_from_nonsense_begins_anew():
+    plant = LinearQuadratic()
+    records = episodes(plant, 1)
+    closure = plant.make_closure(torch.Generator().manual_seed(0))
+    before = closure.matrix.detach().clone()
+    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity", iterations=0))
+    step.update(records, [], 1, torch.Generator())
+    assert torch.equal(closure.matrix, before) and step.report() == {}
+    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity"))
+    with torch.no_grad():
+        closure.matrix.fill_(1e9)
+    found = step.update(records, [], 1, torch.Generator())
+    assert found.start == float("inf")
+    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-6)
+
+
+def test_what_does_not_go_with_sensors_is_refused():
+    for options in ({"initial": "measured"}, {"segment": 5}):
+        with pytest.raises(ValueError, match=r"sensors=\('position',\) .* need initial='estimated' and segment=0"):
+            config("position", **options)
+    plant = WindTurbine(horizon=60.0)
+    closure = plant.make_closure(torch.Generator())
+    twin = make_twin(plant, closure, HypothesesConfig(which="automatic"))
+    with pytest.raises(ValueError, match="do not go with hypotheses"):
+        make_assimilation(twin, config("rotor_speed"), NONE)
+    with pytest.raises(ValueError, match="roof cannot be measured"):
+        make_assimilation(DigitalTwin(plant, closure), config("roof"), NONE)

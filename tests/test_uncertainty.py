@@ -1,0 +1,176 @@
+"""Regions, profiles, design of manoeuvres and bands of curves, against closed forms of regression."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hidden_wall import Envelope, room_records
+from straight_line import Line, Slope, line_segment, noise_of
+from torch import nn
+
+from rt_torchrl.figures import uncertainty as charts
+from rt_torchrl.identification.curve import band
+from rt_torchrl.identification.design import next_manoeuvres, weight_information
+from rt_torchrl.identification.estimation import Estimation, EstimationConfig
+from rt_torchrl.identification.profile import profile
+from rt_torchrl.identification.sensor_record import sensor_record
+from rt_torchrl.identification.sensors import Sensor, sensors_of
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+TIMES = 0.1 * np.arange(81)
+NOISE = 0.2
+
+
+def position(noise=NOISE):
+    return (Sensor(measurement=sensors_of(Line(), ["position"])[0].measurement, noise=noise),)
+
+
+def line_estimate(winds=(1.0, -2.0), *, smooth=False, config=None):
+    sensors = position()
+    records = [
+        sensor_record(
+            Line(),
+            sensors,
+            line_segment((0.5 + 0.3 * z) * TIMES + NOISE * noise_of(81, k, smooth=smooth), wind=z),
+        )
+        for k, z in enumerate(winds)
+    ]
+    closure = Slope()
+    return Estimation(DigitalTwin(Line(), closure), sensors, config=config).run(records)
+
+
+def exact_covariance(winds=(1.0, -2.0)):
+    """Of the two weights, by (XᵀX)⁻¹σ² with a start for each record."""
+    X = np.zeros((81 * len(winds), 2 + len(winds)))
+    for k, z in enumerate(winds):
+        rows = slice(81 * k, 81 * (k + 1))
+        X[rows, 0], X[rows, 1], X[rows, 2 + k] = TIMES, z * TIMES, 1.0
+    return NOISE**2 * np.linalg.inv(X.T @ X)[:2, :2]
+
+
+def test_errors_correlations_and_ellipses_are_those_of_regression():
+    found, C = line_estimate().uncertainty, exact_covariance()
+    np.testing.assert_allclose(found.weights_covariance.numpy(), C, rtol=1e-6)
+    assert found.correlations()[0, 1].item() == pytest.approx(C[0, 1] / math.sqrt(C[0, 0] * C[1, 1]))
+    boundary = found.ellipse("w[0]", "w[1]", level=0.9).numpy() - found.values.numpy()
+    mahalanobis = np.einsum("pi,ij,pj->p", boundary, np.linalg.inv(C), boundary)
+    np.testing.assert_allclose(mahalanobis, 4.605, rtol=1e-3)  # the 90 % quantile of χ² with two degrees of freedom
+    low, high = found.intervals(0.95)["w[0]"]
+    assert (high - low) / 2.0 == pytest.approx(1.959964 * math.sqrt(C[0, 0]))
+
+
+def test_robust_errors_see_that_neighbours_are_alike():
+    """Means of neighbours have half the variance of white noise, but sums of them the same: 81 samples, 10 draws."""
+    config = EstimationConfig(errors="robust")
+    robust = line_estimate(smooth=True, config=config).uncertainty.weights_covariance[0, 0].sqrt().item()
+    assert robust == pytest.approx(math.sqrt(exact_covariance()[0, 0]), rel=0.5)
+
+
+def test_the_profile_of_a_linear_weight_is_its_parabola():
+    found = line_estimate()
+    error = found.uncertainty.standard_errors()["w[0]"]
+    before = found.likelihood.twin.closure.w.detach().clone()
+    shown = profile(found.likelihood, 0, error)
+    # The estimate is within 1e-5 standard errors or so of the minimum, and the profile goes out to two of them.
+    np.testing.assert_allclose(shown.rise.numpy(), 0.5 * ((shown.values - before[0]) / error).numpy() ** 2, atol=1e-4)
+    assert shown.interval == pytest.approx(found.uncertainty.intervals()["w[0]"], rel=1e-4)
+    assert torch.equal(found.likelihood.twin.closure.w, before)
+
+
+def test_the_profile_of_an_unknown_weight_is_open():
+    found = line_estimate(winds=(0.0,))
+    assert found.uncertainty.warnings() == ["the data say nothing of w[1]; it keeps its first value"]
+    shown = profile(found.likelihood, 1, math.inf, reach=3)
+    assert shown.interval == (-math.inf, math.inf) and shown.rise.abs().max() < 1e-9
+
+
+def test_the_next_manoeuvre_is_the_one_that_tells_most():
+    """Of a slope that shows only in wind, a strong wind tells most; then calm air tells the other slope apart."""
+    task = Estimation(DigitalTwin(Line(), Slope()), position())
+    manoeuvres = {f"wind {z}": line_segment(0.0 * TIMES, wind=z) for z in (0.0, 0.5, 3.0)}
+    known = [sensor_record(Line(), position(), line_segment(0.0 * TIMES, wind=0.1))]
+    noise = torch.tensor([NOISE]).double()
+    chosen = next_manoeuvres(task, manoeuvres, noise, count=2, known=known)
+    gains = {}
+    for name, z in (("wind 0.0", 0.0), ("wind 0.5", 0.5), ("wind 3.0", 3.0)):
+        one = Estimation(DigitalTwin(Line(), Slope()), position())
+        records = [*known, sensor_record(Line(), position(), manoeuvres[name])]
+        gains[name] = torch.linalg.det(weight_information(one.likelihood(records, noise))).item()
+        assert gains[name] == pytest.approx(1.0 / np.linalg.det(exact_covariance((0.1, z))), rel=1e-6)
+    assert chosen[0].name == max(gains, key=gains.get) == "wind 3.0" and chosen[0].gain > chosen[1].gain > 0.0
+    expected = np.sqrt(np.diag(exact_covariance((0.1, 3.0))))
+    np.testing.assert_allclose(chosen[0].errors.numpy(), expected, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"manoeuvres=\[\], count=1"):
+        next_manoeuvres(task, {}, noise)
+
+
+def test_the_band_of_a_line_is_that_of_regression():
+    found = line_estimate()
+    x = torch.linspace(-3.0, 3.0, 7).double()
+    drawn = band(found.uncertainty, x, x[:, None])
+    features = np.stack([np.ones(7), x.numpy()], -1)
+    deviation = np.sqrt(np.einsum("pi,ij,pj->p", features, exact_covariance(), features))
+    np.testing.assert_allclose(0.5 * (drawn.high - drawn.low).numpy(), 1.959964 * deviation, rtol=1e-5)
+    assert drawn.covers(drawn.middle) == 1.0 and drawn.covers(drawn.high + 1.0) == 0.0
+    figure = charts.curve(drawn, xlabel="wind", ylabel="slope", data=np.array([1.0, -2.0]), true=drawn.middle.numpy())
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["95 % interval", "twin", "true", "data"]
+
+
+class Curve(nn.Module):
+    """ẋ = g(z), a perceptron."""
+
+    def __init__(self, seed):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.net = BoundedPerceptron([(-3.0, 3.0), (-1.0, 1.0)], [3.0], hidden=(6,), generator=generator)
+
+    def forward(self, features):
+        return self.net(torch.cat([features, torch.zeros_like(features)], -1))
+
+
+def curve_estimate(seed):
+    """A perceptron that learns ẋ = sin z from records in constant winds between −2 and 2."""
+    generator, sensors, records = torch.Generator().manual_seed(seed), position(0.02), []
+    for z in torch.linspace(-2.0, 2.0, 9).tolist():
+        values = math.sin(z) * torch.from_numpy(TIMES[:21]) + 0.02 * torch.randn(21, generator=generator).double()
+        records.append(sensor_record(Line(), sensors, line_segment(values.numpy(), wind=z)))
+    twin = DigitalTwin(Line(), Curve(seed))
+    return Estimation(twin, sensors, config=EstimationConfig(iterations=40, prior=None)).run(records)
+
+
+@pytest.mark.slow
+def test_the_band_of_a_perceptron_widens_where_no_data_was():
+    found = curve_estimate(0)
+    x = torch.linspace(-3.0, 3.0, 61).double()
+    drawn = band(found.uncertainty, x, x[:, None])
+    width, inside = drawn.high - drawn.low, x.abs() <= 2.0
+    assert width[~inside].max() > 3.0 * width[inside].max()
+    # One draw of the noise: the nightly check counts many.
+    assert band(found.uncertainty, x[inside], x[inside][:, None]).covers(x[inside].sin()) > 0.7
+    assert 1e-6 < found.stiffness < 1e8 and found.stiffness != 1.0
+
+
+def test_figures_of_regions_show_every_pair():
+    plant, sensors, records = room_records(lengths=(150,))
+    closure = Envelope(Envelope.true().coefficients)
+    found = Estimation(DigitalTwin(plant, closure), sensors).run(records).uncertainty
+    shown = charts.correlations(found).axes[0]
+    assert [label.get_text() for label in shown.get_xticklabels()] == list(Envelope.names)
+    figure = charts.ellipses(found)
+    drawn = [ax for ax in figure.axes if ax.lines]
+    assert len(drawn) == 3 and drawn[0].lines[1].get_xdata()[0] == pytest.approx(found.values[0].item())
+
+
+def test_what_makes_no_region_is_refused():
+    found = line_estimate()
+    for wrong, message in (
+        (lambda: found.uncertainty.ellipse("w[0]", "x"), r"ellipse of \['x'\]"),
+        (lambda: found.uncertainty.intervals(1.0), "level=1.0"),
+        (lambda: profile(found.likelihood, 2, 0.1), "place=2 of the profile"),
+        (lambda: profile(found.likelihood, 0, 0.1, step=0.0), "step=0.0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            wrong()
