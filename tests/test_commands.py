@@ -17,13 +17,14 @@ from rt_torchrl.runs.user_code import module_of
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 CONFIGS = {name: module_of(ROOT / "recipes" / f"{name}.py").Config for name in RECIPES}
 OF_A_RECIPE = [command for command in commands() if "recipes/" in command]
+BUILD = "uv run --extra docs sphinx-build -W --keep-going docs docs/_build"
 
 
 def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
     if name == "unknown":
         return ["flapping_wing", *arguments]
-    if name in ("export", "real_time"):
+    if name in ("compare", "export", "real_time"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments
@@ -84,8 +85,8 @@ def test_an_option_that_does_not_exist_is_found():
 
 
 def test_every_choice_of_a_policy_is_taken():
-    """The README lists them behind the first one: bias, scheduled or mlp."""
-    assert {"bias", "scheduled", "mlp"} <= set(spans("README.md"))
+    """The page of the options lists them behind the first one: bias, scheduled or mlp."""
+    assert {"bias", "scheduled", "mlp"} <= set(spans("options.md"))
     for name in ("bias", "scheduled", "mlp"):
         assert refusal("wind_turbine", ["--policy", name]) is None
 
@@ -93,8 +94,13 @@ def test_every_choice_of_a_policy_is_taken():
 def test_checks_that_are_printed_are_what_ci_runs():
     """The tests do not run themselves, nor the type checker over everything."""
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert "uv run mypy" in script and any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
+    assert {"uv run mypy", BUILD} <= set(script)
+    assert any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
     rest = [command for command in commands() if command not in OF_A_RECIPE]
     known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow", "uv run pytest -m nightly"}
-    assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs"}
+    assert set(rest) - known == {
+        "uv run pre-commit install",
+        "uv run tensorboard --logdir runs",
+        BUILD,
+    }
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5

@@ -22,6 +22,7 @@ HOMES = {
 """The module that each public name comes from."""
 ROOMS_OF = {
     "benchmark.py": {"trajectories"},
+    "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
     "limit.py": {"evaluation", "optimal_control", "runs", "study"},
@@ -38,7 +39,7 @@ def sources():
     """The Python that people read first: every recipe, and every code block of the README and the tutorial."""
     for path in sorted((ROOT / "recipes").glob("*.py")):
         yield path.name, path.read_text(encoding="utf-8")
-    for path in (ROOT / "README.md", ROOT / "recipes" / "own_plant.md"):
+    for path in (ROOT / "README.md", ROOT / "docs" / "own_plant.md"):
         blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
         assert blocks, path
         yield path.name, "\n".join(blocks)

@@ -1,0 +1,80 @@
+"""The documentation: every Python block runs, every public name has an entry, and the site builds without warnings."""
+
+import ast
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from printed_commands import ROOT, TEXTS, blocks
+from test_export_recipe import leave_run
+
+from rt_torchrl.atomic_file import write_json
+
+RUN_ELSEWHERE = {
+    "README.md": "test_readme.py",
+    "own_plant.md": "test_readme.py",
+    "learner.md": "test_protocols.py",
+    "planner.md": "test_protocols.py",
+    "referee.md": "test_protocols.py",
+    "optimal_control.md": "test_limit_recipe.py",
+}
+RUN_HERE = ["finished_run.md"]
+
+
+def test_every_page_with_code_is_run():
+    """A page with a new block needs a test that runs it; that of another file names the page."""
+    with_code = [page for page in TEXTS if blocks(page, "python")]
+    assert sorted(with_code) == sorted([*RUN_ELSEWHERE, *RUN_HERE])
+    for page, file in RUN_ELSEWHERE.items():
+        assert page.split(".")[0] in (ROOT / "tests" / file).read_text(encoding="utf-8")
+
+
+def leave_finished_run(folder):
+    """A run of the turbine with random weights and two episodes, as a training leaves it."""
+    leave_run(folder, "wind_turbine", policy="bias", horizon=300.0)
+    episodes = [
+        {"episode": k, "live": "model_based", "event": "keep", "real_cost": 0.1 - 0.01 * k, "J_p": 2.0, "seconds": {}}
+        for k in range(2)
+    ]
+    write_json(folder / "metrics.json", {"episodes": episodes, "summary": {"live": "model_based"}})
+    return folder
+
+
+def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
+    leave_finished_run(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(blocks("finished_run.md", "python"))
+    exec(compile(code.replace("runs/wind_turbine/TIME-seed-0", "run"), "docs/finished_run.md", "exec"), {})
+    shown = capsys.readouterr().out
+    assert "torch.Size([601, 6]) torch.Size([600, 2])" in shown and "JonkmanController 0.0" in shown
+    assert (tmp_path / "states.png").exists() and (tmp_path / "learning.png").exists()
+
+
+def test_the_what_if_of_the_readme_is_that_of_the_page():
+    (shown,) = blocks("README.md", "py")
+    page = " ".join(blocks("finished_run.md", "python"))
+    for call in re.findall(r"run\.\w+\(", shown):
+        assert call in page
+
+
+def test_every_public_name_has_an_entry():
+    stub = ast.parse((ROOT / "rt_torchrl" / "__init__.pyi").read_text(encoding="utf-8"))
+    (listed,) = (ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
+    assert sorted(re.findall(r"^\.\. auto\w+:: rt_torchrl\.(\w+)$", pages, re.MULTILINE)) == sorted(listed)
+
+
+def test_the_front_page_is_short():
+    assert len(TEXTS["README.md"].splitlines()) <= 200
+
+
+@pytest.mark.nightly  # .ci/run builds the site in every run; this is for those who run no .ci/run
+@pytest.mark.skipif(importlib.util.find_spec("sphinx") is None, reason="the site needs the extra docs")
+def test_the_site_builds_without_warnings(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert (tmp_path / "api" / "runs.html").exists() and not Path(tmp_path / "_build").exists()
