@@ -52,6 +52,7 @@ def absolute_values(app, what, name, obj, options, lines):
 
 
 def setup(app):
+    """Sphinx calls this when it has read the settings above."""
     app.connect("autodoc-process-docstring", absolute_values)
     # Patterns in the table of contents name pages that need not be there.
     place = logging.getLogger("sphinx.sphinx.directives.other")

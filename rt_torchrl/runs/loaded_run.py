@@ -23,9 +23,8 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # only their types: who reads weights needs neither
-
     import pandas
+    from matplotlib.figure import Figure  # only their types: who reads weights needs neither
 
 
 @dataclass(frozen=True, kw_only=True)

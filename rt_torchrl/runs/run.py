@@ -3,7 +3,7 @@
 import copy
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,13 +22,16 @@ from rt_torchrl.interruption import Interruption, safe_point
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, reference, results
+from rt_torchrl.runs.callbacks import Callback
 from rt_torchrl.runs.dashboard import Dashboard
+from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.progress import Progress
 from rt_torchrl.runs.real_side import judged_on, physics_known, require_simulation, simulated
-from rt_torchrl.runs.results_table import results_table
+from rt_torchrl.runs.results_table import next_steps, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
+from rt_torchrl.runs.run_settings import as_written, flat
 from rt_torchrl.runs.run_start import start_of
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.real_system import RealSystem
@@ -63,6 +66,8 @@ class Run:
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
             unknown closure, a :class:`RealController`.
         first: class of the controller that the real system has had so far, for ``start="controller"``.
+        callbacks: functions that see the entries of all episodes after each one, and may end the training; see
+            :data:`Callback`.
         animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
@@ -83,12 +88,15 @@ class Run:
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
         first: type[ClassicalController] | None = None,
+        callbacks: Sequence[Callback] = (),
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
         quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
+        stopping = self.config.stopping()
+        self.callbacks: list[Callback] = [*callbacks, *([stopping] if stopping else [])]
         device = require_device(config.device)
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
@@ -161,7 +169,10 @@ class Run:
 
     def _train(self) -> dict[str, Any]:
         self._held.begin(self.config)
-        dashboard = Dashboard(self.folder)
+        options = flat(as_written(self.config))
+        loggers = make_loggers(self.config.loggers, self.folder, self.algorithm.twin.plant.name)
+        dashboard = Dashboard(self.folder, loggers)
+        dashboard.settings(options)
         with Progress(self.config.episodes, len(self.episodes)) as bar:
             bar.doing("checking the gradient")
             # Model predictive control has no weights of its own whose gradient could be checked.
@@ -181,9 +192,11 @@ class Run:
             if self.config.figures:
                 bar.doing("drawing the figures")
                 self._draw(dashboard, judged)
+        table = results_table(metrics)
+        dashboard.results(options, metrics["summary"], table)
         dashboard.close()
-        print(results_table(metrics))
-        print(f"results in {self.folder}; look at them with: tensorboard --logdir {self.folder}")
+        print(table)
+        print(f"results in {self.folder}\n{next_steps(metrics, self.folder)}")
         return metrics
 
     def _all_episodes(self, dashboard: Dashboard, bar: Progress) -> None:
@@ -194,6 +207,10 @@ class Run:
                     safe_point()
                     self._episode(dashboard, bar)
                     bar.episode(self.episodes[-1])
+                    reasons = [said for callback in self.callbacks if (said := callback(self.episodes))]
+                    if reasons:
+                        bar.write(f"ended after {len(self.episodes)} episodes: {'; '.join(reasons)}")
+                        break
             except BaseException as error:
                 if interruption.at_once:
                     # Torch and TorchRL may have turned the KeyboardInterrupt into another error.

@@ -7,10 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.exogenous import ExogenousProcess
 
@@ -48,12 +50,14 @@ def simulate(
     plant, closure = (run.plant, true_closure(run)) if on == "real" else (run.physics, run.closure)
     generator = torch.Generator().manual_seed(seed)
     single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))
-    count = max([len(given) for given, rank in ((exogenous, 3), (initial_state, 2)) if _batched(given, rank)], default=1)
+    count = max(
+        [len(given) for given, rank in ((exogenous, 3), (initial_state, 2)) if _batched(given, rank)], default=1
+    )
     # States first, as the unseen episodes are drawn, so that the same seed is the same episode.
     drawn = plant.draw_initial_state(count, generator)
     start = drawn if initial_state is None else _rows(initial_state, "initial_state", count, (len(plant.states),))
     inputs = plant.draw_exogenous(count, generator) if exogenous is None else _inputs(plant, exogenous, count)
-    if hasattr(policy, "fly"):
+    if isinstance(policy, StateFeedback | ClassicalController):
         flown = policy.fly(start, inputs, closure, plant=plant)
     else:
         flown = Rollout(plant, closure, policy)(start, inputs)
@@ -64,10 +68,6 @@ def true_closure(run: "LoadedRun") -> nn.Module:
     """The real system's closure at the end of the training: a system that wears is not what it was."""
     wear = run.config.wear(run.plant)
     return run.plant.closure if wear is None else wear(run.config.effective().episodes - 1)
-
-
-def _batched(given: Tensor | None, rank: int) -> bool:
-    return given is not None and given.dim() == rank
 
 
 def _rows(given: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tensor:

@@ -13,7 +13,7 @@ from rt_torchrl.figures.style import REAL, REFERENCE_LINE, ROLES, caption, legen
 from rt_torchrl.runs.settings import BESIDE, read_settings
 from rt_torchrl.study.results import Entry
 
-APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config_file")
+APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
 """Settings in which runs of one row may differ."""
 COLOURS = (REAL, ROLES["model_based"], ROLES["model_free"], "#CC79A7", "#56B4E9", "#7f3c8d", "#a0522d", "#6b8e23")
 MARKERS = "os^Dv"
@@ -84,8 +84,8 @@ def comparison_figure(runs: Sequence[Entry], controllers: Sequence[Entry], title
         number = np.arange(1, length + 1)
         ax.fill_between(number, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0)
         # Earlier rows are wider, so that a later one that runs on top of them hides none.
-        look: dict[str, Any] = {"linewidth": max(1.2, 3.2 - row), "marker": MARKERS[row % len(MARKERS)], "markersize": 4}
-        ax.plot(number, curves.mean(0), color=colour, label=entry.name, **look)
+        look: dict[str, Any] = {"linewidth": max(1.2, 3.2 - row), "marker": MARKERS[row % len(MARKERS)]}
+        ax.plot(number, curves.mean(0), color=colour, markersize=4, label=entry.name, **look)
     for entry, dash in zip(controllers, ("--", ":", "-.") * len(controllers), strict=False):
         ax.axhline(entry.mean, label=entry.name, **REFERENCE_LINE | {"linestyle": dash})
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
