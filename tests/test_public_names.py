@@ -29,7 +29,9 @@ ROOMS_OF = {
     "pareto.py": {"runs", "study"},
     "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
+    "report.py": {"runs"},
     "study.py": {"study", "runs"},
+    "sweep.py": {"figures", "runs", "study"},
     "unknown.py": {"study", "runs"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""

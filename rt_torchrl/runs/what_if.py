@@ -50,9 +50,8 @@ def simulate(
     plant, closure = (run.plant, true_closure(run)) if on == "real" else (run.physics, run.closure)
     generator = torch.Generator().manual_seed(seed)
     single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))
-    count = max(
-        [len(given) for given, rank in ((exogenous, 3), (initial_state, 2)) if _batched(given, rank)], default=1
-    )
+    batches = ((exogenous, 3), (initial_state, 2))
+    count = max([len(given) for given, rank in batches if given is not None and given.dim() == rank], default=1)
     # States first, as the unseen episodes are drawn, so that the same seed is the same episode.
     drawn = plant.draw_initial_state(count, generator)
     start = drawn if initial_state is None else _rows(initial_state, "initial_state", count, (len(plant.states),))
