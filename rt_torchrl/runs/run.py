@@ -269,9 +269,22 @@ class Run:
     def _figures(self, snapshot: Snapshot) -> dict[str, "Figure"]:
         return figures.figures_of(snapshot) | self.plant_figures(snapshot)
 
+    def _flights(self) -> dict[str, "Figure"]:
+        """The figure of the first unseen episode under the live policy and the classical controllers.
+
+        It is left out on a real system of unknown closure, where these would be flights of their own.
+        """
+        if self.unseen.closure is None:
+            return {}
+        live, first = self.algorithm.referee.live, self.unseen.first(1)
+        flown: dict[str, Trajectory] = {live: first.fly(self.algorithm.policies[live])}
+        flown |= {name: first.fly_baseline(law) for name, law in self.baselines.items()}
+        return {"flights": figures.flights(self.unseen.physics, {who: one.each()[0] for who, one in flown.items()})}
+
     def _draw(self, dashboard: Dashboard, judged: dict[str, Judged]) -> None:
         snapshot = self._snapshot()
-        drawn = self._figures(snapshot) | {"unseen": figures.unseen(judged, self.unseen.categories())}
+        drawn = self._flights() | self._figures(snapshot)
+        drawn |= {"unseen": figures.unseen(judged, self.unseen.categories())}
         (self.folder / "figures").mkdir(exist_ok=True)
         images = {name: figures.pixels(figure) for name, figure in drawn.items()}
         for name, image in images.items():

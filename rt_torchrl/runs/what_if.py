@@ -99,7 +99,8 @@ def figures_of(run: "LoadedRun", flown: Trajectory | None) -> dict[str, "Figure"
     snapshot = snapshot_of(run, flown)
     recipe: Any = sys.modules.get(type(run.config).__module__)
     own = getattr(recipe, "plant_figures", None)
-    return figures.figures_of(snapshot) | (own(snapshot) if own else {})
+    drawn = {"flights": figures.flights(run.physics, {run.live: snapshot.record})} | figures.figures_of(snapshot)
+    return drawn | (own(snapshot) if own else {})
 
 
 @torch.no_grad()
