@@ -30,7 +30,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from rt_torchrl.runs.report_page import write_report
+    from rt_torchrl import write_report  # here, because --help need not wait for Matplotlib
 
     print(f"report in {write_report(load_run(config.run, config.recipe))}")
 

@@ -68,9 +68,11 @@ from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, 
 
 # Trainings from the command line, and their results
 from .options import check_options
+from .runs.callbacks import EarlyStopping
 from .runs.command_line import main_of
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.machine import require_device
+from .runs.report_page import write_report
 from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
@@ -100,6 +102,7 @@ __all__ = [
     "DistillationConfig",
     "DivergenceError",
     "EarlierPolicies",
+    "EarlyStopping",
     "Engine",
     "EpisodeAbandoned",
     "Evidence",
@@ -180,4 +183,5 @@ __all__ = [
     "require_stable_step",
     "rk4_step",
     "shipped_plants",
+    "write_report",
 ]

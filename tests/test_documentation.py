@@ -8,12 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from printed_commands import ROOT, TEXTS, blocks
 from test_export_recipe import leave_run
 
+import rt_torchrl
 from rt_torchrl.atomic_file import write_json
 
-RUN_HERE = ["finished_run.md", "hypotheses.md", "unknown_systems.md"]
+RUN_HERE = ["finished_run.md", "gallery.md", "habits.md", "hypotheses.md", "unknown_systems.md"]
 
 
 def test_every_page_with_code_is_run():
@@ -59,11 +61,41 @@ def test_the_real_turbine_has_what_its_twin_does_not_know():
     assert len(scope["real"].states) > len(scope["twin"].states)
 
 
-def test_the_what_if_of_the_readme_is_that_of_the_page():
+def test_the_what_if_of_the_readme_runs(tmp_path):
     (shown,) = blocks("README.md", "py")
-    page = " ".join(blocks("finished_run.md", "python"))
-    for call in re.findall(r"run\.\w+\(", shown):
-        assert call in page
+    scope = {"rt_torchrl": rt_torchrl, "wind": torch.full((20, 1), 11.0)}
+    exec(shown.replace("runs/wind_turbine/TIME-seed-0", str(leave_finished_run(tmp_path / "run"))), scope)
+    assert len(scope["flown"].states) == 21
+    assert not any(blocks(page, "py") for page in TEXTS if page != "README.md")  # which would not be run
+
+
+def test_the_code_of_the_gallery_draws_what_it_says(tmp_path, monkeypatch):
+    leave_finished_run(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(blocks("gallery.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run")
+    exec(compile(code, "docs/gallery.md", "exec"), {})
+    assert (tmp_path / "power_and_speed.png").exists() and (tmp_path / "flights.png").exists()
+
+
+def test_the_callback_of_the_documentation_ends_a_training():
+    scope = {}
+    exec(compile("\n".join(blocks("habits.md", "python")), "docs/habits.md", "exec"), scope)
+    said = scope["cheap_enough"]
+    assert said([{"real_cost": 0.01}, {"real_cost": 0.5}]) is None
+    assert said([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path):
+    nbformat = pytest.importorskip("nbformat", reason="the notebook needs the extra notebook")
+    nbclient = pytest.importorskip("nbclient", reason="the notebook needs the extra notebook")
+    pytest.importorskip("ipykernel", reason="the notebook needs the extra notebook")
+    notebook = nbformat.read(ROOT / "docs" / "first_steps.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert any("real_cost" in output.get("data", {}).get("text/html", "") for output in shown)
+    assert sum("image/png" in output.get("data", {}) for output in shown) == 2
+    assert (tmp_path / "runs" / "first_steps" / "weights.pt").exists()
 
 
 def test_every_public_name_has_an_entry():

@@ -29,7 +29,6 @@ ROOMS_OF = {
     "pareto.py": {"runs", "study"},
     "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
-    "report.py": {"runs"},
     "study.py": {"study", "runs"},
     "sweep.py": {"figures", "runs", "study"},
     "unknown.py": {"study", "runs"},
