@@ -32,8 +32,21 @@ def whole(name, arguments):
     return ["log.csv", *system, *arguments]
 
 
+NO_OPTIONS = ROOT / "tests" / "no_options.json"
+"""A file of options that gives none, in the place of one that a run leaves."""
+
+
+@pytest.fixture(autouse=True)
+def _with_every_logger(monkeypatch):
+    """As if the packages that the documentation tells to install were there."""
+    monkeypatch.setattr("rt_torchrl.runs.loggers.PACKAGES", {})
+
+
 def refusal(name, arguments):
     """What the command line of a recipe says against these arguments, or None."""
+    if "--config" in arguments:
+        place = arguments.index("--config") + 1
+        arguments = [*arguments[:place], str(NO_OPTIONS), *arguments[place + 1 :]]
     if issubclass(CONFIGS[name], RunConfig):
         arguments = [*arguments, "--log-dir", "somewhere"]  # what --resume needs, and --help does not mind
     said = io.StringIO()
@@ -104,3 +117,10 @@ def test_checks_that_are_printed_are_what_ci_runs():
         BUILD,
     }
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
+
+
+def test_one_word_for_the_folder_of_the_results():
+    """Recipes that read a run, and write beside it or nowhere, have none."""
+    without = {"benchmark", "compare", "export", "record_log", "report"}
+    for name in set(RECIPES) - without:
+        assert "--log-dir" in help_of(name), name
