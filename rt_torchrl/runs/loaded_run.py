@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
@@ -90,8 +89,8 @@ class LoadedRun:
     def simulate(
         self,
         policy: nn.Module,
-        exogenous: Float[Tensor, "*batch n n_z"] | None = None,
-        initial_state: Float[Tensor, "*batch n_s"] | None = None,
+        exogenous: Tensor | None = None,
+        initial_state: Tensor | None = None,
         *,
         on: str = "real",
         seed: int = 0,
@@ -100,8 +99,8 @@ class LoadedRun:
 
         Args:
             policy: policy of an observation, such as ``run.policy("model_based")``, or a :class:`ClassicalController`.
-            exogenous: exogenous inputs, one row for each control interval; None draws those of one episode.
-            initial_state: states to start from; None draws them.
+            exogenous: exogenous inputs, ``*batch n n_z``, a row for each control interval; None draws an episode.
+            initial_state: states to start from, ``*batch n_s``; None draws them.
             on: real for the system with its true closure as it is at the end of the training, or twin.
             seed: seed of what is drawn.
 

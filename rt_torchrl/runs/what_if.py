@@ -4,7 +4,6 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
@@ -26,8 +25,8 @@ if TYPE_CHECKING:
 def simulate(
     run: "LoadedRun",
     policy: nn.Module,
-    exogenous: Float[Tensor, "*batch n n_z"] | None,
-    initial_state: Float[Tensor, "*batch n_s"] | None,
+    exogenous: Tensor | None,
+    initial_state: Tensor | None,
     *,
     on: str,
     seed: int,
