@@ -5,12 +5,13 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 if __name__ == "__main__":
     print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 import torch
+import tyro
 
 from rt_torchrl import ClassicalController, LimitConfig, LoadedRun, Plant, RunConfig, check_options, load_run, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
@@ -71,7 +72,7 @@ class Config:
     starts: Literal["all", "classical"] = "all"
     mpc: tuple[Literal["held", "decaying", "preview"], ...] = ("held", "decaying", "preview")
     run: Path | None = None
-    folder: Path = Path("runs/limit")
+    folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/limit")
     descent: BoundedDescentConfig = field(default_factory=lambda: TO_THE_END)
 
     def __post_init__(self):

@@ -10,7 +10,7 @@ if __name__ == "__main__":
     print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
 import torch
-from tyro.conf import Positional
+import tyro
 
 from rt_torchrl import check_options, load_run, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results
@@ -34,11 +34,11 @@ class Config:
         folder: folder of the results, real_time.json, and of the events of the safety layer, safety.jsonl.
     """
 
-    run: Annotated[Path, Positional]
+    run: Annotated[Path, tyro.conf.Positional]
     seconds: float | None = None
     deadline: float | None = None
     seed: int = 0
-    folder: Path = Path("runs/real_time")
+    folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/real_time")
 
     def __post_init__(self):
         check_options(self)

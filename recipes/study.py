@@ -6,10 +6,12 @@ import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 if __name__ == "__main__":
     print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+
+import tyro
 
 from rt_torchrl import ClassicalController, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
@@ -108,7 +110,7 @@ class Config:
     ray_address: str | None = None
     unseen: int = 100
     limit_episodes: int = 8
-    folder: Path = Path("runs/study")
+    folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/study")
     quick: bool = False
 
     def __post_init__(self):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 if __name__ == "__main__":
     print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
 
-from tyro.conf import Positional
+import tyro
 
 from rt_torchrl import check_options, main_of
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
@@ -64,8 +64,8 @@ class Config:
         page: page in which the table is written, too.
     """
 
-    plant: Annotated[Literal["wind_turbine", "flapping_wing", "cryogenic_tank"], Positional]
-    systems: Annotated[tuple[str, ...], Positional] = ()
+    plant: Annotated[Literal["wind_turbine", "flapping_wing", "cryogenic_tank"], tyro.conf.Positional]
+    systems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     task: Literal["paper", "hop"] = "paper"
     seeds: int = 3
     episodes: int = 3
@@ -74,7 +74,7 @@ class Config:
     starts: int = 3
     iterations: int = 60
     jobs: int = 1
-    folder: Path = Path("runs/unknown")
+    folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/unknown")
     page: Path | None = None
 
     def __post_init__(self):

@@ -85,9 +85,11 @@ from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, 
 
 # Trainings from the command line, and their results
 from .options import check_options
+from .runs.callbacks import EarlyStopping
 from .runs.command_line import main_of
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.machine import require_device
+from .runs.report_page import write_report
 from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
@@ -121,6 +123,7 @@ __all__ = [
     "DistillationConfig",
     "DivergenceError",
     "EarlierPolicies",
+    "EarlyStopping",
     "Engine",
     "EpisodeAbandoned",
     "Estimate",
@@ -229,4 +232,5 @@ __all__ = [
     "sensors_of",
     "served_system",
     "shipped_plants",
+    "write_report",
 ]

@@ -17,13 +17,14 @@ from rt_torchrl.runs.user_code import module_of
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 CONFIGS = {name: module_of(ROOT / "recipes" / f"{name}.py").Config for name in RECIPES}
 OF_A_RECIPE = [command for command in commands() if "recipes/" in command]
+BUILD = "uv run --extra docs sphinx-build -W --keep-going docs docs/_build"
 
 
 def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
     if name == "unknown":
         return ["flapping_wing", *arguments]
-    if name in ("export", "in_service", "real_time"):
+    if name in ("compare", "export", "in_service", "real_time", "report"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments
@@ -31,8 +32,21 @@ def whole(name, arguments):
     return ["log.csv", *system, *arguments]
 
 
+NO_OPTIONS = ROOT / "tests" / "no_options.json"
+"""A file of options that gives none, in the place of one that a run leaves."""
+
+
+@pytest.fixture(autouse=True)
+def _with_every_logger(monkeypatch):
+    """As if the packages that the documentation tells to install were there."""
+    monkeypatch.setattr("rt_torchrl.runs.loggers.PACKAGES", {})
+
+
 def refusal(name, arguments):
     """What the command line of a recipe says against these arguments, or None."""
+    if "--config" in arguments:
+        place = arguments.index("--config") + 1
+        arguments = [*arguments[:place], str(NO_OPTIONS), *arguments[place + 1 :]]
     if issubclass(CONFIGS[name], RunConfig):
         arguments = [*arguments, "--log-dir", "somewhere"]  # what --resume needs, and --help does not mind
     said = io.StringIO()
@@ -84,8 +98,8 @@ def test_an_option_that_does_not_exist_is_found():
 
 
 def test_every_choice_of_a_policy_is_taken():
-    """The README lists them behind the first one: bias, scheduled or mlp."""
-    assert {"bias", "scheduled", "mlp"} <= set(spans("README.md"))
+    """The page of the options lists them behind the first one: bias, scheduled or mlp."""
+    assert {"bias", "scheduled", "mlp"} <= set(spans("options.md"))
     for name in ("bias", "scheduled", "mlp"):
         assert refusal("wind_turbine", ["--policy", name]) is None
 
@@ -93,9 +107,17 @@ def test_every_choice_of_a_policy_is_taken():
 def test_checks_that_are_printed_are_what_ci_runs():
     """The tests do not run themselves, nor the type checker over everything."""
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert "uv run mypy" in script and any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
+    assert {"uv run mypy", BUILD} <= set(script)
+    assert any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
     rest = [command for command in commands() if command not in OF_A_RECIPE]
     known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow", "uv run pytest -m nightly"}
     known |= {"uv run pytest -m faults", "uv run --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
-    assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs"}
+    assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
+
+
+def test_one_word_for_the_folder_of_the_results():
+    """Recipes that read a run, and write beside it or nowhere, have none."""
+    without = {"benchmark", "compare", "export", "record_log", "report"}
+    for name in set(RECIPES) - without:
+        assert "--log-dir" in help_of(name), name

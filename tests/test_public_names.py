@@ -25,6 +25,7 @@ ROOMS_OF = {
     "benchmark.py": {"trajectories"},
     "cascaded_tanks.py": {"figures", "identification"},
     "coverage.py": {"identification"},
+    "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
     "in_service.py": {"runs", "systems"},
@@ -35,6 +36,7 @@ ROOMS_OF = {
     "record_log.py": {"identification", "runs"},
     "soak.py": {"runs"},
     "study.py": {"study", "runs"},
+    "sweep.py": {"figures", "runs", "study"},
     "unknown.py": {"study", "runs"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""
@@ -44,7 +46,7 @@ def sources():
     """The Python that people read first: every recipe, and every code block of the README and the tutorial."""
     for path in sorted((ROOT / "recipes").glob("*.py")):
         yield path.name, path.read_text(encoding="utf-8")
-    for path in (ROOT / "README.md", ROOT / "recipes" / "own_plant.md"):
+    for path in (ROOT / "README.md", ROOT / "docs" / "own_plant.md"):
         blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
         assert blocks, path
         yield path.name, "\n".join(blocks)

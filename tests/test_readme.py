@@ -7,7 +7,7 @@ import fresh_process
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-TUTORIAL = (ROOT / "recipes" / "own_plant.md").read_text(encoding="utf-8")
+TUTORIAL = (ROOT / "docs" / "own_plant.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,3 +29,14 @@ def merit(
         "held within 5 kPa [-]": (error <= BAND).double(),
         "vented mass [kg]": plant.vented_mass(states, applied, plant.closure)[:, -1],
     }
+
+
+def setpoints(
+    plant: "CryogenicTank",
+    states: Float[Tensor, "*batch n 3"],
+    applied: Float[Tensor, "*batch n 1"],
+    exogenous: Float[Tensor, "*batch n n_z"],
+) -> dict[str, tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]]:
+    """Pressure, which should be held at the set point."""
+    pressure = 1e-3 * states[..., 2]
+    return {"pressure [kPa]": (pressure, torch.full_like(pressure, 1e-3 * plant.set_point))}

@@ -276,7 +276,8 @@ class CryogenicTank(Plant):
         r"""The sum of the squared errors of T_s, V_l and p over their natural sizes, over T_o (paper, eq. of J_p)."""
         return (((state - measured) / self.error_sizes) ** 2).sum(-1) / self.horizon
 
-    merit, make_neural_closure, suspects = judgement.merit, first_neural_guess, suspects
+    merit, setpoints, make_neural_closure = judgement.merit, judgement.setpoints, first_neural_guess
+    suspects = suspects
 
     # Randomness
 

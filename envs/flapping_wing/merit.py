@@ -38,3 +38,14 @@ def categories(plant: "FlappingWing", exogenous: Float[Tensor, "batch n 1"]) -> 
     last = round(1.0 / plant.dt)
     held = exogenous[:, -last:, 0].amax(-1) <= plant.strongest_wind
     return {"gust can be held": held, "gust too strong to hold": ~held}
+
+
+def setpoints(
+    plant: "FlappingWing",
+    states: Float[Tensor, "*batch n n_s"],
+    applied: Float[Tensor, "*batch n 2"],
+    exogenous: Float[Tensor, "*batch n n_z"],
+) -> dict[str, tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]]:
+    """Both coordinates, with those of the target."""
+    place, target = states[..., :2], plant.target.expand_as(states[..., :2])
+    return {f"{axis} [m]": (place[..., k], target[..., k]) for k, axis in enumerate(("x", "z"))}

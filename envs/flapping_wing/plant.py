@@ -249,8 +249,9 @@ class FlappingWing(Plant):
         """The discrepancy ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
-    merit, categories, make_neural_closure, suspects = (
+    merit, setpoints, categories, make_neural_closure, suspects = (
         judgement.merit,
+        judgement.setpoints,
         judgement.categories,
         drawn_neural_polar,
         suspects,

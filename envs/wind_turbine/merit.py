@@ -25,3 +25,17 @@ def merit(
         "top generator speed [rad/s]": speed.amax(-1),
         "pitch travel [deg/s]": applied[..., 1].diff(dim=-1).abs().mean(-1) / plant.dt,
     }
+
+
+def setpoints(
+    plant: "WindTurbine",
+    states: Float[Tensor, "*batch n n_s"],
+    applied: Float[Tensor, "*batch n 2"],
+    exogenous: Float[Tensor, "*batch n n_z"],
+) -> dict[str, tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]]:
+    """Generator speed and power with the references that the paper's cost follows (paper, eqs. omega_ref and P_ref)."""
+    omega_g = plant.gear_ratio * states[..., 0]
+    return {
+        "generator speed [rad/s]": (omega_g, plant.reference_speed(states[..., 2])),
+        "power [MW]": (1e-6 * plant.generator_power(states, applied), 1e-6 * plant.reference_power(omega_g)),
+    }

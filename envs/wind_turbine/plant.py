@@ -254,7 +254,7 @@ class WindTurbine(Plant):
         """The discrepancy ½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
         return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
 
-    merit, controller_start, suspects = judgement.merit, started, suspects
+    merit, setpoints, controller_start, suspects = judgement.merit, judgement.setpoints, started, suspects
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """All states from the rotor speed: the filters start settled, and the last actions are those of the record."""

@@ -1,6 +1,7 @@
 """The figures of a training; ``__init__.py`` imports each at its first use, from the module named here."""
 
 from .episode import actions, exogenous, states
+from .flights import flights
 from .learning import closure_weights, learning_curves, seconds
 from .overview import figures_of
 from .policy import policy_contours
@@ -14,6 +15,7 @@ __all__ = [
     "closure_weights",
     "exogenous",
     "figures_of",
+    "flights",
     "learning_curves",
     "pixels",
     "policy_contours",

@@ -222,5 +222,7 @@ def _draw_timeline(ax: Axes, episodes: list[dict[str, Any]], live: Role) -> None
     caption(ax, "live (filled) and idle (pale)")
     legend_above(ax)
     ax.set_xlabel("episode")
-    ax.set_xlim(-0.5, len(episodes) - 0.5)
+    # An event at the end of the last episode would otherwise lie on the frame.
+    room = 0.25 if episodes[-1].get("event") in EVENTS else 0.0
+    ax.set_xlim(-0.5, len(episodes) - 0.5 + room)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))

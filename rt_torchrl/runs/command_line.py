@@ -1,5 +1,7 @@
 """Recipes, which are files with a ``Config`` and a ``main``, and their command lines."""
 
+import dataclasses
+import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -40,8 +42,52 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
     config = tyro.cli(config_class, args=arguments)
     if not isinstance(config, RunConfig):
         return config
+    defaults = config.defaults() if config.config is None else of_file(config.config, config)
     # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
-    return tyro.cli(config_class, args=arguments, default=cast(Configuration, config.defaults()))
+    return tyro.cli(config_class, args=arguments, default=cast(Configuration, defaults))
+
+
+OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")
+"""Options that a file of options never gives."""
+
+
+def of_file(path: Path, asked: RunConfig) -> RunConfig:
+    """The options in a file, such as ``config.json`` of a run; those that it lacks have the defaults of ``asked``.
+
+    Nothing of the file is imported or run.
+
+    Raises:
+        ValueError: if the file cannot be read, is that of another recipe, or holds an option that does not exist or a
+            value that it does not take.
+    """
+    from rt_torchrl.runs.run_settings import as_written  # here, because --help needs none of it
+    from rt_torchrl.runs.settings import BESIDE, config_of
+
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"config={path} cannot be read: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"config={path} must hold an object with options, such as config.json of a run.")
+    made, mine = (found.get("recipe") or {}).get("file"), getattr(sys.modules[type(asked).__module__], "__file__", None)
+    if made and mine and Path(made).name != Path(mine).name:
+        raise ValueError(f"config={path} is of the recipe {Path(made).name}, not of {Path(mine).name}; use its recipe.")
+    options = {name: value for name, value in found.items() if name not in (*BESIDE, *OF_THE_CALL)}
+    try:
+        read = config_of(type(asked), _over(as_written(asked.defaults()), options))
+        return dataclasses.replace(read, config=None, log_dir=None)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"config={path}: {error}") from error
+
+
+def _over(under: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Nested options, in which those of ``above`` replace those of ``under``."""
+    nested = {
+        name: _over(under[name], value)
+        for name, value in above.items()
+        if isinstance(value, dict) and isinstance(under.get(name), dict)
+    }
+    return under | above | nested
 
 
 def load_recipe(path: Path) -> ModuleType:

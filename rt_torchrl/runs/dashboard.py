@@ -1,11 +1,15 @@
 """The TensorBoard dashboard of a run: one scalar per quantity and episode, and the figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers import Logger  # only its type
 
 TAGS = {
     "real_cost": "cost/real episode (live policy)",
@@ -41,15 +45,48 @@ TAGS = {
 """Tag of each scalar entry of an episode's record."""
 
 
+COSTS = [TAGS[key] for key in ("real_cost", "J_a_model_based", "J_a_model_free", "J_a_unseen")]
+"""Curves that one chart of TensorBoard's custom scalars shows together."""
+
+
 class Dashboard:
-    """A dashboard, which writes TensorBoard events.
+    """A dashboard, which writes TensorBoard events, and the same curves to other loggers.
 
     Args:
         folder: folder of the event file.
+        loggers: further loggers.
     """
 
-    def __init__(self, folder: Path):
-        self._writer = SummaryWriter(str(folder))
+    def __init__(self, folder: Path, loggers: "Sequence[Logger]" = ()):
+        self._writer, self._loggers = SummaryWriter(str(folder)), loggers
+        self._writer.add_custom_scalars({"cost": {"all costs": ["Multiline", COSTS]}})
+
+    def _scalar(self, tag: str, value: float, step: int) -> None:
+        self._writer.add_scalar(tag, value, step)
+        for logger in self._loggers:
+            logger.log_scalar(tag, value, step=step)
+
+    def settings(self, options: Mapping[str, Any]) -> None:
+        """Tell the other loggers the options of the run, by their dotted names."""
+        for logger in self._loggers:
+            logger.log_hparams(dict(options))
+
+    def results(self, options: Mapping[str, Any], summary: Mapping[str, Any], table: str) -> None:
+        """Write what the run has come to: final costs as scalars, the options beside them (HParams), and the table.
+
+        Args:
+            options: options of the run by their dotted names.
+            summary: entry ``summary`` in ``metrics.json``.
+            table: table of results as the terminal shows it.
+        """
+        final = {f"final/{name}": value for name, value in final_costs(summary).items()}
+        for tag, value in final.items():
+            self._scalar(tag, value, 0)
+        shown = {key: value if isinstance(value, bool | int | float) else str(value) for key, value in options.items()}
+        for part in hparams(shown, final):
+            self._writer._get_file_writer().add_summary(part)
+        # TensorBoard shows Markdown, in which indented lines are code.
+        self._writer.add_text("results", "\n".join("    " + line for line in table.splitlines()), 0)
 
     def episode(self, record: Mapping[str, Any]) -> None:
         """Write the scalars of one episode.
@@ -60,22 +97,22 @@ class Dashboard:
         step = record["episode"]
         for key, tag in TAGS.items():
             if key in record:
-                self._writer.add_scalar(tag, record[key], step)
-        self._writer.add_scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
+                self._scalar(tag, record[key], step)
+        self._scalar("switch/live is model-based", float(record["live"] == "model_based"), step)
         for event in ("swap", "clone"):
-            self._writer.add_scalar(f"switch/{event}", float(record.get("event") == event), step)
+            self._scalar(f"switch/{event}", float(record.get("event") == event), step)
         for key in record:
             if key.startswith(("hypothesis/", "misfit/")):
-                self._writer.add_scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
+                self._scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
         faults = record.get("faults", ())
         if faults:
             rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
             table = "\n".join(["| time in the episode [s] | fault | detail |", "|---|---|---|", *rows])
             self._writer.add_text("faults", table, step)
         for key in (key for key in record if key.startswith(("faults/", "violations/"))):
-            self._writer.add_scalar(key, record[key], step)
+            self._scalar(key, record[key], step)
         for name, seconds in record["seconds"].items():
-            self._writer.add_scalar(f"seconds/{name}", seconds, step)
+            self._scalar(f"seconds/{name}", seconds, step)
 
     def images(self, images: Mapping[str, np.ndarray], step: int) -> None:
         """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""
@@ -84,7 +121,19 @@ class Dashboard:
 
     def scalar(self, tag: str, value: float) -> None:
         """Write a scalar of the run as a whole."""
-        self._writer.add_scalar(tag, value, 0)
+        self._scalar(tag, value, 0)
 
     def close(self) -> None:
         self._writer.close()
+        for logger in self._loggers:
+            logger.close() if hasattr(logger, "close") else None
+
+
+def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Final costs of a run by name; those that are not finite are left out."""
+    unseen, paid = summary["unseen"], summary["cost_of_learning"]
+    found = {f"J_a {role.replace('_', '-')}": unseen[f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
+    found["J_a live"] = unseen[f"J_a_{summary['live']}"]["mean"]
+    found |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    found |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"]}
+    return {name: float(value) for name, value in found.items() if value is not None and np.isfinite(value)}

@@ -1,18 +1,29 @@
-"""Loading a run folder: its plant, its trained policies and its closure, without a training."""
+"""Loading a run folder: its plant, its trained policies, its closure and its results, without a training."""
 
+import copy
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs import what_if
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of
 from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
 from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.referees import Role
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure  # only their types: who reads weights needs neither
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +37,8 @@ class LoadedRun:
         policies: trained policies by role: ``model_based`` and ``model_free``. Model predictive control in the place of
             ``model_based`` plans on ``closure``.
         closure: trained closure of the twin.
+        initial_closure: closure that the training started from.
+        folder: folder of the run.
     """
 
     config: RunConfig
@@ -33,6 +46,89 @@ class LoadedRun:
     physics: Plant
     policies: dict[str, nn.Module]
     closure: nn.Module
+    initial_closure: nn.Module
+    folder: Path
+
+    @property
+    def twin(self) -> DigitalTwin:
+        """The twin with the trained closure."""
+        return DigitalTwin(self.physics, self.closure)
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Content of ``metrics.json``: ``episodes`` and ``summary``.
+
+        Raises:
+            ValueError: if the folder holds no ``metrics.json``, or a damaged one.
+        """
+        file = self.folder / "metrics.json"
+        try:
+            found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{file} cannot be read ({error}); a training writes it at its end.") from error
+        return found
+
+    @property
+    def live(self) -> Role:
+        """Role of the policy that is live at the end."""
+        role: Role = self.metrics["summary"]["live"]
+        return role
+
+    def table(self) -> "pandas.DataFrame":
+        """The episodes as a table: a row for each, a column for each entry; nested entries are ``seconds.plan``.
+
+        Raises:
+            ImportError: without pandas, which the extra ``logs`` installs; ``metrics["episodes"]`` needs nothing.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("table needs pandas: install rt_torchrl[logs], or read metrics['episodes'].") from error
+        return pandas.json_normalize(self.metrics["episodes"]).set_index("episode")
+
+    def simulate(
+        self,
+        policy: nn.Module,
+        exogenous: Tensor | None = None,
+        initial_state: Tensor | None = None,
+        *,
+        on: str = "real",
+        seed: int = 0,
+    ) -> Trajectory:
+        """Fly a policy on the real system in simulation, or on the twin; see :func:`what_if.simulate`.
+
+        Args:
+            policy: policy of an observation, such as ``run.policy("model_based")``, or a :class:`ClassicalController`.
+            exogenous: exogenous inputs, ``*batch n n_z``, a row for each control interval; None draws an episode.
+            initial_state: states to start from, ``*batch n_s``; None draws them.
+            on: real for the system with its true closure as it is at the end of the training, or twin.
+            seed: seed of what is drawn.
+
+        Raises:
+            ValueError: if ``on`` is something else, or shapes do not fit the plant.
+            DivergenceError: if the system diverges.
+        """
+        return what_if.simulate(self, policy, exogenous, initial_state, on=on, seed=seed)
+
+    def figure(self, name: str, flown: Trajectory | None = None) -> "Figure":
+        """A figure of the training by name, as ``figures/`` of the run folder has it; see :meth:`figure_names`.
+
+        Args:
+            name: name of the figure, such as states, actions, learning_curves or power_and_speed.
+            flown: episode that figures of an episode show, from :meth:`simulate`; None for an episode that no training
+                has seen, under the live policy and without exploration.
+
+        Raises:
+            ValueError: if this run has no such figure.
+        """
+        drawn = what_if.figures_of(self, flown)
+        if name not in drawn:
+            raise ValueError(f"figure {name!r} does not exist in this run; choose one of {', '.join(sorted(drawn))}.")
+        return drawn[name]
+
+    def figure_names(self) -> Sequence[str]:
+        """Names that :meth:`figure` takes."""
+        return sorted(what_if.figures_of(self, None))
 
     def policy(self, role: str) -> nn.Module:
         """The trained policy of a role.
@@ -70,12 +166,21 @@ def load_run(
     config, plant = _rebuilt(folder, settings, config_class, plant)
     physics = config.believed() or plant
     policies, closure = _parts(config, physics)
+    initial = copy.deepcopy(closure)
     for role, part in {**policies, "closure": closure}.items():
         try:
             part.load_state_dict(weights[role])
         except (RuntimeError, KeyError) as error:
             raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
-    return LoadedRun(config=config, plant=plant, physics=physics, closure=closure, policies=policies)
+    return LoadedRun(
+        config=config,
+        plant=plant,
+        physics=physics,
+        closure=closure,
+        policies=policies,
+        initial_closure=initial,
+        folder=folder,
+    )
 
 
 def _rebuilt(

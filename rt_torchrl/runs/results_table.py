@@ -1,8 +1,13 @@
 """The results of a run on the terminal: the progress line and the table at the end."""
 
+from pathlib import Path
 from typing import Any
 
 from rt_torchrl.runs.results import ROLES
+
+SCREEN = 24
+"""Lines of a terminal that need no scrolling."""
+LEAST_WEIGHTS = 4
 
 
 def progress(record: dict[str, Any]) -> str:
@@ -44,7 +49,8 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += hypothesis_lines(found.get("hypotheses", {}))
-    lines += closure_lines(found["closure"])
+    room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next
+    lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room))
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
 
@@ -103,22 +109,31 @@ def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
     return lines
 
 
-def closure_lines(closure: dict[str, Any]) -> list[str]:
+def closure_lines(closure: dict[str, Any], most: int = 1000) -> list[str]:
     """Lines with the closure's weights at the start and as found, with units and meanings that the closure states.
 
-    The true weights of the same names are shown, if there are any.
+    The true weights of the same names are shown, if there are any. Of more weights than ``most``, those are shown that
+    have changed most.
     """
     if not closure["found"] or not all(isinstance(value, float | None) for value in closure["found"].values()):
         return []
     true = {name: value for name, value in (closure.get("true") or {}).items() if name in closure["found"]}
     described = closure.get("described", {})  # runs of 0.1.0 have none
     lines = [f"  {'closure weight':<22}{'start':>12}{'found':>12}" + (f"{'true':>12}" if true else "")]
-    for name, value in closure["found"].items():
+    chosen = list(closure["found"])
+    if len(chosen) > most:
+        change = {name: _change(closure["start"].get(name), closure["found"][name]) for name in chosen}
+        moved = sorted(chosen, key=change.__getitem__)[-most + 1 :]
+        chosen = [name for name in chosen if name in moved]
+    for name in chosen:
+        value = closure["found"][name]
         weights = [closure["start"][name], value, *([true.get(name)] if true else [])]
         about = described.get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{about['unit']}]" if about["unit"] else name
         shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)
         lines.append(f"  {label:<22}{shown}   {about['meaning']}".rstrip())
+    if len(chosen) < len(closure["found"]):
+        lines.append(f"  {len(closure['found']) - len(chosen)} more, which have changed less, are in metrics.json")
     return lines
 
 
@@ -131,3 +146,35 @@ def hypothesis_lines(hypotheses: dict[str, Any]) -> list[str]:
         found = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
         lines.append(f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else ""))
     return lines
+
+
+def _change(start: float | None, found: float | None) -> float:
+    """Relative change of a weight; that of one that is not a finite number comes first."""
+    if start is None or found is None:
+        return float("inf")
+    return abs(found - start) / max(abs(start), abs(found), 1e-300)
+
+
+def next_steps(metrics: dict[str, Any], folder: Path) -> str:
+    """What to do with the run, from what its results say: one line for each thing.
+
+    Args:
+        metrics: content of ``metrics.json``.
+        folder: run folder.
+    """
+    found = metrics["summary"]
+    unseen, live = found["unseen"], found["live"]
+    cost = unseen[f"J_a_{live}"]["mean"]
+    classical = {name: baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    known = {name: value for name, value in classical.items() if value is not None}
+    best = min(known, key=known.__getitem__, default=None)
+    steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: rt_torchrl.load_run({str(folder)!r})"]
+    if cost is None:
+        steps.append("the live policy diverges on unseen episodes: see `reason` in metrics.json, and train longer")
+    elif best is not None and cost >= known[best]:
+        steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
+    elif found["better"] != live:
+        steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
+    else:
+        steps.append(f"take the controller away: recipes/export.py {folder}")
+    return "\n".join(f"  next: {step}" for step in steps)

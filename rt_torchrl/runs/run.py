@@ -4,7 +4,7 @@ import copy
 import errno
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +23,17 @@ from rt_torchrl.interruption import Interruption, safe_point, termination_as_int
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, reference, results
+from rt_torchrl.runs.callbacks import Callback
 from rt_torchrl.runs.dashboard import Dashboard
+from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, operation_of
 from rt_torchrl.runs.progress import Progress
 from rt_torchrl.runs.real_side import judged_on, physics_known, require_simulation, simulated
-from rt_torchrl.runs.results_table import results_table
+from rt_torchrl.runs.results_table import next_steps, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
+from rt_torchrl.runs.run_settings import as_written, flat
 from rt_torchrl.runs.run_start import start_of
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.real_system import RealSystem
@@ -68,6 +71,8 @@ class Run:
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
             unknown closure, a :class:`RealController`.
         first: class of the controller that the real system has had so far, for ``start="controller"``.
+        callbacks: functions that see the entries of all episodes after each one, and may end the training; see
+            :data:`Callback`.
         animate: function that writes an animation of the last real episode to a path, ``figures/animation.gif``.
 
     Raises:
@@ -88,12 +93,15 @@ class Run:
         plant_figures: PlantFigures = lambda snapshot: {},
         baselines: dict[str, type[Baseline]] | None = None,
         first: type[ClassicalController] | None = None,
+        callbacks: Sequence[Callback] = (),
         animate: Callable[[Snapshot, Path], None] | None = None,
     ):
         self.started = time.perf_counter()
         quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
         self.plant_figures, self.animate = plant_figures, animate
+        stopping = self.config.stopping()
+        self.callbacks: list[Callback] = [*callbacks, *([stopping] if stopping else [])]
         device = require_device(config.device)
         native = config.engine == "native" and device.type == "cpu"
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
@@ -188,7 +196,10 @@ class Run:
         self._held.begin(self.config)
         if not self._held.resumes():
             (self.folder / EVENTS).unlink(missing_ok=True)
-        dashboard = Dashboard(self.folder)
+        options = flat(as_written(self.config))
+        loggers = make_loggers(self.config.loggers, self.folder, self.algorithm.twin.plant.name)
+        dashboard = Dashboard(self.folder, loggers)
+        dashboard.settings(options)
         with Progress(self.config.episodes, len(self.episodes)) as bar:
             bar.doing("checking the gradient")
             # Model predictive control has no weights of its own whose gradient could be checked.
@@ -209,9 +220,11 @@ class Run:
             if self.config.figures:
                 bar.doing("drawing the figures")
                 self._draw(dashboard, judged)
+        table = results_table(metrics)
+        dashboard.results(options, metrics["summary"], table)
         dashboard.close()
-        print(results_table(metrics))
-        print(f"results in {self.folder}; look at them with: tensorboard --logdir {self.folder}")
+        print(table)
+        print(f"results in {self.folder}\n{next_steps(metrics, self.folder)}")
         return metrics
 
     def _all_episodes(self, dashboard: Dashboard, bar: Progress) -> None:
@@ -222,6 +235,10 @@ class Run:
                     safe_point()
                     self._episode(dashboard, bar)
                     bar.episode(self.episodes[-1])
+                    reasons = [said for callback in self.callbacks if (said := callback(self.episodes))]
+                    if reasons:
+                        bar.write(f"ended after {len(self.episodes)} episodes: {'; '.join(reasons)}")
+                        break
             except BaseException as error:
                 if interruption.at_once:
                     # Torch and TorchRL may have turned the KeyboardInterrupt into another error.
@@ -287,9 +304,22 @@ class Run:
     def _figures(self, snapshot: Snapshot) -> dict[str, "Figure"]:
         return figures.figures_of(snapshot) | self.plant_figures(snapshot)
 
+    def _flights(self) -> dict[str, "Figure"]:
+        """The figure of the first unseen episode under the live policy and the classical controllers.
+
+        It is left out on a real system of unknown closure, where these would be flights of their own.
+        """
+        if self.unseen.closure is None:
+            return {}
+        live, first = self.algorithm.referee.live, self.unseen.first(1)
+        flown: dict[str, Trajectory] = {live: first.fly(self.algorithm.policies[live])}
+        flown |= {name: first.fly_baseline(law) for name, law in self.baselines.items()}
+        return {"flights": figures.flights(self.unseen.physics, {who: one.each()[0] for who, one in flown.items()})}
+
     def _draw(self, dashboard: Dashboard, judged: dict[str, Judged]) -> None:
         snapshot = self._snapshot()
-        drawn = self._figures(snapshot) | {"unseen": figures.unseen(judged, self.unseen.categories())}
+        drawn = self._flights() | self._figures(snapshot)
+        drawn |= {"unseen": figures.unseen(judged, self.unseen.categories())}
         (self.folder / "figures").mkdir(exist_ok=True)
         images = {name: figures.pixels(figure) for name, figure in drawn.items()}
         for name, image in images.items():

@@ -16,6 +16,8 @@ from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.runs.callbacks import EarlyStopping
+from rt_torchrl.runs.loggers import LoggerName, require_loggers
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.config import TwinningConfig
@@ -45,6 +47,8 @@ class RunConfig:
             twinning.assimilation, which it calls NEURAL.
         closure_hidden: widths of the hidden layers of an mlp closure.
         episodes: number n_e of real episodes.
+        patience: number of episodes without a gain of 1 % in the live policy's cost on the twin after which the
+            training ends early; with 0 it never does.
         seed: seed of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: native (exact, machine code, for CPUs), parallel (exact, PyTorch, for
             GPUs), parallel_in_time (exact, PyTorch, for few long episodes on GPUs, untested there), odeint_adjoint (the
@@ -60,6 +64,8 @@ class RunConfig:
             run: its policies and its closure go on. A log, as a .csv or .parquet file that identify.py reads: the twin
             is fitted to it, and the policies imitate the actions in it. random: random weights.
         log: how the log is read that the training begins with.
+        config: file with options, such as config.json of a run, which then runs again; options that are given beside it
+            replace those of the file, and log_dir, resume and overwrite are never taken from it.
         log_dir: run folder; by default runs/PLANT/TIME-seed-SEED.
         resume: whether to go on from the checkpoint in log_dir.
         overwrite: whether to replace the files that an earlier run left in log_dir.
@@ -78,6 +84,8 @@ class RunConfig:
             the end too, and with 0 only there.
         unseen_every: number of episodes after which the live policy is judged on the unseen episodes again; with 0 it
             is judged only at the end.
+        loggers: loggers of TorchRL to write the curves to beside TensorBoard: csv (into csv/ of the run folder), wandb
+            (Weights & Biases) or mlflow, of which the latter two need their packages.
         noise: standard deviation of the real system's sensors, as a share of the value that they read.
         asynchronous: whether the real system operates on while the algorithm learns; docs/connect_your_machine.md.
         operation: how it operates then.
@@ -93,6 +101,7 @@ class RunConfig:
     closure: Literal["plant", "mlp"] = "plant"
     closure_hidden: tuple[int, ...] = (16, 16)
     episodes: int = 20
+    patience: int = 0
     seed: int = 0
     engine: Engine = "native"
     compiled: bool | None = None
@@ -100,6 +109,7 @@ class RunConfig:
     threads: int = 0
     start: str = "random"
     log: LogConfig = field(default_factory=LogConfig)
+    config: Path | None = None
     log_dir: Path | None = None
     resume: bool = False
     overwrite: bool = False
@@ -112,6 +122,7 @@ class RunConfig:
     figures: bool = True
     figures_every: int = 5
     unseen_every: int = 0
+    loggers: tuple[LoggerName, ...] = ()
     noise: float = 0.0
     asynchronous: bool = False
     operation: OperationConfig = field(default_factory=OperationConfig)
@@ -126,6 +137,7 @@ class RunConfig:
             )
         for argument in ("hidden", "closure_hidden"):
             require_widths(argument, getattr(self, argument))
+        require_loggers(self.loggers)
         self._check_ranges()
         if not self.asynchronous and self.operation != self.usual_operation():
             raise ValueError("operation.* says how an asynchronous run operates; give --asynchronous, too.")
@@ -133,6 +145,7 @@ class RunConfig:
     def _check_ranges(self) -> None:
         for argument, least in (
             ("episodes", 1),
+            ("patience", 0),
             ("seed", 0),
             ("threads", 0),
             ("checkpoints", 1),
@@ -211,6 +224,10 @@ class RunConfig:
         if planner.method != "receding_horizon":
             return policies
         return policies | {"model_based": PredictiveControl(physics, closure, planner.receding_horizon)}
+
+    def stopping(self) -> EarlyStopping | None:
+        """What ends the training early; None if nothing does."""
+        return EarlyStopping(patience=self.patience) if self.patience else None
 
     def limit(self) -> LimitConfig | None:
         """How the limit of the cost and model predictive control beside it are computed; None leaves them out.

@@ -14,11 +14,9 @@ from rt_torchrl.runs.settings import FILE
 RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
 LEFT = (
-    "events.out.tfevents.*",
-    "figures/*.png",
-    "figures/animation.gif",
-    "checkpoint-*.pt",
-    "checkpoint*.pt.damaged",
+    *("events.out.tfevents.*", "csv/scalars/**/*.csv", "csv/texts/*.txt", "report.html"),
+    *("figures/*.png", "figures/animation.gif"),
+    *("checkpoint-*.pt", "checkpoint*.pt.damaged"),
     *WRITTEN,
 )
 """Files of a run, in the order of their removal: ``config.json`` comes last, because it tells what the others are."""

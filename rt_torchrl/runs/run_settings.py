@@ -16,11 +16,11 @@ from rt_torchrl.runs.settings import BESIDE, FILE, RAN, read_settings, settings_
 
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
 HARMLESS = {
-    *("episodes", "figures", "figures_every", "unseen_every", "untrained", "reference", "limit_episodes"),
-    "checkpoints",
+    *("episodes", "patience", "figures", "figures_every", "unseen_every", "untrained", "reference", "limit_episodes"),
+    *("checkpoints", "loggers"),
     # These change a result by rounding alone.
     *("threads", "compiled"),
-    *("log_dir", "resume", "overwrite"),
+    *("config", "log_dir", "resume", "overwrite"),
 }
 """Options that may differ when a run is resumed: those of its length, its reports and its speed."""
 ABSENT = "nothing"

@@ -215,6 +215,10 @@ class Extension(Plant):
         base, hidden = self.split(states)
         return self.base.merit(base, self.acting(hidden[:, :-1], applied), exogenous)
 
+    def setpoints(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
+        base, hidden = self.split(states)
+        return self.base.setpoints(base, self.acting(hidden, applied), exogenous)
+
     def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
         return self.base.categories(exogenous)
 

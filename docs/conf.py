@@ -1,0 +1,59 @@
+"""How Sphinx builds the documentation: Markdown by MyST, the reference of the public names by autodoc."""
+
+import logging
+import re
+import typing
+
+# Before the library is imported: jaxtyping then writes annotations as people read them.
+typing.GENERATING_DOCUMENTATION = "rt_torchrl"  # type: ignore[attr-defined]
+
+import rt_torchrl  # noqa: E402
+
+project, author, copyright = "rt_torchrl", "the authors of rt_torchrl", "the authors of rt_torchrl, MIT licence"
+version = release = rt_torchrl.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+exclude_patterns = ["_build", "first_steps.ipynb"]
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]
+myst_heading_anchors = 4
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+napoleon_google_docstring, napoleon_numpy_docstring, napoleon_use_rtype = True, False, False
+
+html_theme = "pydata_sphinx_theme"
+html_title = "rt_torchrl"
+html_show_sourcelink = False
+html_theme_options = {
+    "show_toc_level": 2,
+    "navigation_with_keys": False,
+    "navbar_align": "left",
+    "header_links_before_dropdown": 6,
+    "footer_end": [],
+    "pygments_light_style": "tango",
+}
+
+
+def absolute_values(app, what, name, obj, options, lines):
+    """|x| in a docstring is an absolute value, and not the substitution that reStructuredText takes it for."""
+    for number, line in enumerate(lines):
+        if "\\" not in line:
+            lines[number] = re.sub(r"(?<!`)\|([^|`\s][^|`]*)\|(?!`)", r"\\|\1\\|", line)
+
+
+def setup(app):
+    """Sphinx calls this when it has read the settings above."""
+    app.connect("autodoc-process-docstring", absolute_values)
+    # Patterns in the table of contents name pages that need not be there.
+    place = logging.getLogger("sphinx.sphinx.directives.other")
+    place.addFilter(lambda record: "glob pattern" not in str(record.msg))

@@ -1,0 +1,118 @@
+"""The documentation: every Python block runs, every public name has an entry, and the site builds without warnings."""
+
+import ast
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from printed_commands import ROOT, TEXTS, blocks
+from test_export_recipe import leave_run
+
+import rt_torchrl
+from rt_torchrl.atomic_file import write_json
+
+RUN_HERE = ["finished_run.md", "gallery.md", "habits.md", "hypotheses.md", "unknown_systems.md"]
+
+
+def test_every_page_with_code_is_run():
+    """A page with a block needs a test that runs it, here or in another file that names the page."""
+    others = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py") if path != Path(__file__)]
+    for page in TEXTS:
+        if blocks(page, "python") and page not in RUN_HERE:
+            assert any(re.search(rf"\b{page}\b", text) for text in others), page
+
+
+def leave_finished_run(folder):
+    """A run of the turbine with random weights and two episodes, as a training leaves it."""
+    leave_run(folder, "wind_turbine", policy="bias", horizon=300.0)
+    episodes = [
+        {"episode": k, "live": "model_based", "event": "keep", "real_cost": 0.1 - 0.01 * k, "J_p": 2.0, "seconds": {}}
+        for k in range(2)
+    ]
+    write_json(folder / "metrics.json", {"episodes": episodes, "summary": {"live": "model_based"}})
+    return folder
+
+
+def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
+    leave_finished_run(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(blocks("finished_run.md", "python"))
+    exec(compile(code.replace("runs/wind_turbine/TIME-seed-0", "run"), "docs/finished_run.md", "exec"), {})
+    shown = capsys.readouterr().out
+    assert "torch.Size([601, 6]) torch.Size([600, 2])" in shown and "JonkmanController 0.0" in shown
+    assert (tmp_path / "states.png").exists() and (tmp_path / "learning.png").exists()
+
+
+def test_the_suspects_of_the_tutorial_plant_are_plants():
+    scope = {"__name__": "tutorial"}
+    exec(compile(blocks("own_plant.md", "python")[0], "docs/own_plant.md", "exec"), scope)
+    exec(compile("\n".join(blocks("hypotheses.md", "python")), "docs/hypotheses.md", "exec"), scope)
+    found = scope["Tank"]().suspects()
+    assert list(found) == ["pump lags", "pump late"] and all(len(plant.states) > 2 for plant in found.values())
+
+
+def test_the_real_turbine_has_what_its_twin_does_not_know():
+    scope = {}
+    exec(compile("\n".join(blocks("unknown_systems.md", "python")), "docs/unknown_systems.md", "exec"), scope)
+    assert len(scope["real"].states) > len(scope["twin"].states)
+
+
+def test_the_what_if_of_the_readme_runs(tmp_path):
+    (shown,) = blocks("README.md", "py")
+    scope = {"rt_torchrl": rt_torchrl, "wind": torch.full((20, 1), 11.0)}
+    exec(shown.replace("runs/wind_turbine/TIME-seed-0", str(leave_finished_run(tmp_path / "run"))), scope)
+    assert len(scope["flown"].states) == 21
+    assert not any(blocks(page, "py") for page in TEXTS if page != "README.md")  # which would not be run
+
+
+def test_the_code_of_the_gallery_draws_what_it_says(tmp_path, monkeypatch):
+    leave_finished_run(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(blocks("gallery.md", "python")).replace("runs/wind_turbine/TIME-seed-0", "run")
+    exec(compile(code, "docs/gallery.md", "exec"), {})
+    assert (tmp_path / "power_and_speed.png").exists() and (tmp_path / "flights.png").exists()
+
+
+def test_the_callback_of_the_documentation_ends_a_training():
+    scope = {}
+    exec(compile("\n".join(blocks("habits.md", "python")), "docs/habits.md", "exec"), scope)
+    said = scope["cheap_enough"]
+    assert said([{"real_cost": 0.01}, {"real_cost": 0.5}]) is None
+    assert said([{"real_cost": 0.5}, {"real_cost": 0.01}]) == "the real system costs 0.01"
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path):
+    nbformat = pytest.importorskip("nbformat", reason="the notebook needs the extra notebook")
+    nbclient = pytest.importorskip("nbclient", reason="the notebook needs the extra notebook")
+    pytest.importorskip("ipykernel", reason="the notebook needs the extra notebook")
+    notebook = nbformat.read(ROOT / "docs" / "first_steps.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert any("real_cost" in output.get("data", {}).get("text/html", "") for output in shown)
+    assert sum("image/png" in output.get("data", {}) for output in shown) == 2
+    assert (tmp_path / "runs" / "first_steps" / "weights.pt").exists()
+
+
+def test_every_public_name_has_an_entry():
+    stub = ast.parse((ROOT / "rt_torchrl" / "__init__.pyi").read_text(encoding="utf-8"))
+    (listed,) = (ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
+    assert sorted(re.findall(r"^\.\. auto\w+:: rt_torchrl\.(\w+)$", pages, re.MULTILINE)) == sorted(listed)
+
+
+def test_the_front_page_is_short():
+    assert len(TEXTS["README.md"].splitlines()) <= 200
+
+
+@pytest.mark.nightly  # .ci/run builds the site in every run; this is for those who run no .ci/run
+@pytest.mark.skipif(importlib.util.find_spec("sphinx") is None, reason="the site needs the extra docs")
+def test_the_site_builds_without_warnings(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert (tmp_path / "api" / "runs.html").exists() and not Path(tmp_path / "_build").exists()
