@@ -34,7 +34,7 @@ class Config:
         horizon: length of an episode, and of a window [s].
         threads: number of threads of the learner.
         quick: whether to make small updates of the model-free policy.
-        folder: folder of the trainings and of the results, asynchronous.json.
+        log_dir: folder of the trainings and of the results, asynchronous.json.
     """
 
     hours: float = 4.0
@@ -43,7 +43,7 @@ class Config:
     horizon: float = 600.0
     threads: int = 1
     quick: bool = False
-    folder: Path = Path("runs/asynchronous")
+    log_dir: Path = Path("runs/asynchronous")
 
     def __post_init__(self):
         check_options(self)
@@ -77,7 +77,7 @@ def trained(config: Config, seed: int, kind: str, **options) -> list[dict]:
         figures=False,
         untrained=0,
         unseen=2,
-        log_dir=config.folder / f"{kind}-{seed}",
+        log_dir=config.log_dir / f"{kind}-{seed}",
         overwrite=True,
         **options,
     )
@@ -130,9 +130,9 @@ def compared(config: Config, seed: int) -> dict[str, float]:
 
 
 def main(config: Config) -> None:
-    make_folder("folder", config.folder)
+    make_folder("log_dir", config.log_dir)
     found = [compared(config, seed) for seed in config.seeds]
-    path = write_results(config.folder / "asynchronous.json", {"config": config, "seeds": found})
+    path = write_results(config.log_dir / "asynchronous.json", {"config": config, "seeds": found})
     for each in found:
         ratio = each["asynchronous"] / each["synchronous"]
         print(

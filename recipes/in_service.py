@@ -32,7 +32,7 @@ class Config:
         pace: seconds of the turbine for each second.
         seconds: time for which the policy acts [s of the turbine].
         seed: seed of the wind, if the server is started here.
-        folder: folder of the results, in_service.json, and of the events of the safety layer, safety.jsonl.
+        log_dir: folder of the results, in_service.json, and of the events of the safety layer, safety.jsonl.
     """
 
     policy: Annotated[Path, Positional]
@@ -43,7 +43,7 @@ class Config:
     pace: float = 25.0
     seconds: float = 600.0
     seed: int = 0
-    folder: Path = Path("runs/in_service")
+    log_dir: Path = Path("runs/in_service")
 
     def __post_init__(self):
         check_options(self)
@@ -63,12 +63,12 @@ def main(config: Config) -> None:
     from rt_torchrl.systems.exploration import LivePolicy
 
     torch.set_num_threads(1)
-    make_folder("folder", config.folder)
+    make_folder("log_dir", config.log_dir)
     served = config.served()
     plant = served.plant()
     policy = load_policy(config.policy, plant)
     options = {"protocol": config.protocol, "port": config.port, "period": served.period}
-    log = config.folder / "safety.jsonl"
+    log = config.log_dir / "safety.jsonl"
     log.unlink(missing_ok=True)
     system = served_system(plant, safe=SAFE, log=log, **options)
     actor = LivePolicy(plant, policy, ExplorationConfig(episodes=0), generator=torch.Generator())
@@ -87,7 +87,7 @@ def main(config: Config) -> None:
         "late_answers": float(client.late),
         "lost_connections": float(client.losses),
     }
-    path = write_results(config.folder / "in_service.json", {"config": config, **found})
+    path = write_results(config.log_dir / "in_service.json", {"config": config, **found})
     for name, value in found.items():
         print(f"{name.replace('_', ' '):<24}{value:.6g}")
     print(f"results in {path}")

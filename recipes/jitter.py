@@ -32,7 +32,7 @@ class Config:
         realtime: whether the acting process runs before all others, which needs root or CAP_SYS_NICE.
         threads: number of threads of the learner.
         seed: seed of the turbine, its policies and its wind.
-        folder: folder of the results, jitter.json.
+        log_dir: folder of the results, jitter.json.
     """
 
     seconds: float = 60.0
@@ -42,7 +42,7 @@ class Config:
     realtime: bool = False
     threads: int = 1
     seed: int = 0
-    folder: Path = Path("runs/jitter")
+    log_dir: Path = Path("runs/jitter")
 
     def __post_init__(self):
         check_options(self)
@@ -121,7 +121,7 @@ def main(config: Config) -> None:
     from rt_torchrl.systems.operation.process import ProcessOperation
 
     torch.set_num_threads(config.threads)
-    make_folder("folder", config.folder)
+    make_folder("log_dir", config.log_dir)
     learner = Learner(config)
     alone = [learner.learn() for _ in range(3)]
     plant = learner.plant
@@ -149,7 +149,7 @@ def main(config: Config) -> None:
         "learner_seconds": {"alone": float(np.median(alone)), "beside": float(np.median(rounds))},
         "learner_ratio": float(np.median(rounds) / np.median(alone)),
     }
-    path = write_results(config.folder / "jitter.json", {"config": config, **found})
+    path = write_results(config.log_dir / "jitter.json", {"config": config, **found})
     for kind in ("idle", "learning"):
         told = ", ".join(f"{name.replace('_', ' ')} {value:.6g}" for name, value in found[kind].items())
         print(f"{kind}: {told}")

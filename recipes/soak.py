@@ -40,7 +40,7 @@ class Config:
         horizon: length of a window of operation [s of the turbine].
         seed: seed of the training and of the faults.
         threads: number of threads of the learner.
-        folder: folder of the results, soak.json, and of the events of the safety layer, safety.jsonl.
+        log_dir: folder of the results, soak.json, and of the events of the safety layer, safety.jsonl.
     """
 
     hours: float = 2.0
@@ -51,7 +51,7 @@ class Config:
     horizon: float = 600.0
     seed: int = 0
     threads: int = 1
-    folder: Path = Path("runs/soak")
+    log_dir: Path = Path("runs/soak")
 
     def __post_init__(self):
         check_options(self)
@@ -63,7 +63,7 @@ class Config:
     def served(self) -> Served:
         """The training whose parts operate."""
         given = {"protocol": self.protocol, "port": self.port, "pace": self.pace, "horizon": self.horizon}
-        options = {"seed": self.seed, "threads": self.threads, "log_dir": self.folder / "run", "overwrite": True}
+        options = {"seed": self.seed, "threads": self.threads, "log_dir": self.log_dir / "run", "overwrite": True}
         return dataclasses.replace(Served().defaults(), **given, **options)
 
 
@@ -138,7 +138,7 @@ def operate(config: Config, algorithm, server, until: float) -> tuple[list[dict[
         for process, pid in pids.items():
             found[f"{process}_MiB"], found[f"{process}_handles"] = usage(pid)
         rounds.append(found | {"left": until - time.monotonic()})
-        write_results(config.folder / "soak.json", {"config": config, "rounds": rounds})
+        write_results(config.log_dir / "soak.json", {"config": config, "rounds": rounds})
     return rounds, refused
 
 
@@ -149,8 +149,8 @@ def main(config: Config) -> None:
     if not Path("/proc/self/fd").is_dir():
         raise ValueError("the soak reads memory and file handles from /proc, which this system does not have.")
     torch.set_num_threads(config.threads)
-    make_folder("folder", config.folder)
-    log = config.folder / "safety.jsonl"
+    make_folder("log_dir", config.log_dir)
+    log = config.log_dir / "safety.jsonl"
     log.unlink(missing_ok=True)
     served = config.served()
     plant = served.plant()
@@ -190,7 +190,7 @@ def write(config: Config, rounds, refused: list[str], faults: list[dict[str, flo
         "cost": {"mean": float(costs.mean()), "standard_error": float(costs.std() / len(costs) ** 0.5)},
         "rounds": rounds,
     }
-    path = write_results(config.folder / "soak.json", {"config": config, **found})
+    path = write_results(config.log_dir / "soak.json", {"config": config, **found})
     for process, values in found["processes"].items():
         told = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
         print(f"{process}: {told}")

@@ -117,7 +117,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
 
 
 def test_one_word_for_the_folder_of_the_results():
-    """Recipes that read a run, and write beside it or nowhere, have none."""
-    without = {"benchmark", "compare", "export", "record_log", "report"}
+    """Recipes that print, or read a run and write beside it or nowhere, have none."""
+    without = {"benchmark", "compare", "coverage", "export", "record_log", "report"}
     for name in set(RECIPES) - without:
         assert "--log-dir" in help_of(name), name

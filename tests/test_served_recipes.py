@@ -32,7 +32,9 @@ def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
     export_program(parts["model_based"], tmp_path / "law.pt2", physics_of(config))
     module = recipe("in_service")
     module.main(
-        module.Config(policy=tmp_path / "law.pt2", port=free_port(), pace=PACE, seconds=20.0, folder=tmp_path / "found")
+        module.Config(
+            policy=tmp_path / "law.pt2", port=free_port(), pace=PACE, seconds=20.0, log_dir=tmp_path / "found"
+        )
     )
     found = json.loads((tmp_path / "found" / "in_service.json").read_text())
     assert found["intervals"] == 40.0 and found["lost_connections"] == 0.0 and found["J_a"] > 0.0
@@ -42,7 +44,7 @@ def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
 def test_a_short_soak_counts_its_faults_and_handles(tmp_path):
     module = recipe("soak")
     options = {"hours": 0.02, "faults": 10.0, "pace": PACE, "horizon": 30.0, "port": free_port()}
-    module.main(module.Config(folder=tmp_path, **options))
+    module.main(module.Config(log_dir=tmp_path, **options))
     found = json.loads((tmp_path / "soak.json").read_text())
     assert found["faults"] and found["safety_events"] > 0
     for process in ("learner", "acting", "server"):
@@ -52,7 +54,7 @@ def test_a_short_soak_counts_its_faults_and_handles(tmp_path):
 @pytest.mark.nightly
 def test_jitter_is_measured_with_and_without_learning(tmp_path):
     module = recipe("jitter")
-    module.main(module.Config(seconds=5.0, turns=1, folder=tmp_path))
+    module.main(module.Config(seconds=5.0, turns=1, log_dir=tmp_path))
     found = json.loads((tmp_path / "jitter.json").read_text())
     for kind in ("idle", "learning"):
         assert found[kind]["intervals"] >= 100.0
@@ -64,7 +66,7 @@ def test_jitter_is_measured_with_and_without_learning(tmp_path):
 def test_trainings_of_the_same_real_time_are_compared(tmp_path):
     module = recipe("asynchronous")
     options = {"hours": 0.05, "horizon": 60.0, "seeds": (0,), "quick": True, "pace": 10.0}
-    module.main(module.Config(folder=tmp_path, **options))
+    module.main(module.Config(log_dir=tmp_path, **options))
     (found,) = json.loads((tmp_path / "asynchronous.json").read_text())["seeds"]
     assert found["synchronous"] > 0.0 and found["asynchronous"] > 0.0 and found["learning_share"] > 0.0
 

@@ -88,5 +88,5 @@ def test_yardsticks_are_measured_on_the_plant_of_the_trainings():
     short = configured(RECIPES / "flapping_wing.py", ("--quick", "--horizon", "1.25"))
     assert short.plant().horizon == pytest.approx(1.25) and short.episodes == 3
     for name, default in shipped_plants().items():
-        if (RECIPES / f"{name}.py").exists():
+        if (RECIPES / f"{name}.py").exists() and name != "cascaded_tanks":  # whose recipe trains on a record alone
             assert configured(RECIPES / f"{name}.py", ()).plant().extra_repr() == default().extra_repr()

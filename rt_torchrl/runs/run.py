@@ -6,7 +6,7 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
@@ -25,6 +25,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import checkpoint, reference, results
 from rt_torchrl.runs.callbacks import Callback
 from rt_torchrl.runs.dashboard import Dashboard
+from rt_torchrl.runs.drawing import Drawing, PlantFigures, first_flights
 from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, operation_of
@@ -43,14 +44,8 @@ from rt_torchrl.twinning.cloning import of_each_role
 from rt_torchrl.twinning.hypotheses.choice import make_twin
 from rt_torchrl.twinning.referees import Role
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # only its type: a run loads Matplotlib when it draws
-
-    from rt_torchrl.systems.operation.operation import Operation
-
 CHECKED_STEPS = 10
 """Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
-PlantFigures = Callable[[Snapshot], dict[str, "Figure"]]
 
 
 class Run:
@@ -99,7 +94,7 @@ class Run:
         self.started = time.perf_counter()
         quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
-        self.plant_figures, self.animate = plant_figures, animate
+        self.drawing = Drawing(plant_figures, animate)
         stopping = self.config.stopping()
         self.callbacks: list[Callback] = [*callbacks, *([stopping] if stopping else [])]
         device = require_device(config.device)
@@ -149,11 +144,9 @@ class Run:
         closure = config.make_closure(physics, generator).to(device)
         policies = config.acting_policies(policies, physics, closure)
         first = self._start(physics, closure)
-        system: EnvBase | Operation = env
-        if config.asynchronous:
-            system = operation_of(config, env, make_env, physics, acting_by_name(policies, first), folder=self.folder)
+        acting = acting_by_name(policies, first)
         self.algorithm = ReinforcementTwinning(
-            system,
+            operation_of(config, env, make_env, physics, acting, folder=self.folder) if config.asynchronous else env,
             make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine, compiled=compiled),
             model_free=policies["model_free"],
             model_based=policies["model_based"],
@@ -219,7 +212,11 @@ class Run:
             metrics = self._results(gap, flights, judged)
             if self.config.figures:
                 bar.doing("drawing the figures")
-                self._draw(dashboard, judged)
+                live = self.algorithm.referee.live
+                flown = first_flights(self.unseen, live, self.algorithm.policies[live], self.baselines)
+                unseen = {"unseen": figures.unseen(judged, self.unseen.categories())}
+                images = self.drawing.save(self._snapshot(), self.folder / "figures", first=flown, last=unseen)
+                dashboard.images(images, len(self.episodes) - 1)
         table = results_table(metrics)
         dashboard.results(options, metrics["summary"], table)
         dashboard.close()
@@ -268,8 +265,7 @@ class Run:
         every = self.config.figures_every if self.config.figures else 0
         if every and len(self.episodes) % every == 0 and len(self.episodes) < self.config.episodes:
             safe_point()
-            drawn = self._figures(self._snapshot())
-            dashboard.images({name: figures.pixels(figure) for name, figure in drawn.items()}, len(self.episodes) - 1)
+            dashboard.images(self.drawing.images(self._snapshot()), len(self.episodes) - 1)
 
     def _follow_wear(self) -> None:
         """Give the unseen episodes the real system's present closure, if it is known."""
@@ -300,30 +296,3 @@ class Run:
 
     def _snapshot(self) -> Snapshot:
         return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)
-
-    def _figures(self, snapshot: Snapshot) -> dict[str, "Figure"]:
-        return figures.figures_of(snapshot) | self.plant_figures(snapshot)
-
-    def _flights(self) -> dict[str, "Figure"]:
-        """The figure of the first unseen episode under the live policy and the classical controllers.
-
-        It is left out on a real system of unknown closure, where these would be flights of their own.
-        """
-        if self.unseen.closure is None:
-            return {}
-        live, first = self.algorithm.referee.live, self.unseen.first(1)
-        flown: dict[str, Trajectory] = {live: first.fly(self.algorithm.policies[live])}
-        flown |= {name: first.fly_baseline(law) for name, law in self.baselines.items()}
-        return {"flights": figures.flights(self.unseen.physics, {who: one.each()[0] for who, one in flown.items()})}
-
-    def _draw(self, dashboard: Dashboard, judged: dict[str, Judged]) -> None:
-        snapshot = self._snapshot()
-        drawn = self._flights() | self._figures(snapshot)
-        drawn |= {"unseen": figures.unseen(judged, self.unseen.categories())}
-        (self.folder / "figures").mkdir(exist_ok=True)
-        images = {name: figures.pixels(figure) for name, figure in drawn.items()}
-        for name, image in images.items():
-            figures.save_pixels(image, self.folder / "figures" / f"{name}.png")
-        dashboard.images(images, len(self.episodes) - 1)
-        if self.animate:
-            self.animate(snapshot, self.folder / "figures" / "animation.gif")
