@@ -87,6 +87,11 @@ def test_a_printed_training_begins(command, clone, tmp_path):
     """Up to its first real episode; the tests of the algorithm train on."""
     if "rosco" in command:
         pytest.importorskip("rosco")
+    folder = re.search(r"(runs/wind_turbine/TIME-seed-0)/config\.json", command)
+    if folder:  # the options of a run that is there
+        require_begun(
+            f"uv run recipes/wind_turbine.py --quick --log-dir {folder[1]}", clone, tmp_path, r"real episode \d"
+        )
     require_begun(command, clone, tmp_path, r"real episode \d")
 
 

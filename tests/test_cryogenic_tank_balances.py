@@ -49,7 +49,7 @@ def assert_balances(ledger, first, last):
     assert (gap.abs() < 1e-8 * heat).all()
 
 
-@pytest.mark.parametrize("n", [480, pytest.param(14_400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [480, pytest.param(14_400, marks=pytest.mark.nightly)])
 @torch.no_grad()
 def test_mass_and_energy_are_conserved(plant, n):
     ledger, policy = Ledger(plant), plant.make_policy(seeded(2))

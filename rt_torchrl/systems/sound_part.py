@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.safety import SafetyLayer
@@ -99,7 +98,7 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
     return SoundPart(list(zip(starts, ends, strict=True)), faults, "; ".join(said), whole)
 
 
-def report_of(env: EnvBase) -> SafetyReport | None:
+def report_of(env: object) -> SafetyReport | None:
     """The report of the safety layer of a real system about its last episode; None if there is none."""
     inner: Any = env
     while inner is not None and not isinstance(inner, SafetyLayer):

@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.exploration import LivePolicy
+from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.sound_part import (
     SHORTEST,
     EpisodeEndedError,
@@ -75,7 +76,7 @@ class RealFlights:
     """Real episodes of the algorithm: each is flown, and flown again if too little of it is sound.
 
     Args:
-        env: the real system.
+        env: the real system, or an operation of one.
         actor: what acts in the rollout.
         rollout: function that flies one episode of batch size 1.
         plant: plant that gives the length of an episode.
@@ -83,7 +84,12 @@ class RealFlights:
     """
 
     def __init__(
-        self, env: EnvBase, actor: LivePolicy, rollout: Callable[[], TensorDict], plant: Plant, least_sound: float
+        self,
+        env: EnvBase | Operation,
+        actor: LivePolicy,
+        rollout: Callable[[], TensorDict],
+        plant: Plant,
+        least_sound: float,
     ):
         self.env, self.actor, self.rollout, self.plant = env, actor, rollout, plant
         self._least = max(SHORTEST, least_sound * plant.n_steps)
