@@ -34,6 +34,7 @@ def cell(size, contender, quantity="gradient", wall=float("nan"), **more):
     return Cell(size, contender, quantity, wall, wall, 2.0 * wall, 1, wall, 0.0, **more)
 
 
+@pytest.mark.slow
 def test_every_engine_is_timed_and_compared(tmp_path):
     found = compared(tmp_path, *SMALL, "--engines", "parallel", "autograd", "odeint_adjoint")
     assert set(found) == {
