@@ -150,13 +150,13 @@ def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(mon
     twin, assimilation = ensemble(PLANT, call=0.05)
     (lagging, _), generator = recorded(LaggedActuator(PLANT, "force", LAG)), torch.Generator()
     assimilation.update([lagging], (), 1, generator)
-    assert not assimilation.explain(0.04, [lagging], generator)
+    assert not assimilation.explain(0.04, generator)
     assert twin.weights == {ALONE: 1.0} and assimilation.report() == {f"hypothesis/{n}": n == ALONE for n in twin.twins}
-    assert assimilation.explain(0.06, [lagging], generator) and twin.weights == {"lags": 1.0}
+    assert assimilation.explain(0.06, generator) and twin.weights == {"lags": 1.0}
     # The one that explains the records stays, and is fitted to each new one.
-    assert not assimilation.explain(0.0, [lagging], generator) and assimilation.called
+    assert not assimilation.explain(0.0, generator) and assimilation.called
     twin.weights = {ALONE: 1.0}
-    assert not assimilation.explain(0.0, [lagging], generator) and not assimilation.called
+    assert not assimilation.explain(0.0, generator) and not assimilation.called
 
 
 def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):

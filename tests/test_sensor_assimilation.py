@@ -1,5 +1,7 @@
 """Step 4 from some sensors: the closure is that of the whole state, and plans cost the same."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -8,6 +10,7 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.identification.sensor_record import sensor_record
 from rt_torchrl.identification.sensors import sensors_of
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import AssimilationConfig
@@ -107,3 +110,11 @@ def test_what_does_not_go_with_sensors_is_refused():
         make_assimilation(twin, config("rotor_speed"), NONE)
     with pytest.raises(ValueError, match="roof cannot be measured"):
         make_assimilation(DigitalTwin(plant, closure), config("roof"), NONE)
+
+
+def test_a_recipe_that_fits_sensors_leaves_the_hypotheses_out():
+    recipe = load_recipe(Path(__file__).parent.parent / "recipes" / "cryogenic_tank.py").Config
+    asked = ["--twinning.assimilation.sensors", "pressure", "--twinning.assimilation.initial", "estimated"]
+    asked += ["--twinning.assimilation.method", "levenberg_marquardt", "--twinning.assimilation.inputs", "record"]
+    assert from_command_line(recipe, asked).twinning.hypotheses.which == "none"
+    assert from_command_line(recipe, []).twinning.hypotheses.which == "automatic"

@@ -21,6 +21,7 @@ from rt_torchrl.runs.loggers import LoggerName, require_loggers
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.referees import Role
 
 SPREAD_OF_IMITATION = 0.02
@@ -248,8 +249,11 @@ class RunConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
 
         A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
-        Without that noise the critic cannot be trusted far, and updates of the model-free policy are judged.
+        Without that noise the critic cannot be trusted far, and updates of the model-free policy are judged. Hypotheses
+        replay the whole state, and are left out where the twin is fitted to some sensors alone.
         """
+        if self.twinning.assimilation.sensors:
+            twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which="none"))
         if self.start == "random":
             return twinning
         exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)

@@ -153,7 +153,7 @@ class ReinforcementTwinning:
             self.virtual.learn(flight.record) if on_twin else None
         if on_twin:
             self.assimilate(records)
-            self.assimilation.explain(self.examination.replayed(records), records, self.generator)
+            self.assimilation.explain(self.examination.replayed(records), self.generator)
             self.planning.remember() if "model_based" in pupils else None
         imitating = {role: self.policies[role] for role in pupils}
         found = self.cloning.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
@@ -209,7 +209,7 @@ class ReinforcementTwinning:
 
     def examine(self) -> TensorDict:
         """Compare what the latest real episodes cost with what the twin says of them, and seek an explanation."""
-        return self.examination.explained(self.assimilation, list(self.short_term), self.generator)
+        return self.examination.explained(self.assimilation, self.generator)
 
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""

@@ -225,8 +225,10 @@ class Assimilation:
             share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
         )
 
-    def explain(self, difference: float, records: Sequence[Trajectory], generator: torch.Generator) -> bool:
-        """Seek what makes real episodes cost other than the twin says; a twin alone knows nothing else.
+    def explain(self, difference: float, generator: torch.Generator) -> bool:
+        """Seek in the records of the last update why real episodes cost other than the twin says.
+
+        A twin alone has nothing to try.
 
         Returns:
             Whether the twin has changed.

@@ -57,12 +57,10 @@ class Examination:
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
 
-    def explained(
-        self, assimilation: Assimilation, records: Sequence[Trajectory], generator: torch.Generator
-    ) -> TensorDict:
+    def explained(self, assimilation: Assimilation, generator: torch.Generator) -> TensorDict:
         """As :meth:`examine`, once step 4 has sought what explains the difference."""
         found = self.examine()
-        if not assimilation.explain(self.unexplained, records, generator):
+        if not assimilation.explain(self.unexplained, generator):
             return found
         return merged(findings(**assimilation.report()), self.examine())
 

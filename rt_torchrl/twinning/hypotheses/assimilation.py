@@ -119,6 +119,7 @@ class EnsembleAssimilation(Assimilation):
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call
+        self._records: Sequence[Trajectory] = ()
 
     def update(
         self,
@@ -129,16 +130,16 @@ class EnsembleAssimilation(Assimilation):
     ) -> Descended:
         """As :meth:`Assimilation.update`, whose report is that of the twin alone, and fit the hypotheses if called."""
         found = super().update(records, processes, count, generator)
+        self._records = records
         if self.called:
-            self._weigh(records, generator)
+            self._weigh(generator)
         return found
 
-    def explain(self, difference: float, records: Sequence[Trajectory], generator: torch.Generator) -> bool:
+    def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
 
         Args:
             difference: paired difference of the latest episode beyond what exploration explains.
-            records: the records in D_S.
             generator: source of random numbers.
 
         Returns:
@@ -148,10 +149,12 @@ class EnsembleAssimilation(Assimilation):
         first = wrong and not self.called
         self.called = wrong or (self.called and set(self.ensemble.weights) != {ALONE})
         if first:
-            self._weigh(records, generator)
+            self._weigh(generator)
         return first
 
-    def _weigh(self, records: Sequence[Trajectory], generator: torch.Generator) -> None:
+    def _weigh(self, generator: torch.Generator) -> None:
+        """Fit the hypotheses to the records of the last update, and weigh them."""
+        records = self._records
         alone = misfit(self.ensemble.twins[ALONE], records, self.segment)
         misfits = {name: self._misfit(fit, records, generator) for name, fit in self.fits.items()}
         self.misfits = {ALONE: alone} | misfits

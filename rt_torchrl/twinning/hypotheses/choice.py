@@ -65,7 +65,10 @@ def make_assimilation(twin: DigitalTwin, config: AssimilationConfig, hypotheses:
         ValueError: if hypotheses are to be fitted to some sensors alone, or the plant has no such sensor.
     """
     if config.sensors and isinstance(twin, TwinEnsemble):
-        raise ValueError(f"sensors={config.sensors} of the assimilation do not go with hypotheses; leave one out.")
+        raise ValueError(
+            f"sensors={config.sensors} of the assimilation do not go with hypotheses, which replay "
+            "the whole state; leave the sensors out, or the hypotheses by hypotheses.which='none'."
+        )
     if config.sensors:
         return SensorAssimilation(twin, config)
     if isinstance(twin, TwinEnsemble):
