@@ -27,7 +27,7 @@ from rt_torchrl import (
     main_of,
     read_log,
 )
-from rt_torchrl.identification.estimate_table import metrics_of_sensors, table_of_sensors
+from rt_torchrl.identification.estimate_table import metrics_of_sensors, table_of_sensors, weight_lines
 from rt_torchrl.identification.identification import Identified, held_back, measured_states
 from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
@@ -229,10 +229,7 @@ def table(metrics: dict[str, Any]) -> str:
             lines.append(f"    {label:<30}{rms['before']:>12.4g}{rms['after']:>12.4g}")
     correlation = ", ".join(f"{name} {value:.2f}" for name, value in metrics["autocorrelation"].items())
     lines.append(f"  correlation of neighbouring residuals: {correlation}")
-    lines.append(f"  {'weight':<32}{'before':>12}{'after':>12}{'std. error':>12}")
-    for name, entry in metrics["weights"].items():
-        error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
-        lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
+    lines += weight_lines(metrics["weights"])
     return "\n".join(lines)
 
 

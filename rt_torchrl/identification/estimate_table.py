@@ -1,6 +1,7 @@
 """The result of an identification from sensors, as ``metrics.json`` and the terminal show it."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from rt_torchrl.identification.sensor_identification import SensorIdentified
@@ -56,10 +57,7 @@ def table_of_sensors(metrics: dict[str, Any]) -> str:
     lines.append(f"  noise of the sensors: {levels}")
     correlation = ", ".join(f"{name} {_shown(value)}" for name, value in metrics["autocorrelation"].items())
     lines.append(f"  correlation of neighbouring residuals: {correlation}")
-    lines.append(f"  {'weight':<32}{'before':>12}{'after':>12}{'std. error':>12}")
-    for name, entry in metrics["weights"].items():
-        error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
-        lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
+    lines += weight_lines(metrics["weights"])
     lines += [f"  note: {warning}" for warning in metrics["warnings"]]
     return "\n".join(lines)
 
@@ -70,3 +68,12 @@ def _number(value: float) -> float | None:
 
 def _shown(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.4g}"
+
+
+def weight_lines(weights: Mapping[str, Any]) -> list[str]:
+    """A line for each weight of a closure, before and after, with its standard error."""
+    lines = [f"  {'weight':<32}{'before':>12}{'after':>12}{'std. error':>12}"]
+    for name, entry in weights.items():
+        error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
+        lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
+    return lines

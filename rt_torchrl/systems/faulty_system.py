@@ -12,6 +12,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import check_options
+from rt_torchrl.systems.around_system import AroundSystem
 
 CLOCK = "time"
 """Entry of the clock that a faulty system reports."""
@@ -76,7 +77,7 @@ class Injection:
         return self.episode in (None, episode) and self.first <= interval <= last
 
 
-class FaultySystem(EnvBase):
+class FaultySystem(AroundSystem):
     """An environment with injected faults; without any it is the environment itself.
 
     It reports the system's clock as entry ``time`` [s] if the environment reports none of that name.
@@ -121,15 +122,6 @@ class FaultySystem(EnvBase):
                 f"{injection} has no place: the system observes {sorted(map(str, self.observation_spec.keys()))} and "
                 f"takes {self.action_spec.shape[-1]} actions."
             )
-
-    def __getattr__(self, name: str) -> Any:
-        """An attribute of the system, such as ``plant``, where this class has none of that name."""
-        try:
-            return super().__getattr__(name)
-        except AttributeError:
-            if name.startswith("_") or name == "env":
-                raise
-            return getattr(self.env, name)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")

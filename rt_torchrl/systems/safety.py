@@ -11,6 +11,7 @@ from torchrl.data import Binary, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.action_limits import ActionLimits, components
+from rt_torchrl.systems.around_system import AroundSystem
 from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
 
@@ -22,7 +23,7 @@ WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
 
 
-class SafetyLayer(EnvBase):
+class SafetyLayer(AroundSystem):
     r"""An environment with one continuous ``action``, and limits in front of it.
 
     Range and rate, :math:`|a_k - a_{k-1}| \le r\,\Delta t`, limit every action. They limit the fallback too, because
@@ -115,15 +116,6 @@ class SafetyLayer(EnvBase):
             done["truncated"] = done["done"].clone()
         self.done_spec = done
         self._watched = [k for k in self.env.full_observation_spec if observation[k].dtype.is_floating_point]
-
-    def __getattr__(self, name: str) -> Any:
-        """An attribute of the system, such as ``plant``, where the layer has none of that name."""
-        try:
-            return super().__getattr__(name)
-        except AttributeError:
-            if name.startswith("_") or name == "env":
-                raise
-            return getattr(self.env, name)
 
     @property
     def report(self) -> SafetyReport:
