@@ -90,7 +90,10 @@ def test_a_printed_training_begins(command, clone, tmp_path):
     folder = re.search(r"(runs/wind_turbine/TIME-seed-0)/config\.json", command)
     if folder:  # the options of a run that is there
         require_begun(
-            f"uv run recipes/wind_turbine.py --quick --log-dir {folder[1]}", clone, tmp_path, r"real episode \d"
+            f"uv run recipes/wind_turbine.py --quick --overwrite --log-dir {folder[1]}",
+            clone,
+            tmp_path,
+            r"real episode \d",
         )
     require_begun(command, clone, tmp_path, r"real episode \d")
 
@@ -126,7 +129,7 @@ def test_a_log_is_recorded_and_identified(clone):
 def test_a_policy_is_exported(clone):
     (command,) = (c for c in commands() if "recipes/export.py" in c)
     folder = re.search(r"runs/\S+", command).group()
-    done(LAST + folder, clone)
+    done(f"{LAST}{folder} --overwrite", clone)  # a command before may have begun a run there
     done(command, clone)
     kinds = {path.suffix for path in (clone / folder / "exported").iterdir()}
     assert {".c", ".h", ".onnx", ".pt2"} <= kinds
