@@ -18,17 +18,18 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.twinning.starts import FirstController
 
 GAINS = (0.4, 0.3)
 
 
-def twinning(*, gains=GAINS, iterations=0, model_free=None, **options):
+def twinning(*, gains=GAINS, iterations=0, model_free=None, approach=0, approach_at=3, **options):
     plant = LinearQuadratic(horizon=2.0)
     generator = torch.Generator().manual_seed(3)
     learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
-    planner = PlannerConfig(iterations=iterations, descent=DescentConfig(optimiser="lbfgs", rate=1.0))
+    descent = DescentConfig(optimiser="lbfgs", rate=1.0)
+    planner = PlannerConfig(iterations=iterations, descent=descent, approach=approach, approach_at=approach_at)
     assimilation = AssimilationConfig(iterations=3, descent=DescentConfig(rate=0.02))
     parts = {"learner": learner, "planner": planner, "assimilation": assimilation}
     return ReinforcementTwinning(
@@ -131,6 +132,28 @@ def test_the_next_plan_is_the_best_of_both_starts():
         assert torch.equal(now, weights["gain"] if kept else before) and not found.planning.others
         costs.append(found.virtual.cost(found.policies["model_based"], judged_on).item())
     assert set(other) == {"gain"} and costs[1] < costs[0]
+
+
+def test_an_approach_by_small_steps_stays_where_it_costs_less():
+    """The planner itself takes no gradient here, so that what the policy gains comes from the small steps."""
+    for at, kept in ((1, True), (2, False)):
+        found = twinning(approach=40, approach_at=at)
+        flight = found.flights.fly(found.policies["model_based"], strength=0.0, whole=True)
+        found.keep(flight)
+        found.virtual.learn(flight.record)
+        before = found.policies["model_based"].gain.detach().clone()
+        report = found.plan()
+        assert ("approached" in report) == kept
+        assert torch.equal(found.policies["model_based"].gain, before) != kept
+
+
+WINDOW = {"approach": 5, "short_horizon": ShortHorizonConfig(window=5)}
+
+
+def test_an_approach_needs_whole_episodes():
+    for options in ({"approach": -1}, {"approach_at": 0}, {"approach": 5, "method": "receding_horizon"}, WINDOW):
+        with pytest.raises(ValueError, match="approach"):
+            PlannerConfig(**options)
 
 
 def run(folder, **options):

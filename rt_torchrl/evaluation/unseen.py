@@ -1,7 +1,7 @@
 """Evaluation of twin and policies on episodes that they were never trained on."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline
-from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -206,8 +206,6 @@ def untrained_costs(
 
 
 TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
-APPROACH = tuple(DescentConfig(rate=rate, gradient_limit=0.1, second_moment=0.99) for rate in (0.02, 0.005))
-"""Adam's options for the two halves of an approach."""
 FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}
 """Numbers of gradients with which three starts of a small perceptron end within 3 % of each other."""
 
@@ -249,20 +247,21 @@ def exact_optimum(
     """
     generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
 
-    def descend(policy: nn.Module, count: int, steps: Sequence[tuple[DescentConfig, int]]) -> float:
+    def descend(policy: nn.Module, count: int, steps: int, *, approaching: int = 0) -> float:
         rollout = unseen._rollout(policy)
         state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
 
         def cost() -> Tensor:
             return rollout.costs(state, exogenous).mean()
 
-        return [Descent(policy, config).run(cost, iterations).best for config, iterations in steps][-1]
+        if approaching:
+            by_small_steps(policy, cost, approaching)
+        return Descent(policy, TO_THE_END).run(cost, steps).best
 
-    first = [(config, approach // 2) for config in APPROACH if approach]
     policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
-    costs = [descend(policy, few, [*first, (TO_THE_END, iterations)]) for policy in policies]
+    costs = [descend(policy, few, iterations, approaching=approach) for policy in policies]
     best = policies[min(range(starts), key=costs.__getitem__)]
-    return Optimum(descend(best, len(unseen.initial_state), [(TO_THE_END, polish)]), best, costs)
+    return Optimum(descend(best, len(unseen.initial_state), polish), best, costs)
 
 
 def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:

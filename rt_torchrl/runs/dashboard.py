@@ -19,6 +19,7 @@ TAGS = {
     "J_a_plan_before": "cost/J_a before planning (twin)",
     "J_a_plan": "cost/J_a after planning (twin)",
     "plan_accepted": "switch/plan accepted",
+    "approached": "switch/plan by small steps accepted",
     "J_p_before": "twin/J_p before assimilation",
     "J_p": "twin/J_p after assimilation",
     "closure_refused": "twin/closure refused",

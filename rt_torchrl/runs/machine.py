@@ -1,6 +1,7 @@
 """Devices and compilation on this machine, and the libraries' log lines."""
 
 import logging
+import os
 import warnings
 
 import torch
@@ -13,6 +14,7 @@ NOISY = ("torchrl", "torch.utils.cpp_extension")
 
 def quieten_libraries() -> None:
     """Keep log lines and warnings off the terminal that concern the libraries' own code, which a user cannot mend."""
+    os.environ.setdefault("RL_LOGGING_LEVEL", "ERROR")  # TorchRL sets its own level when it is loaded, which is later
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.ERROR)
     # Code of PyTorch and TorchRL themselves causes this warning, with new versions of PyTorch.

@@ -97,7 +97,7 @@ class ReinforcementTwinning:
         self.clearance = Clearance(system, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
-        self.planning = Planning(self.planner, self.virtual)
+        self.planning = Planning(self.planner, self.virtual, config.planner)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)
@@ -222,7 +222,7 @@ class ReinforcementTwinning:
             require_sound_twin=lambda episodes: self.track_record.require_sound_twin(self.virtual, episodes),
             evidence=self.examination.judge(self.short_term[-1]) if by_evidence else None,
         )
-        return self.planning.plan(planned_on, judged_on, judgement)
+        return self.planning.plan(self.episodes_done + 1, planned_on, judged_on, judgement)
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:

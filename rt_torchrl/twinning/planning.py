@@ -7,12 +7,12 @@ from typing import NamedTuple
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.optimisers.descent import Descended, by_small_steps
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.examination import RealJudge
 from rt_torchrl.twinning.findings import findings, merged
-from rt_torchrl.twinning.planners import Planner
+from rt_torchrl.twinning.planners import Planner, PlannerConfig
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
@@ -50,16 +50,18 @@ class Planning:
     Args:
         planner: planner of step 5.
         virtual: virtual episodes.
+        config: parameters of step 5.
     """
 
-    def __init__(self, planner: Planner, virtual: VirtualEpisodes):
-        self.planner, self.virtual = planner, virtual
+    def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig):
+        self.planner, self.virtual, self.config = planner, virtual, config
         self.others: list[dict[str, Tensor]] = []
 
-    def plan(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
+    def plan(self, episode: int, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """Plan, and go back to the earlier weights if the plan is worse.
 
         Args:
+            episode: number of the real episode, from 1.
             planned_on: virtual episodes of the plan.
             judged_on: virtual episodes on which it is judged.
             judgement: how it is judged.
@@ -79,6 +81,9 @@ class Planning:
         while self.others:
             other = self._from_others(self.others.pop(), planned_on, judged_on)
             found = found if other is None else other
+        if self.config.approach and episode == self.config.approach_at:
+            further = self._from_others(policy.state_dict(), planned_on, judged_on, approach=self.config.approach)
+            found = merged(found if further is None else further, findings(approached=float(further is not None)))
         return found
 
     def remember(self) -> None:
@@ -86,13 +91,17 @@ class Planning:
         if not isinstance(self.planner.policy, StateFeedback):
             self.others.append(copy.deepcopy(self.planner.policy.state_dict()))
 
-    def _from_others(self, weights: dict[str, Tensor], planned_on: Scenario, judged_on: Scenario) -> TensorDict | None:
+    def _from_others(
+        self, weights: dict[str, Tensor], planned_on: Scenario, judged_on: Scenario, *, approach: int = 0
+    ) -> TensorDict | None:
         """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
         policy = self.planner.policy
         best, least = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on)
         policy.load_state_dict(weights)
         self.planner.restart()
         try:
+            if approach:
+                by_small_steps(policy, lambda: self.virtual.twin.cost(policy, *planned_on), approach)
             found = self.planner.plan(planned_on)
         except FloatingPointError:
             found = None  # the twin is sound with the present policy, so that these weights are to blame

@@ -114,6 +114,7 @@ def _operate(crew: Crew, state: dict[str, Any] | None, orders: SimpleQueue[Any],
                 operator.follow(order)
                 order = _next(orders)
     finally:
+        gc.unfreeze()  # otherwise libraries report at the end of the process what nobody has freed
         operator.env.close()
 
 

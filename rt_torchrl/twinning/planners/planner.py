@@ -98,6 +98,10 @@ class PlannerConfig:
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
+        approach: number of gradients of Adam with small steps that lead to one more plan, which stays if it costs less
+            on other virtual episodes; 0 for none. A descent from the imitation of a controller may end in a minimum
+            beside that controller, which small steps lead past.
+        approach_at: number of the episode whose step 5 makes that plan. The twin should be right by then.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         descent: parameters of the policy's descent over whole episodes.
         short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
@@ -108,6 +112,8 @@ class PlannerConfig:
     method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
     iterations: int = 10
     realisations: int | None = None
+    approach: int = 0
+    approach_at: int = 3
     experience: int = 100
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
@@ -122,6 +128,16 @@ class PlannerConfig:
             )
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
+        if self.approach < 0 or self.approach_at < 1:
+            raise ValueError(
+                f"approach={self.approach} of the planning must not be negative, and approach_at={self.approach_at} "
+                "must be at least 1."
+            )
+        if self.approach and (self.short_horizon.window or self.method == "receding_horizon"):
+            raise ValueError(
+                f"approach={self.approach} of the planning belongs to descents over whole episodes; leave it out, or "
+                "short_horizon.window and method=receding_horizon."
+            )
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
         if self.experience < 1:
