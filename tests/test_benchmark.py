@@ -90,14 +90,8 @@ def test_an_iteration_of_step_2_is_timed_by_formula_and_by_torchrls_losses():
     assert 0.0 < found["explicit"] < found["torchrl"] < 1e3
 
 
-@pytest.mark.parametrize(
-    "plant",
-    [
-        pytest.param("wind_turbine", marks=pytest.mark.slow),
-        pytest.param("flapping_wing", marks=pytest.mark.nightly),  # minutes of backpropagation
-        pytest.param("cryogenic_tank", marks=pytest.mark.nightly),
-    ],
-)
+@pytest.mark.nightly  # minutes of backpropagation
+@pytest.mark.parametrize("plant", ["wind_turbine", "flapping_wing", "cryogenic_tank"])
 def test_engines_agree_over_a_whole_episode(tmp_path, plant):
     steps = {"wind_turbine": "1200", "flapping_wing": "10000", "cryogenic_tank": "14400"}[plant]
     sizes = ["--horizons", steps, "--at-horizon", steps, "--realisations", "2", "--at-realisations", "2"]

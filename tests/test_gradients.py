@@ -219,18 +219,17 @@ import sys
 sys.path.insert(0, "tests")
 from test_gradients import Case, LinearQuadratic, relative_gap
 
-for driver in ("commands", "policy"):
-    for batch in (1, 4):
-        case = Case(LinearQuadratic(dt=0.1, horizon=2.0), "own", driver, batch)
-        # Like the start of a record: a slice, whose strides are not those of a fresh tensor.
-        case.initial_state = case.initial_state.unsqueeze(1).repeat(1, 5, 1)[:, 0]
-        exact = case.gradients("autograd")
-        for engine in ("parallel", "parallel_in_time", "autograd", "odeint_adjoint"):
-            eager, compiled = (case.gradients(engine, compiled=flag) for flag in (False, True))
-            for name in exact:
-                gap = relative_gap(compiled[name], eager[name])
-                # Fused multiply-adds and another order of the sums.
-                assert gap < 1e-11, (driver, batch, engine, name, gap)
+for driver, batch in (("commands", 1), ("policy", 4)):
+    case = Case(LinearQuadratic(dt=0.1, horizon=2.0), "own", driver, batch)
+    # Like the start of a record: a slice, whose strides are not those of a fresh tensor.
+    case.initial_state = case.initial_state.unsqueeze(1).repeat(1, 5, 1)[:, 0]
+    exact = case.gradients("autograd")
+    for engine in ("parallel", "parallel_in_time", "autograd", "odeint_adjoint"):
+        eager, compiled = (case.gradients(engine, compiled=flag) for flag in (False, True))
+        for name in exact:
+            gap = relative_gap(compiled[name], eager[name])
+            # Fused multiply-adds and another order of the sums.
+            assert gap < 1e-11, (driver, batch, engine, name, gap)
 print("compared")
 """
 
