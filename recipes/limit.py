@@ -30,6 +30,7 @@ from rt_torchrl.evaluation.limits import (
 )
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.runs.run_config import plant_of
@@ -58,6 +59,8 @@ class Config:
             among them.
         mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none while it
             commands the drop.
+        mpc_iterations: greatest number of iterations in a solve of model predictive control; 0 for the recipe's.
+        mpc_tolerance: relative decrease of the cost below which a solve ends; 0 for the recipe's.
         run: folder of a training. Its plant takes the place of plant, with its cost, command and limits; its policies
             are judged beside the controllers, and model predictive control plans on its closure, too.
         folder: folder of the results, which are in PLANT.json.
@@ -71,13 +74,15 @@ class Config:
     hold: int = 0
     starts: Literal["all", "classical"] = "all"
     mpc: tuple[Literal["held", "decaying", "preview"], ...] = ("held", "decaying", "preview")
+    mpc_iterations: int = 0
+    mpc_tolerance: float = 0.0
     run: Path | None = None
     folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/limit")
     descent: BoundedDescentConfig = field(default_factory=lambda: TO_THE_END)
 
     def __post_init__(self):
         check_options(self)
-        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0)):
+        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0), ("mpc_iterations", 0), ("mpc_tolerance", 0)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
         if self.run is not None and (self.plant is not None or self.horizon is not None):
@@ -137,13 +142,19 @@ def contenders(
         yield role, learned(episodes, policy)
     if known.window is None:
         return
-    window = fitting(known.window, plant)
+    window = fitting(chosen_window(config, known.window), plant)
     foreseen = forecasts(plant, episodes.exogenous, window.horizon)
     models = {"exact": (plant, episodes.known_closure())}
     models |= {} if run is None else {"fitted": (run.physics, run.closure)}
     for title, model in models.items():
         for name in config.mpc:
             yield f"MPC, {title}, {name}", receding(episodes, *model, window, foreseen[name])
+
+
+def chosen_window(config: Config, window: PredictiveConfig) -> PredictiveConfig:
+    """The recipe's window with the solves that are asked for."""
+    asked = {"iterations": config.mpc_iterations, "tolerance": config.mpc_tolerance}
+    return dataclasses.replace(window, **{name: value for name, value in asked.items() if value})
 
 
 def header(best: Contender) -> str:

@@ -1,6 +1,7 @@
 """The recipe of the limits, on short episodes, and the start that rests at the end."""
 
 import ast
+import dataclasses
 import json
 import math
 import re
@@ -16,6 +17,7 @@ from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
 from rt_torchrl.evaluation.limits import resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.runs.results_file import write_results
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -55,13 +57,21 @@ def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
 
 def test_a_run_has_its_own_cost_and_command(tmp_path):
     config, _ = leave_run(tmp_path / "run", "cryogenic_tank", command="duty", end_weight=7200.0, horizon=7200.0)
-    found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",)), config.plant()
+    found, plant = run(tmp_path, run=tmp_path / "run", mpc=("held",), mpc_iterations=1), config.plant()
+    assert found["MPC, exact, held"]["details"]["gradients"] <= 3
     planned = ["MPC, exact, held", "MPC, fitted, held"]
     assert list(found) == ["clairvoyant", "on-off", "on-off, resting", "PI", "model-based", "model-free", *planned]
     episodes = UnseenEpisodes(plant, 2)
     judged = episodes.judge(episodes.fly_baseline(OnOffValve(plant)))
     assert found["on-off"]["costs"] == judged.control_costs.tolist()
     assert min(map(mean, found.values())) == mean(found["clairvoyant"])
+
+
+def test_solves_have_the_recipes_window_with_what_is_asked_for():
+    module, window = recipe("limit"), PredictiveConfig(horizon=2.0, iterations=7)
+    assert module.chosen_window(module.Config(), window) == window
+    found = module.chosen_window(module.Config(mpc_iterations=60, mpc_tolerance=1e-6), window)
+    assert found == dataclasses.replace(window, iterations=60, tolerance=1e-6)
 
 
 @pytest.mark.parametrize("option", [{"plant": "wind_turbine"}, {"horizon": 15.0}])
