@@ -134,6 +134,21 @@ def test_the_next_plan_is_the_best_of_both_starts():
     assert set(other) == {"gain"} and costs[1] < costs[0]
 
 
+def test_an_approach_begins_from_the_first_weights_too_also_after_a_resumption():
+    """From the imitation no step is allowed to help; the weights before it are the optimum already."""
+    best = {"gain": torch.tensor([[0.9, 1.1]], dtype=torch.float64)}
+    begun, resumed = (twinning(approach=2, approach_at=2) for _ in range(2))
+    begun.policies["model_based"].load_state_dict(best)
+    begun.start()
+    begun.planning.others.clear()
+    resumed.load_state_dict(begun.state_dict())
+    resumed.episodes_done = 1
+    before = resumed.virtual.cost(resumed.policies["model_based"], judged_on := resumed.virtual.draw(50))
+    assert resumed.plan()["approached"] == 1.0 and resumed.planning.state_dict() == {"first": []}
+    assert resumed.virtual.cost(resumed.policies["model_based"], judged_on) < before
+    torch.testing.assert_close(resumed.policies["model_based"].gain.detach(), best["gain"], rtol=0, atol=0.05)
+
+
 def test_an_approach_by_small_steps_stays_where_it_costs_less():
     """The planner itself takes no gradient here, so that what the policy gains comes from the small steps."""
     for at, kept in ((1, True), (2, False)):

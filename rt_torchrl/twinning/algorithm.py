@@ -297,4 +297,4 @@ class ReinforcementTwinning:
 
 
 KEPT = ("virtual", "short_term", "informative", "track_record")  # they leave the tensors of their state on their device
-COMPONENTS = ("env", "learner", "planner", "referee", "assimilation", "clearance", *KEPT)
+COMPONENTS = ("env", "learner", "planner", "planning", "referee", "assimilation", "clearance", *KEPT)

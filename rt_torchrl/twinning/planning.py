@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -56,6 +56,7 @@ class Planning:
     def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig):
         self.planner, self.virtual, self.config = planner, virtual, config
         self.others: list[dict[str, Tensor]] = []
+        self._first: list[dict[str, Tensor]] = []
 
     def plan(self, episode: int, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """Plan, and go back to the earlier weights if the plan is worse.
@@ -82,14 +83,33 @@ class Planning:
             other = self._from_others(self.others.pop(), planned_on, judged_on)
             found = found if other is None else other
         if self.config.approach and episode == self.config.approach_at:
-            further = self._from_others(policy.state_dict(), planned_on, judged_on, approach=self.config.approach)
-            found = merged(found if further is None else further, findings(approached=float(further is not None)))
+            found = self._approached(found, planned_on, judged_on)
         return found
+
+    def _approached(self, found: TensorDict, planned_on: Scenario, judged_on: Scenario) -> TensorDict:
+        """The best plan by small steps from the present weights and from the first ones, or the plan found so far."""
+        accepted = False
+        for weights in (self.planner.policy.state_dict(), *self._first):
+            further = self._from_others(weights, planned_on, judged_on, approach=self.config.approach)
+            found, accepted = (found, accepted) if further is None else (further, True)
+        self._first.clear()
+        return merged(found, findings(approached=float(accepted)))
 
     def remember(self) -> None:
         """Plan from the present weights, too, the next time; state feedback has none."""
         if not isinstance(self.planner.policy, StateFeedback):
-            self.others.append(copy.deepcopy(self.planner.policy.state_dict()))
+            weights = copy.deepcopy(self.planner.policy.state_dict())
+            self.others.append(weights)
+            if self.config.approach:
+                self._first.append(weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The weights that an approach will begin with; ``others`` is empty after each episode."""
+        return {"first": list(self._first)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the :meth:`state_dict` of a planning with the same planner."""
+        self._first = list(state["first"])
 
     def _from_others(
         self, weights: dict[str, Tensor], planned_on: Scenario, judged_on: Scenario, *, approach: int = 0

@@ -98,10 +98,11 @@ class PlannerConfig:
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
-        approach: number of gradients of Adam with small steps that lead to one more plan, which stays if it costs less
-            on other virtual episodes; 0 for none. A descent from the imitation of a controller may end in a minimum
-            beside that controller, which small steps lead past.
-        approach_at: number of the episode whose step 5 makes that plan. The twin should be right by then.
+        approach: number of gradients of Adam with small steps that lead to two more plans, one from the present weights
+            and one from those before the imitation of a controller; each stays if it costs less on other virtual
+            episodes; 0 for none. A descent from the imitation of a controller may end in a minimum beside that
+            controller.
+        approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         descent: parameters of the policy's descent over whole episodes.
         short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
