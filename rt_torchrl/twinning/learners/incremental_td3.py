@@ -105,6 +105,16 @@ class IncrementalTD3:
             raise ValueError(f"trust={trust} in the twin must lie in [0, 1].")
         self._trust = trust
 
+    @property
+    def asks_for_trust(self) -> bool:
+        """Whether the trust is to be measured, because the twin is to teach something."""
+        own = self.config.incremental
+        return own.measured and (own.slopes or own.virtual > 0)
+
+    def trust_twin(self, probability: float) -> None:
+        """Trust the twin with the probability that it is right about the policy."""
+        self.trust = probability
+
     def take_twin(self, twin: DigitalTwin) -> None:
         """Learn from this twin as far as it is trusted."""
         self._teacher = TwinTeacher(twin, self.policy, self.memory)
