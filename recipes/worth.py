@@ -57,6 +57,7 @@ TREE: Options = ("--twinning.referee.rule", "decision_tree")
 CORRECTED: Options = ("--twinning.corrected-plans",)
 UNCORRECTED: Options = ("--twinning.no-corrected-plans",)
 UNTAUGHT: Options = ("--twinning.learner.incremental.trust", "0", "--twinning.learner.incremental.no-measured")
+RANDOM: Options = ("--start", "random")
 OLD_LEARNER: Options = ("--twinning.learner.algorithm", "ddpg")
 PARTS = {
     "without hypotheses": "hypotheses",
@@ -83,6 +84,8 @@ def arms_of(case: str) -> dict[str, Options]:
         "twinning of the paper": ("--paper",),
         "model-free, DDPG": free,
         "model-free, incremental TD3": (*free, *learner, *EXPLORING, *NOISE.get(case, ())),
+        "twinning from random weights": (*every, *RANDOM),
+        "the same without the referee": (*learner, *HYPOTHESES, *TREE, *CORRECTED, *RANDOM),
         "model-based": (*planned, *ALONE, *TREE, *UNCORRECTED),
         "model-based, hypotheses": (*planned, *HYPOTHESES, *EVIDENCE, *CORRECTED),
         "without hypotheses": (*learner, *ALONE, *EVIDENCE, *CORRECTED),

@@ -133,6 +133,9 @@ def test_stakes_are_those_of_a_simulation():
         ((0.2, 0.15, 0.25, 0.2, 0.18), True),
         ((3.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0), False),  # what is long ago no longer counts
         ((-0.7, -0.69, -0.71), True),
+        ((0.1, 0.9, 1.85), True),  # two in a row are no chance, however they scatter
+        ((1.67, 0.15, 0.14, 0.12, 0.13), True),  # one bad policy does not hide the others
+        ((1.67, 0.0, 0.02, -0.03, 0.05), False),
     ],
 )
 def test_the_alarm(differences, wrong):

@@ -139,7 +139,8 @@ class LearnerConfig:
             sum over more intervals mends that.
         reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
             scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
-        target_rate: rate τ at which the target critic, and TD3's target policy, follow.
+        target_rate: rate τ at which the target critic, and TD3's target policy, follow; those of incremental TD3 follow
+            faster where few iterations would not carry values through the horizon.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
         gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
