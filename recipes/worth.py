@@ -1,6 +1,7 @@
 """What twinning is worth: every arm, with each part off in turn, on systems that the twin knows and on others."""
 
 import json
+import shlex
 import sys
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -124,6 +125,7 @@ class Config:
         jobs: number of trainings side by side.
         folder: folder of the runs and of the results, worth.json and worth.md.
         page: page in which the findings are written, too.
+        finished: whether to compute nothing, and to write the page from the trainings that are finished so far.
     """
 
     plants: tuple[str, ...] = ("all",)
@@ -137,6 +139,7 @@ class Config:
     jobs: int = 1
     folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/worth")
     page: Path | None = None
+    finished: bool = False
 
     def __post_init__(self):
         check_options(self)
@@ -229,12 +232,16 @@ def recipe_of(case: str) -> Path:
     return Path(__file__).with_name("flapping_wing.py" if case == "hop" else f"{case}.py")
 
 
-def result(config: Config, case: str, system: str) -> SystemResult:
-    """All arms on a system, of what is kept."""
-    groups = config.trainings(case, system)
+def result(config: Config, case: str, system: str) -> SystemResult | None:
+    """All arms on a system, of the trainings that are finished; None if there are none, or no oracle."""
+    every = config.trainings(case, system)
+    done = {name: [training for training in group if training.done()] for name, group in every.items()}
+    groups = {name: group for name, group in done.items() if group}
+    if not groups or not config.optimum(case, system).done():
+        return None
     arms = [trained_arm(name, group) for name, group in groups.items()]
-    whole_set = [name for name in groups if name != "predictive control"]
-    classical = classical_arms(groups[whole_set[0]][0]) if whole_set else []
+    judged_on_all = [group[0] for name, group in groups.items() if name != "predictive control"]
+    classical = classical_arms(judged_on_all[0]) if judged_on_all else []
     return SystemResult(
         case=case.replace("_", " "),
         system=" + ".join(names(system)),
@@ -246,12 +253,10 @@ def result(config: Config, case: str, system: str) -> SystemResult:
 def command(config: Config) -> str:
     """The command line that makes the page."""
     usual, found = Config(), ["uv run recipes/worth.py"]
-    for name in ("plants", "systems", "arms"):
-        if values := getattr(config, name) if getattr(config, name) != getattr(usual, name) else ():
-            found.append(f"--{name} " + " ".join(f"'{value}'" if " " in value else value for value in values))
-    for name in ("seeds", "episodes", "unseen", "starts", "iterations"):
-        if getattr(config, name) != getattr(usual, name):
-            found.append(f"--{name} {getattr(config, name)}")
+    for name in ("plants", "systems", "arms", "seeds", "episodes", "unseen", "starts", "iterations"):
+        value = getattr(config, name)
+        if value != getattr(usual, name):
+            found.append(f"--{name} " + (shlex.join(value) if isinstance(value, tuple) else str(value)))
     return " ".join(found)
 
 
@@ -260,13 +265,16 @@ def write(config: Config) -> Path:
     from rt_torchrl.figures.style import save_figure
     from rt_torchrl.study.figures import regret  # here, because --help need not wait for Matplotlib
 
-    results = [result(config, *row) for row in config.rows()]
-    for (case, system), found in zip(config.rows(), results, strict=True):
+    kept = {row: found for row in config.rows() if (found := result(config, *row)) is not None}
+    if not kept:
+        raise ValueError(f"folder={config.folder} holds no finished training and oracle of this study; compute them.")
+    for (case, system), found in kept.items():
         save_figure(regret(found), config.folder / f"regret_{case}_{system}.png")
+    results = list(kept.values())
     page = findings_page(results, PARTS, command(config))
     (config.folder / "worth.md").write_text(f"# What twinning is worth\n\n{page}\n", encoding="utf-8")
     if config.page is not None:
-        write_into(config.page, "worth", page)
+        write_into(config.page, f"worth of {', '.join(config.cases())}", page)
     numbers = [{"case": found.case, "system": found.system, "least": found.least} for found in results]
     for number, found in zip(numbers, results, strict=True):
         number["oracle"] = found.oracle.mean
@@ -278,8 +286,9 @@ def write(config: Config) -> Path:
 
 def main(config: Config) -> None:
     make_folder("folder", config.folder)
-    tasks = config.tasks()
-    side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
+    if not config.finished:
+        tasks = config.tasks()
+        side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
     print(f"findings in {write(config)}")
 
 

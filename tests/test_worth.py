@@ -1,5 +1,6 @@
 """What twinning is worth: the plan of arms and systems, regret, alarms and the page, from results by hand."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -132,3 +133,9 @@ def test_the_page_is_written_from_what_is_kept(tmp_path):
     numbers = json.loads((config.folder / "worth.json").read_text())["systems"]
     assert numbers[1]["arms"]["twinning"]["paid"] == [[7.0, 5.0, 1.05, 1.0]] * 2
     assert (config.folder / "regret_flapping_wing_delay.png").stat().st_size > 0
+    (config.trainings("flapping_wing", "delay")["model-based"][0].folder / "metrics.json").unlink()
+    config.optimum("flapping_wing", "nothing").path.unlink()
+    rest = worth.write(config).read_text()
+    assert "### flapping wing, as the twin" not in rest and "| model-based | 1 |" in rest and "| twinning | 2 |" in rest
+    with pytest.raises(ValueError, match="holds no finished training and oracle of this study"):
+        worth.write(dataclasses.replace(config, folder=tmp_path / "none"))
