@@ -324,6 +324,12 @@ def test_the_policys_learning_rate_cools():
     assert found.actor_optimiser.param_groups[0]["lr"] == 1e-2
 
 
+@pytest.mark.parametrize("iterations, rate", [(1000, 0.01), (20, 5 / 3 * 2 / 40), (1, 0.5)])
+def test_targets_carry_values_through_the_horizon_within_two_updates(iterations, rate):
+    """Five decisions of the horizon are two targets of three decisions; the policy's delay is two."""
+    assert 1.0 - learner(critic_iterations=iterations).target.eps == pytest.approx(rate)
+
+
 def test_errors_have_settled_when_a_window_falls_no_longer():
     falling, level = torch.linspace(1.0, 0.1, 200), torch.ones(200)
     assert not settled(list(falling), 0.9) and settled(list(level), 0.9)
