@@ -139,7 +139,7 @@ def test_half_the_gain_comes_within_ten_percent(answer):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="with the rates that hold a clone of the optimum it hardly moves: J/J* = 1.28 after twenty episodes of seed 0",
+    reason="with the rates that hold a clone it hardly moves: J/J* = 1.28 after twenty episodes of seed 0",
 )
 def test_half_the_gain_comes_within_ten_percent_at_the_rates_of_the_clone(answer):
     for seed in SEEDS:
