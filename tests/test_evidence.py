@@ -216,7 +216,7 @@ def test_the_learner_trusts_the_twin_as_far_as_it_was_right(factor):
     learner = LearnerConfig(algorithm="incremental_td3", incremental=incremental, **options)
     plant = LinearQuadratic(horizon=2.0)
     found = twinning(
-        plant, closure=copy.deepcopy(plant.closure), learner=learner, exploration=ExplorationConfig(spread=0)
+        plant, closure=copy.deepcopy(plant.closure), learner=learner, exploration=ExplorationConfig(spread=0.0)
     )
     fly = found.flights.fly
 

@@ -10,7 +10,7 @@ NOTHING = 1e-6
 """Residual, as a share of a signal's own deviation, below which nothing is left over but rounding."""
 
 
-def whiteness(residuals: Float[Tensor, "n n_s"], signals: Float[Tensor, "n n_s"], *, lags: int = LAGS) -> float:
+def whiteness(residuals: Float[Tensor, "n n_s"], signals: Float[Tensor, "n_read n_y"], *, lags: int = LAGS) -> float:
     r"""Probability that residuals of white noise would be correlated as much, in at least one signal.
 
     .. math:: Q = n(n + 2)\sum_{k=1}^m\frac{r_k^2}{n - k}
