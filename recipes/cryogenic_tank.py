@@ -72,6 +72,8 @@ CONVERGED = dataclasses.replace(
         PAPER.planner, iterations=12, descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6)
     ),
     hypotheses=HypothesesConfig(),
+    referee=dataclasses.replace(PAPER.referee, rule="weight_of_evidence"),
+    corrected_plans=True,
 )
 """Configuration of the training by default, whose plans converge."""
 NEURAL = dataclasses.replace(

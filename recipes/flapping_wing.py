@@ -74,6 +74,8 @@ CONVERGED = dataclasses.replace(
         receding_horizon=PREDICTIVE,
     ),
     hypotheses=HypothesesConfig(),
+    referee=dataclasses.replace(PAPER.referee, rule="weight_of_evidence"),
+    corrected_plans=True,
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(

@@ -32,8 +32,14 @@ POLICY: dict[str, tuple[str, ...]] = {
     "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
 }
 """Policies of few weights, whose optimum exact gradients find."""
-WITH_HYPOTHESES = ("--twinning.hypotheses.which", "automatic", "--twinning.referee.rule", "weight_of_evidence")
-ALONE = ("--twinning.hypotheses.which", "none")
+WITH_HYPOTHESES = (
+    *("--twinning.hypotheses.which", "automatic"),
+    *("--twinning.referee.rule", "weight_of_evidence", "--twinning.corrected-plans"),
+)
+ALONE = (
+    *("--twinning.hypotheses.which", "none"),
+    *("--twinning.referee.rule", "decision_tree", "--twinning.no-corrected-plans"),
+)
 UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "cryogenic_tank": 50}
 """Number of unseen episodes that judge a plant by default."""
 HOPS = 192

@@ -23,6 +23,7 @@ from rt_torchrl import (
     PlannerConfig,
     Plant,
     PredictiveConfig,
+    RefereeConfig,
     RunConfig,
     TwinningConfig,
     main_of,
@@ -66,6 +67,8 @@ CONVERGED = dataclasses.replace(
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),
     hypotheses=HypothesesConfig(),
+    referee=RefereeConfig(rule="weight_of_evidence"),
+    corrected_plans=True,
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(

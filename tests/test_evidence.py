@@ -1,5 +1,6 @@
 """What real episodes say about the twin: the belief about policies, the referee that weighs it, and the alarm."""
 
+import copy
 import math
 import random
 
@@ -10,6 +11,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from test_algorithm import twinning
 
+from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -26,6 +28,8 @@ from rt_torchrl.twinning.evidence.paired_differences import (
     PairedDifferences,
     difference,
 )
+from rt_torchrl.twinning.learners import LearnerConfig
+from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
 from rt_torchrl.twinning.track_record import Differences
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -129,6 +133,9 @@ def test_stakes_are_those_of_a_simulation():
         ((0.2, 0.15, 0.25, 0.2, 0.18), True),
         ((3.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0), False),  # what is long ago no longer counts
         ((-0.7, -0.69, -0.71), True),
+        ((0.1, 0.9, 1.85), True),  # two in a row are no chance, however they scatter
+        ((1.67, 0.15, 0.14, 0.12, 0.13), True),  # one bad policy does not hide the others
+        ((1.67, 0.0, 0.02, -0.03, 0.05), False),
     ],
 )
 def test_the_alarm(differences, wrong):
@@ -183,10 +190,10 @@ def test_weights_are_recalled_that_are_expected_to_cost_less():
     assert judge_of([], []).recalled(LinearGain([[2.0, 0.0]]), episodes) is None
 
 
-@pytest.mark.parametrize("rule", ["decision_tree", "weight_of_evidence"])
-def test_a_training_goes_back_to_what_was_better_in_reality(rule):
-    """The twin's plans cost ten times as much on the real system, which the referee's evidence shows."""
-    found = twinning(arm="model_based", referee=RefereeConfig(rule=rule))
+@pytest.mark.parametrize("corrected", [False, True])
+def test_a_training_goes_back_to_what_was_better_in_reality(corrected):
+    """The twin's plans cost ten times as much on the real system, which the paired differences show."""
+    found = twinning(arm="model_based", corrected_plans=corrected)
     fly, costs = found.flights.fly, []
 
     def flown(policy, *, strength, whole):
@@ -198,4 +205,27 @@ def test_a_training_goes_back_to_what_was_better_in_reality(rule):
 
     found.flights.fly = flown
     recalled = [found.episode()["recalled"].item() for _ in range(3)]
-    assert any(recalled) == (rule == "weight_of_evidence")
+    assert any(recalled) == corrected
+
+
+@pytest.mark.parametrize("factor", [1.0, 10.0])
+def test_the_learner_trusts_the_twin_as_far_as_it_was_right(factor):
+    """The real system costs the factor times what the twin says."""
+    incremental = IncrementalTD3Config(decisions=5, virtual=10)
+    options = {"critic_iterations": 4, "batch_size": 16, "critic_hidden": (8,), "discount": 0.9, "return_steps": 4}
+    learner = LearnerConfig(algorithm="incremental_td3", incremental=incremental, **options)
+    plant = LinearQuadratic(horizon=2.0)
+    found = twinning(
+        plant, closure=copy.deepcopy(plant.closure), learner=learner, exploration=ExplorationConfig(spread=0.0)
+    )
+    fly = found.flights.fly
+
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
+        flight.transitions["next", "reward"] *= factor
+        return flight
+
+    found.flights.fly = flown
+    trusts = [found.episode()["trust"].item() for _ in range(3)]
+    assert found.learner.trust == trusts[-1]
+    assert trusts[-1] > 0.8 if factor == 1.0 else trusts[-1] < 0.01

@@ -12,11 +12,13 @@ from torch import nn
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.plants.increments import Increments, greatest_increments
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.learners.episode_memory import decision_intervals
@@ -251,6 +253,51 @@ def test_trust_without_a_twin_is_refused():
         learner().trust = 1.5
 
 
+def test_the_likeliest_hypothesis_teaches_with_its_hidden_states():
+    """Slopes and virtual returns are those of the plant with a lag, along what the sensors of that plant read."""
+    lagging = LaggedActuator(PLANT, "force", 0.3)
+    found = learner("gain", twin=False, own={"trust": 1.0})
+    twin = TwinEnsemble(PLANT, PLANT.closure, {"lags": lagging}, {"lags": lagging.closure})
+    twin.weights = {"lags": 1.0}
+    found.take_twin(twin)
+    start, exogenous = lagging.at_rest(PLANT.draw_initial_state(1, seeded(8))), PLANT.draw_exogenous(1, seeded(9))
+    with torch.no_grad():
+        flight = Rollout(lagging, lagging.closure, found.policy)(start, exogenous)
+    episode = found.memory.episodes[0].clone()
+    episode["state"], episode["exogenous"] = flight.states[0, :-1, :2], exogenous[0]
+    episode["action"] = flight.actions[0]
+    slopes = found.teacher().slopes(episode)
+    for k in (0, 30):
+        action = flight.actions[0, k].clone().requires_grad_()
+        one = Rollout(lagging, lagging.closure, engine="autograd")(
+            flight.states[:, k], exogenous[:, k : k + 1], action.view(1, 1, -1)
+        )
+        rest = Rollout(lagging, lagging.closure, found.policy, engine="autograd")(
+            one.states[:, -1], exogenous[:, k + 1 :]
+        )
+        states, actions = torch.cat([one.states, rest.states[:, 1:]], 1), torch.cat([one.actions, rest.actions], 1)
+        t = PLANT.dt * torch.arange(k, PLANT.n_steps, dtype=torch.float64)
+        cost = lagging.running_cost(t, states[:, :-1], actions, exogenous[:, k:])
+        total = (cost * GAMMA ** torch.arange(cost.shape[1]).double()).sum()
+        torch.testing.assert_close(slopes[k], torch.autograd.grad(total, action)[0])
+    found.memory.episodes.clear()
+    found.memory.episodes.append(episode)
+    virtual = found.teacher().transitions(8, 1, reward_scale=1.0, generator=seeded(0))
+    mean, spread = found.memory.statistics()
+    met = (virtual["next", "features"] * spread + mean)[:, 2:4]
+    # The recorded decision, of two intervals, leads where the real system went.
+    torch.testing.assert_close(met, episode["state"][virtual["place"] + 2], rtol=1e-6, atol=1e-8)
+
+
+def test_trust_is_measured_only_if_something_is_taught():
+    assert learner().asks_for_trust
+    assert not learner(own={"measured": False}).asks_for_trust
+    assert not learner(own={"slopes": False, "virtual": 0}).asks_for_trust
+    found = learner()
+    found.trust_twin(0.8)
+    assert found.trust == 0.8
+
+
 # Patience, trust region and recovery
 
 
@@ -275,6 +322,12 @@ def test_the_policys_learning_rate_cools():
     found.restart()
     found.update()
     assert found.actor_optimiser.param_groups[0]["lr"] == 1e-2
+
+
+@pytest.mark.parametrize("iterations, rate", [(1000, 0.01), (20, 5 / 3 * 2 / 40), (1, 0.5)])
+def test_targets_carry_values_through_the_horizon_within_two_updates(iterations, rate):
+    """Five decisions of the horizon are two targets of three decisions; the policy's delay is two."""
+    assert 1.0 - learner(critic_iterations=iterations).target.eps == pytest.approx(rate)
 
 
 def test_errors_have_settled_when_a_window_falls_no_longer():

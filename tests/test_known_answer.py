@@ -1,5 +1,7 @@
 """The model-free half alone on a problem under partial observation whose optimum is known in closed form."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -119,12 +121,27 @@ def test_ddpg_ruins_a_clone_of_the_optimum(answer):
 
 
 @pytest.mark.nightly
+def test_half_the_gain_comes_within_ten_percent(answer):
+    """Of 1.6 and 4.1 half is missing, so that rates of 3e-3 are wanted; 1e-3 ends at 1.28 with seed 0.
+
+    With these rates targets that are too slow for the horizon lead from 1.29 to 2.1 (seed 1). A clone of the optimum
+    drifts to 1.36 with them, so that no rates are known that hold for both.
+    """
+    fast = dataclasses.replace(
+        INCREMENTAL, critic_rate=3e-3, incremental=dataclasses.replace(INCREMENTAL.incremental, actor_rate=3e-3)
+    )
+    for seed in SEEDS:
+        *_, excess = excesses(answer, 0.5, seed, learner=fast)
+        assert excess < 0.10, f"seed {seed}"
+
+
+@pytest.mark.nightly
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="incremental TD3 hardly moves: J/J* = 1.25 after twenty episodes of seed 0, from 1.29; DDPG drifts to 2.57",
+    reason="with the rates that hold a clone it hardly moves: J/J* = 1.28 after twenty episodes of seed 0",
 )
-def test_half_the_gain_comes_within_ten_percent(answer):
+def test_half_the_gain_comes_within_ten_percent_at_the_rates_of_the_clone(answer):
     for seed in SEEDS:
         *_, excess = excesses(answer, 0.5, seed)
         assert excess < 0.10, f"seed {seed}"

@@ -13,14 +13,17 @@ import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_export_recipe import RECIPES, leave_run, recipe
+from test_hypotheses import Suspecting
 
-from rt_torchrl import load_run
+from rt_torchrl import Run, load_run
 from rt_torchrl.options import choices
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 
 PLANTS = ("cryogenic_tank", "flapping_wing", "pendulum", "wind_turbine")
 WITHOUT_NEURAL_CLOSURE = ("pendulum",)
@@ -106,9 +109,11 @@ from pathlib import Path
 import torch
 from dataclasses import dataclass
 from room import Room
-from rt_torchrl import load_run
+from rt_torchrl import Run, load_run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 print("runs")
 @dataclass(frozen=True, kw_only=True)
 class Config(RunConfig):
@@ -202,3 +207,23 @@ def test_recipes_that_cannot_be_found_are_told(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=message):
             load_run(tmp_path, given)
+
+
+def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
+    hypotheses = dataclasses.replace(SMALL, hypotheses=HypothesesConfig(call=0.0))
+    options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
+    run = Run(RunConfig(episodes=1, log_dir=tmp_path, twinning=hypotheses, **options), Suspecting(horizon=2.0))
+    run.train()
+    trained = run.algorithm.twin
+    found = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0)).twin
+    assert isinstance(found, TwinEnsemble) and found.weights == trained.weights
+    assert found.twins.keys() == trained.twins.keys() == {ALONE, "late", "lags"}
+    for name, twin in trained.twins.items():
+        expected, its = twin.closure.state_dict(), found.twins[name].closure.state_dict()
+        assert its.keys() == expected.keys() and all(torch.equal(its[key], value) for key, value in expected.items())
+    fresh = Suspecting(horizon=2.0).suspects()["lags"].closure.state_dict()
+    assert any(not torch.equal(value, found.twins["lags"].closure.state_dict()[key]) for key, value in fresh.items())
+    with pytest.raises(
+        ValueError, match=r"hypotheses in .*weights.pt do not fit: plant 'linear_quadratic' suspects no"
+    ):
+        load_run(tmp_path, RunConfig, plant=LinearQuadratic(horizon=2.0))

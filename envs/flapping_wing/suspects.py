@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
 from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
 from rt_torchrl.plants.plant import Plant
 
@@ -12,11 +13,13 @@ if TYPE_CHECKING:
 
 LAG = 0.05  # [s]; one wing beat, with which the identification begins
 DEAD_TIME = 0.1  # [s]
+FREQUENCY, DAMPING = 10.0, 0.5  # [rad/s], [-]; an elastic mount that settles within some tenths of a second
+SHORT_DEAD_TIME = 0.02  # [s]; of a link that the mount follows
 AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
 
 
 def suspects(plant: "FlappingWing") -> Mapping[str, Plant]:
-    """Lags and dead times of the stroke plane and of the amplitude."""
+    """Lags and dead times of the stroke plane and of the amplitude, and an elastic stroke plane behind a dead time."""
 
     def lagging(base: Plant, action: str) -> Plant:
         return LaggedActuator(base, action, LAG)
@@ -24,9 +27,17 @@ def suspects(plant: "FlappingWing") -> Mapping[str, Plant]:
     def late(base: Plant, action: str) -> Plant:
         return SlowActuator(base, action, DEAD_TIME, stages=4)
 
+    def swinging(base: Plant) -> Plant:
+        return ResonantActuator(base, PLANE, FREQUENCY, DAMPING)
+
+    def after(base: Plant, action: str) -> Plant:
+        return SlowActuator(base, action, SHORT_DEAD_TIME, stages=2)
+
     return {
         "plane lags": lagging(plant, PLANE),
         "plane late": late(plant, PLANE),
         "both lag": lagging(lagging(plant, PLANE), AMPLITUDE),
         "both late": late(late(plant, PLANE), AMPLITUDE),
+        "plane swings, late": after(swinging(plant), PLANE),
+        "plane swings, both late": late(late(swinging(plant), PLANE), AMPLITUDE),
     }

@@ -19,6 +19,8 @@ from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.hypotheses.choice import make_twin
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
@@ -38,6 +40,8 @@ class LoadedRun:
             ``model_based`` plans on ``closure``.
         closure: trained closure of the twin.
         initial_closure: closure that the training started from.
+        twin: the twin with the trained closure; with hypotheses a :class:`TwinEnsemble` with their trained closures and
+            weights, whose ``twins`` are those of the hypotheses by name.
         folder: folder of the run.
     """
 
@@ -47,12 +51,8 @@ class LoadedRun:
     policies: dict[str, nn.Module]
     closure: nn.Module
     initial_closure: nn.Module
+    twin: DigitalTwin
     folder: Path
-
-    @property
-    def twin(self) -> DigitalTwin:
-        """The twin with the trained closure."""
-        return DigitalTwin(self.physics, self.closure)
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -174,6 +174,7 @@ def load_run(
             raise ValueError(f"weights of {role!r} in {folder / 'weights.pt'} do not fit: {error}") from error
     return LoadedRun(
         config=config,
+        twin=_twin(folder, config, physics, closure, weights.get("hypotheses")),
         plant=plant,
         physics=physics,
         closure=closure,
@@ -181,6 +182,22 @@ def load_run(
         initial_closure=initial,
         folder=folder,
     )
+
+
+def _twin(
+    folder: Path, config: RunConfig, physics: Plant, closure: nn.Module, hypotheses: dict[str, Any] | None
+) -> DigitalTwin:
+    """The twin of a run; one of 0.1.0 and one that had no hypotheses is alone."""
+    if hypotheses is None:
+        return DigitalTwin(physics, closure)
+    twin = make_twin(physics, closure, config.twinning.hypotheses)
+    try:
+        if not isinstance(twin, TwinEnsemble):
+            raise ValueError(f"plant {physics.name!r} suspects nothing any more.")
+        twin.load_hypotheses(hypotheses)
+    except ValueError as error:
+        raise ValueError(f"the hypotheses in {folder / 'weights.pt'} do not fit: {error}") from error
+    return twin
 
 
 def _rebuilt(
@@ -225,7 +242,7 @@ def _parts(config: RunConfig, physics: Plant) -> tuple[dict[str, nn.Module], nn.
     return dict(config.acting_policies(policies, physics, closure).items()), closure
 
 
-def _read_weights(folder: Path) -> dict[str, dict[str, torch.Tensor]]:
+def _read_weights(folder: Path) -> dict[str, dict[str, Any]]:
     file = folder / "weights.pt"
     if not file.is_file():
         raise ValueError(

@@ -8,6 +8,8 @@ from rt_torchrl.runs.results import ROLES
 SCREEN = 24
 """Lines of a terminal that need no scrolling."""
 LEAST_WEIGHTS = 4
+SIGNIFICANT = 0.01
+"""Probability below which what a replay leaves over is no white noise."""
 
 
 def progress(record: dict[str, Any]) -> str:
@@ -49,6 +51,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += hypothesis_lines(found.get("hypotheses", {}))
+    lines += alarm_lines(metrics["episodes"])
     room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next
     lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room))
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
@@ -146,6 +149,17 @@ def hypothesis_lines(hypotheses: dict[str, Any]) -> list[str]:
         found = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
         lines.append(f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else ""))
     return lines
+
+
+def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
+    """A line with the number of alarms, and apart from it how often the twin's replay left more over than noise."""
+    watched = [one for one in episodes if "alarm" in one]
+    if not watched:
+        return []
+    raised = sum(one["alarm"] > 0.0 for one in watched)
+    correlated = sum((one.get("whiteness") or 0.0) < SIGNIFICANT for one in watched)
+    about = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
+    return [f"  {about}; apart from that, its replay left more over than noise in {correlated}"]
 
 
 def _change(start: float | None, found: float | None) -> float:

@@ -2,6 +2,7 @@
 
 import copy
 from operator import is_
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -84,6 +85,15 @@ class DigitalTwin:
 
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights of the trained parts, by name: those of the closure."""
+        return {"closure": self.closure.state_dict()}
+
+    @property
+    def believed(self) -> "DigitalTwin":
+        """The twin that is most likely to be right; a twin that is alone is."""
+        return self
 
     def explanation(self) -> str:
         """What the twin says about itself that may explain a wrong prediction; a twin that is alone says nothing."""

@@ -209,18 +209,18 @@ class ReinforcementTwinning:
 
     def examine(self) -> TensorDict:
         """Compare what the latest real episodes cost with what the twin says of them, and seek an explanation."""
-        return self.examination.explained(self.assimilation, self.generator)
+        found = self.examination.explained(self.assimilation, self.generator)
+        return merged(found, self.learning.trust(lambda: self.examination.judge(self.short_term[-1])))
 
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""
         count = self.config.planner.realisations or self.config.realisations
-        by_evidence = self.config.referee.rule == "weight_of_evidence"
         planned_on, judged_on = map(self.virtual.draw, (count, self.judged))
         judgement = Judgement(
             incumbent=lambda episodes: self.virtual_costs(episodes, ("model_based",))["model_based"],
             worse=self.referee.worse,
             require_sound_twin=lambda episodes: self.track_record.require_sound_twin(self.virtual, episodes),
-            evidence=self.examination.judge(self.short_term[-1]) if by_evidence else None,
+            evidence=self.examination.judge(self.short_term[-1]) if self.config.corrected_plans else None,
         )
         return self.planning.plan(self.episodes_done + 1, planned_on, judged_on, judgement)
 

@@ -38,6 +38,9 @@ class TwinningConfig:
         judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse on the twin, in the
             arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
             ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
+        corrected_plans: whether step 5 judges a plan by what it is expected to cost on the real system, as the paired
+            differences of real episodes say, and goes back to weights that have flown for less; without it the twin
+            alone judges.
         exploration: parameters of step 1.
         learner: parameters of step 2.
         exogenous: parameters of step 3.
@@ -56,6 +59,7 @@ class TwinningConfig:
     least_sound: float = 0.5
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     judged_updates: bool = False
+    corrected_plans: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)

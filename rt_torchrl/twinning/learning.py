@@ -9,6 +9,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.twinning.evidence.alarm import MATTERS
+from rt_torchrl.twinning.evidence.examination import RealJudge
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.learners import Learner
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -24,7 +26,8 @@ class Learning:
     A learner that needs more than one interval in a row says so by ``shortest``; one that takes the first interval it
     is given for the start of an episode has a true ``from_the_start``.
 
-    A learner that learns from the twin has a method ``take_twin(twin)``. One that wants to know of the real episodes
+    A learner that learns from the twin has a method ``take_twin(twin)``; one that asks how far the twin can be trusted
+    has a method ``trust_twin(probability)`` and a true ``asks_for_trust``. One that wants to know of the real episodes
     that its policy flies has methods ``adopt()`` and ``flown(cost)``.
 
     Args:
@@ -39,6 +42,24 @@ class Learning:
         take = getattr(learner, "take_twin", None)
         if taught and take is not None:
             take(virtual.twin)
+        self._asks = taught and getattr(learner, "asks_for_trust", False)
+
+    def trust(self, judge: Callable[[], RealJudge]) -> TensorDict:
+        """Tell the learner, if it asks, how probably the twin is right about its policy.
+
+        Args:
+            judge: function that gives the judge by the evidence so far; it flies real episodes again, so that it is
+                called only if needed.
+
+        Returns:
+            ``trust``, the probability that the twin says what the policy costs to within what matters.
+        """
+        if not self._asks:
+            return findings()
+        told: Any = self.learner
+        probability = judge().belief(self.learner.policy).within(MATTERS)
+        told.trust_twin(probability)
+        return findings(trust=probability)
 
     def store(self, parts: Sequence[tuple[int, TensorDict]]) -> None:
         """Give the learner the transitions of the sound parts of an episode that it can use.

@@ -87,6 +87,11 @@ class TrackRecord:
         start = Scenario(flown.trajectory.states[:1], flown.trajectory.exogenous[None])
         return virtual.cost(self._policy(flown), start).item()
 
+    @property
+    def latest_record(self) -> Trajectory:
+        """The latest real episode."""
+        return self._flown[-1].trajectory
+
     def policy_flown(self) -> nn.Module:
         """The policy that has flown the latest episode, with the weights that it had in it."""
         return self._policy(self._flown[-1])

@@ -9,6 +9,10 @@ MATTERS = math.log(1.1)
 """Difference of log J below which a wrong twin does not matter."""
 LEAST_DEVIATION = 0.05
 """Standard deviation of the paired differences of a sound twin, of log J; few episodes do not show a smaller one."""
+GREAT = math.log(1.35)
+"""Difference of log J beyond which a greater one says no more, so that a single bad policy does not hide the others."""
+BEYOND_CHANCE = 3.0 * LEAST_DEVIATION
+"""Difference of log J that two episodes in a row of a sound twin hardly ever have."""
 QUIET = 0.02
 """Exploration, as a share of half the ranges, above which the cost of an episode says little about its policy."""
 CONFIDENCE = 0.975
@@ -17,8 +21,9 @@ CONFIDENCE = 0.975
 def alarm(differences: Sequence[float]) -> str | None:
     r"""What is wrong with the twin, in plain words; None if nothing is.
 
-    The mean of the paired differences :math:`d = \log J - \log\hat J` of the last episodes is off zero by Student's
-    test with at least ``LEAST_DEVIATION``, and by more than matters.
+    The mean of the paired differences :math:`d = \log J - \log\hat J` of the last episodes, each at most ``GREAT``, is
+    off zero by Student's test with at least ``LEAST_DEVIATION``, and by more than matters; or the last two are both
+    beyond chance to the same side.
 
     Args:
         differences: d of the latest quiet episodes, oldest first.
@@ -29,11 +34,19 @@ def alarm(differences: Sequence[float]) -> str | None:
         return None
     from scipy.stats import t as student  # here, because it takes a second to load
 
-    mean = sum(latest) / n
-    spread = math.sqrt(sum((d - mean) ** 2 for d in latest) / (n - 1))
+    counted = [max(-GREAT, min(GREAT, d)) for d in latest]
+    mean = sum(counted) / n
+    spread = math.sqrt(sum((d - mean) ** 2 for d in counted) / (n - 1))
     bound = student.ppf(CONFIDENCE, n - 1) * max(spread, LEAST_DEVIATION) / math.sqrt(n)
-    if abs(mean) <= max(bound, MATTERS):
+    if abs(mean) <= max(bound, MATTERS) and not twice(latest):
         return None
+    mean = sum(latest) / n
     ratio = math.exp(abs(mean))
     relation = f"{ratio:.3g} times as much as" if mean > 0.0 else f"1/{ratio:.3g} of what"
     return f"the twin is wrong where it matters: the last {n} episodes cost {relation} the twin says of them"
+
+
+def twice(latest: Sequence[float]) -> bool:
+    """Whether the last two differences are both beyond chance, to the same side."""
+    before, now = latest[-2:]
+    return min(before, now) > BEYOND_CHANCE or max(before, now) < -BEYOND_CHANCE

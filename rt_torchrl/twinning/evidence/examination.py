@@ -14,6 +14,7 @@ from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
+from rt_torchrl.twinning.evidence.whiteness import whiteness
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
@@ -43,8 +44,9 @@ class Examination:
         """Fly the latest real episodes on the present twin.
 
         Returns:
-            ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1; nothing if
-            state feedback flew them.
+            ``paired_difference`` of the last episode; ``alarm``, with a ``warning`` in words if it is 1; and apart from
+            these ``whiteness`` of what the replay of the episode leaves over, see :func:`whiteness`. Nothing if state
+            feedback flew them.
         """
         found = self.track_record.differences(self.virtual)
         if not found.values:
@@ -54,8 +56,19 @@ class Examination:
         quiet = [d for d, noise in zip(found.values, found.exploration, strict=True) if noise <= QUIET]
         said = alarm(quiet)
         explained = self.virtual.twin.explanation()
-        report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
+        report = findings(paired_difference=found.values[-1], alarm=float(said is not None), whiteness=self._white())
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
+
+    def _white(self) -> float:
+        """Whiteness of what the replay of the latest real episode leaves over, by the likeliest twin."""
+        record, twin = self.track_record.latest_record, self.virtual.twin.believed
+        start = twin.plant.at_rest(record.states[:1])
+        try:
+            flown = twin.replay(start, record.exogenous[None], record.actions[None], start=record.start)
+        except DivergenceError:
+            return 0.0
+        read = record.states[1:]
+        return whiteness(flown.states[0, 1:, : read.shape[-1]] - read, read)
 
     def explained(self, assimilation: Assimilation, generator: torch.Generator) -> TensorDict:
         """As :meth:`examine`, once step 4 has sought what explains the difference."""

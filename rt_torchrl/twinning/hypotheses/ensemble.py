@@ -1,6 +1,7 @@
 """Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -78,9 +79,38 @@ class TwinEnsemble(DigitalTwin):
         """Name of the hypothesis with the greatest weight."""
         return max(self._shares, key=self._shares.__getitem__)
 
+    @property
+    def believed(self) -> DigitalTwin:
+        """The twin of the likeliest hypothesis."""
+        return self.twins[self.likeliest]
+
     def explanation(self) -> str:
         """The hypothesis that replays the records best."""
         return f"{self.likeliest!r} explains the records best"
+
+    def state_dict(self) -> dict[str, Any]:
+        """As :meth:`DigitalTwin.state_dict`, and ``hypotheses``: their closures, and the weights of all that count."""
+        closures = {name: twin.closure.state_dict() for name, twin in self.twins.items() if name != ALONE}
+        return super().state_dict() | {"hypotheses": {"closures": closures, "weights": self.weights}}
+
+    def load_hypotheses(self, state: Mapping[str, Any]) -> None:
+        """Take the closures of the hypotheses and their weights, as ``hypotheses`` of :meth:`state_dict` holds them.
+
+        Raises:
+            ValueError: if the hypotheses are others, or a closure does not fit.
+        """
+        closures, own = state["closures"], [name for name in self.twins if name != ALONE]
+        if closures.keys() != set(own):
+            raise ValueError(
+                f"hypotheses {', '.join(closures)} of the state are not those of the twin, {', '.join(own)}; plant "
+                f"{self.plant.name!r} must suspect what it suspected then."
+            )
+        for name in own:
+            try:
+                self.twins[name].closure.load_state_dict(closures[name])
+            except RuntimeError as error:
+                raise ValueError(f"closure of hypothesis {name!r} does not fit: {error}") from error
+        self.weights = state["weights"]
 
     def retreat(self) -> None:
         """Leave every hypothesis out for this episode: the policy that has just flown diverges under one."""
@@ -95,7 +125,7 @@ class TwinEnsemble(DigitalTwin):
         start: float | Float[Tensor, " batch"] = 0.0,
     ) -> Trajectory:
         """Virtual episodes under the likeliest hypothesis, as sensors read them; see :meth:`DigitalTwin.control`."""
-        twin = self.twins[self.likeliest]
+        twin = self.believed
         flown = twin.control(policy, twin.plant.at_rest(initial_state), exogenous, start=start)
         return flown._replace(states=flown.states[..., : len(self.plant.states)])
 

@@ -80,8 +80,9 @@ class IncrementalTD3Config:
             critics have settled; the policy waits for this at first and after a clone.
         recovery: ratio of the cost of a real episode to the least median of three in a row so far above which the
             policy goes back to the weights from before the update; infinity never does.
-        trust: trust in the twin at first, from 0 to 1; 0 learns nothing from it. A part of the algorithm that measures
-            the trust may change it.
+        trust: trust in the twin at first, from 0 to 1; 0 learns nothing from it.
+        measured: whether trust is measured from the first examination of the twin on: the probability, by the paired
+            differences of real episodes, that the twin says within 10 % what the policy costs.
         slopes: whether a twin that is trusted teaches the slopes of values by actions.
         virtual: number of transitions that a twin that is trusted adds to an update, where they fill half of every
             batch; 0 for none.
@@ -99,6 +100,7 @@ class IncrementalTD3Config:
     settled: float = 0.9
     recovery: float = 1.5
     trust: float = 0.0
+    measured: bool = True
     slopes: bool = True
     virtual: int = 1000
 
@@ -137,7 +139,8 @@ class LearnerConfig:
             sum over more intervals mends that.
         reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
             scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
-        target_rate: rate τ at which the target critic, and TD3's target policy, follow.
+        target_rate: rate τ at which the target critic, and TD3's target policy, follow; those of incremental TD3 follow
+            faster where few iterations would not carry values through the horizon.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
         gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.

@@ -26,6 +26,10 @@ from rt_torchrl.twinning.learners.rescaled_iterations import RescaledIterations
 from rt_torchrl.twinning.learners.twin_teacher import TwinTeacher
 from rt_torchrl.twinning.learners.weights import MeanWeights, change_of_actions, step_towards, weights_of
 
+UPDATES = 2
+"""Number of updates within which values reach through the horizon; before, slopes are those of what is near."""
+FASTEST = 0.5
+"""Greatest rate of the targets; beyond it they are hardly others than the critics."""
 WINDOW = 100
 """Number of critic iterations over which |δ| is averaged."""
 
@@ -40,6 +44,7 @@ class IncrementalTD3:
     - *Decisions.* A decision lasts as many control intervals as make ``decisions`` of them last 1/(1 − γ).
     - *Rescaled values.* Rewards are counted in the mean cost of the cheapest episode, and critics give the logarithm
       of values (:func:`symlog`), which may span four orders of magnitude.
+    - *Targets.* They follow the critics at least so fast that values reach through the horizon within two updates.
     - *Latest states.* The policy is improved in the states of the latest episodes alone, its new weights are a mean
       over the iterations of an update, and the actions change by no more than the trust region allows.
     - *Patience.* The policy waits after a clone until the TD errors have settled.
@@ -74,12 +79,21 @@ class IncrementalTD3:
         self.memory = EpisodeMemory(own.episodes, self.increments, intervals=intervals, discount=config.discount)
         self.batch_size = min(config.batch_size, plant.n_steps)
         self.loss = self._make_loss(plant)
-        self.target = SoftUpdate(self.loss, tau=config.target_rate)
+        self.target = SoftUpdate(self.loss, tau=self._target_rate())
         weights = [weight for weight in self.loss.qvalue_network_params.parameters() if weight.requires_grad]
         self.critic_optimiser = torch.optim.Adam(weights, lr=config.critic_rate)
         self.trust = own.trust
         self._teacher: TwinTeacher | None = None
         self.restart()
+
+    def _target_rate(self) -> float:
+        """Rate of the targets: at least so fast that values reach through the horizon within ``UPDATES`` updates.
+
+        A target of n decisions carries values n decisions further each time that the target critics have followed.
+        """
+        own, config = self.config.incremental, self.config
+        backups = own.decisions / self.decisions
+        return min(FASTEST, max(config.target_rate, backups * own.delay / max(1, UPDATES * config.critic_iterations)))
 
     def _make_loss(self, plant: Plant) -> RescaledTD3Loss:
         n_x, n_a = len(plant.observations) + len(plant.states) + len(plant.inputs), len(plant.actions)
@@ -104,6 +118,16 @@ class IncrementalTD3:
         if not 0.0 <= trust <= 1.0:
             raise ValueError(f"trust={trust} in the twin must lie in [0, 1].")
         self._trust = trust
+
+    @property
+    def asks_for_trust(self) -> bool:
+        """Whether the trust is to be measured, because the twin is to teach something."""
+        own = self.config.incremental
+        return own.measured and (own.slopes or own.virtual > 0)
+
+    def trust_twin(self, probability: float) -> None:
+        """Trust the twin with the probability that it is right about the policy."""
+        self.trust = probability
 
     def take_twin(self, twin: DigitalTwin) -> None:
         """Learn from this twin as far as it is trusted."""

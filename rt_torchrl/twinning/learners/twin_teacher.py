@@ -6,7 +6,9 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
 from rt_torchrl.twinning.learners.episode_memory import EpisodeMemory, windows
 
 INSIDE = 1.0 - 1e-9
@@ -16,6 +18,8 @@ INSIDE = 1.0 - 1e-9
 class TwinTeacher:
     """A twin with the policy that the critics judge.
 
+    Of several hypotheses the likeliest one teaches. Its hidden states follow from what the sensors read.
+
     Args:
         twin: the digital twin, whose closure other steps train.
         policy: policy π_mf.
@@ -24,6 +28,11 @@ class TwinTeacher:
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, memory: EpisodeMemory):
         self.twin, self.policy, self.memory = twin, policy, memory
+
+    def _whole(self, episode: TensorDict) -> Float[Tensor, "n n_s"]:
+        """States of an episode with the hidden ones of the twin."""
+        record = Trajectory(episode["state"], episode["action"][:-1], episode["exogenous"][:-1])
+        return with_hidden_states(self.twin.believed, record).states
 
     def slopes(self, episode: TensorDict) -> Float[Tensor, "n n_a"]:
         r"""Slopes :math:`g_k = \partial J/\partial a_k` of the discounted sum of L_a by each applied action.
@@ -50,14 +59,15 @@ class TwinTeacher:
 
     def _linearised(self, episode: TensorDict) -> tuple[Tensor, ...]:
         """Φ_s, Φ_a, π_s, L_s and L_a at every control interval."""
-        plant, increments = self.twin.plant, self.memory.increments
+        twin, increments = self.twin.believed, self.memory.increments
+        plant = twin.plant
         t = plant.dt * torch.arange(len(episode), dtype=torch.float64)
         exogenous = episode["exogenous"]
         with torch.enable_grad():
-            state = episode["state"].clone().requires_grad_()
+            state = self._whole(episode).clone().requires_grad_()
             action = episode["action"].clone().requires_grad_()
             centre = increments.centre(episode["state"])
-            end = plant.step(t, state, centre + INSIDE * (action - centre), exogenous, self.twin.closure).state
+            end = plant.step(t, state, centre + INSIDE * (action - centre), exogenous, twin.closure).state
             cost = plant.running_cost(t, state, action, exogenous)
             acted = plant.actuate(state, self.policy(plant.observe(t, state, exogenous)))
             by_both = jacobian(end, (state, action))
@@ -105,18 +115,20 @@ class TwinTeacher:
     def _flown(
         self, episode: TensorDict, at: Tensor, n: int, scales: tuple[Tensor, Tensor], reward_scale: float
     ) -> dict[str, Tensor]:
-        plant, memory, m = self.twin.plant, self.memory, self.memory.intervals
+        twin, memory, m = self.twin.believed, self.memory, self.memory.intervals
+        plant, read = twin.plant, len(self.twin.plant.states)
         ahead = at.unsqueeze(-1) + torch.arange(n, device=at.device)
         exogenous, start = episode["exogenous"][ahead], plant.dt * at.double()
-        first = self.twin.replay(episode["state"][at], exogenous[:, :m], episode["action"][ahead[:, :m]], start=start)
+        first = twin.replay(self._whole(episode)[at], exogenous[:, :m], episode["action"][ahead[:, :m]], start=start)
         states, actions = first.states, first.actions
         if n > m:
-            after = self.twin.control(self.policy, states[:, -1], exogenous[:, m:], start=start + m * plant.dt)
+            after = twin.control(self.policy, states[:, -1], exogenous[:, m:], start=start + m * plant.dt)
             states, actions = torch.cat([states, after.states[:, 1:]], 1), torch.cat([actions, after.actions], 1)
         t = plant.dt * ahead.double()
         rewards = -plant.running_cost(t, states[:, :-1], actions, exogenous) @ memory.discounts(n)
         end = TensorDict({"state": states[:, -1], "exogenous": episode["exogenous"][at + n]}, batch_size=len(at))
         end["observation"] = plant.observe(plant.dt * (at + n).double(), end["state"], end["exogenous"])
+        end["state"] = end["state"][:, :read]  # the critics see what sensors read
         end["reward"] = rewards.unsqueeze(-1)  # its device and length say where the features are computed
         found = memory.situation(end, torch.arange(len(at), device=at.device), scales)
         discount = torch.full_like(end["reward"], memory.discount**n)

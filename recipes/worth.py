@@ -1,0 +1,296 @@
+"""What twinning is worth: every arm, with each part off in turn, on systems that the twin knows and on others."""
+
+import json
+import shlex
+import sys
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+if __name__ == "__main__":
+    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+
+import tyro
+
+from rt_torchrl import check_options, main_of
+from rt_torchrl.envs.cryogenic_tank import unknown as tanks
+from rt_torchrl.envs.flapping_wing import unknown as drones
+from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.study.arms import SystemResult, classical_arms, trained_arm
+from rt_torchrl.study.results import yardstick_entry
+from rt_torchrl.study.room import write_into
+from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.training import Training
+from rt_torchrl.study.worth import WHOLE, findings_page
+from rt_torchrl.study.yardsticks import Yardstick, oracle
+
+if TYPE_CHECKING:
+    from rt_torchrl.study.task import Task
+
+Options = tuple[str, ...]
+CATALOGUES = {"wind_turbine": turbines, "flapping_wing": drones, "hop": drones, "cryogenic_tank": tanks}
+"""Names of unknown systems of every plant; the hop is a task of the drone."""
+POLICY: dict[str, Options] = {
+    "wind_turbine": ("--policy", "scheduled"),
+    "flapping_wing": ("--policy", "paper"),
+    "hop": ("--policy", "paper", "--task", "hop"),
+    "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
+}
+"""Policies of few weights, whose optimum exact gradients find."""
+UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "hop": 192, "cryogenic_tank": 50}
+"""Number of unseen episodes that judge everything by default; a few hops cost ten times as much as the others."""
+FEW = 8
+"""Number of unseen episodes that model predictive control flies, which takes long."""
+
+NEW_LEARNER: Options = (
+    *("--twinning.learner.algorithm", "incremental_td3", "--twinning.learner.critic-iterations", "1000"),
+)
+DISCOUNT: dict[str, Options] = {"wind_turbine": ("--twinning.learner.discount", "0.99")}
+"""Discount of the new learner, where it differs from that of the recipe."""
+EXPLORING: Options = ("--twinning.exploration.redrawn", "2", "--twinning.exploration.least", "0.2")
+NOISE: dict[str, Options] = {"wind_turbine": ("--twinning.exploration.correlation-time", "5")}
+HYPOTHESES: Options = ("--twinning.hypotheses.which", "automatic")
+ALONE: Options = ("--twinning.hypotheses.which", "none")
+EVIDENCE: Options = ("--twinning.referee.rule", "weight_of_evidence")
+TREE: Options = ("--twinning.referee.rule", "decision_tree")
+CORRECTED: Options = ("--twinning.corrected-plans",)
+UNCORRECTED: Options = ("--twinning.no-corrected-plans",)
+UNTAUGHT: Options = ("--twinning.learner.incremental.trust", "0", "--twinning.learner.incremental.no-measured")
+RANDOM: Options = ("--start", "random")
+OLD_LEARNER: Options = ("--twinning.learner.algorithm", "ddpg")
+PARTS = {
+    "without hypotheses": "hypotheses",
+    "without the new learner": "the new learner",
+    "without lessons of the twin": "slopes and virtual transitions from the twin",
+    "without corrected plans": "the correction of plans by paired differences",
+    "without the referee": "the referee that weighs evidence",
+}
+"""Name of each part, by the arm that lacks it."""
+
+
+def whole(case: str) -> Options:
+    """Options of twinning with all its parts."""
+    return (*NEW_LEARNER, *DISCOUNT.get(case, ()), *HYPOTHESES, *EVIDENCE, *CORRECTED)
+
+
+def arms_of(case: str) -> dict[str, Options]:
+    """Options of every arm on a plant, by name."""
+    every, learner = whole(case), (*NEW_LEARNER, *DISCOUNT.get(case, ()))
+    planned = ("--twinning.arm", "model_based")
+    free = ("--paper", "--twinning.arm", "model_free")
+    found: dict[str, Options] = {
+        WHOLE: every,
+        "twinning of the paper": ("--paper",),
+        "model-free, DDPG": free,
+        "model-free, incremental TD3": (*free, *learner, *EXPLORING, *NOISE.get(case, ())),
+        "twinning from random weights": (*every, *RANDOM),
+        "the same without the referee": (*learner, *HYPOTHESES, *TREE, *CORRECTED, *RANDOM),
+        "model-based": (*planned, *ALONE, *TREE, *UNCORRECTED),
+        "model-based, hypotheses": (*planned, *HYPOTHESES, *EVIDENCE, *CORRECTED),
+        "without hypotheses": (*learner, *ALONE, *EVIDENCE, *CORRECTED),
+        "without the new learner": (*OLD_LEARNER, *HYPOTHESES, *EVIDENCE, *CORRECTED),
+        "without lessons of the twin": (*every, *UNTAUGHT),
+        "without corrected plans": (*learner, *HYPOTHESES, *EVIDENCE, *UNCORRECTED),
+        "without the referee": (*learner, *HYPOTHESES, *TREE, *CORRECTED),
+    }
+    if case == "wind_turbine":  # it plans in real time there; the tank's half-open valve has no plans by gradients
+        mpc = ("--twinning.planner.method", "receding_horizon")
+        found["predictive control"] = (*planned, *ALONE, *TREE, *UNCORRECTED, *mpc)
+    return found
+
+
+ARMS = tuple(arms_of("wind_turbine"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Train every arm on nominal and unknown systems, find the oracles, and write a page of findings.
+
+    The folder keeps finished results, so that the same command goes on where it was interrupted. A policy of few
+    weights is trained, whose optimum on the true system exact gradients find.
+
+    Args:
+        plants: all, or some of wind_turbine, flapping_wing, hop (a task of the drone) and cryogenic_tank.
+        systems: what the real system has beside its twin, as names of --unknown of a recipe; a plus combines names;
+            nothing is the system as its twin knows it. A name counts for every plant that has it. By default that and
+            all systems.
+        arms: names of arms; by default all. Each arm that begins with without lacks a part of twinning.
+        seeds: number of trainings of each arm on each system.
+        episodes: number of real episodes of a training, beside that of the controller.
+        unseen: number of unseen episodes that judge everything; by default 50, or 100 of the drone, and 192 hops.
+        starts: number of random starts of the search for the optimum.
+        iterations: number of gradients of each start on ten episodes; a third as many follow on all.
+        jobs: number of trainings side by side.
+        folder: folder of the runs and of the results, worth.json and worth.md.
+        page: page in which the findings are written, too.
+        finished: whether to compute nothing, and to write the page from the trainings that are finished so far.
+    """
+
+    plants: tuple[str, ...] = ("all",)
+    systems: tuple[str, ...] = ()
+    arms: tuple[str, ...] = ()
+    seeds: int = 3
+    episodes: int = 10
+    unseen: int | None = None
+    starts: int = 3
+    iterations: int = 60
+    jobs: int = 1
+    folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/worth")
+    page: Path | None = None
+    finished: bool = False
+
+    def __post_init__(self):
+        check_options(self)
+        for argument in ("seeds", "episodes", "starts", "iterations", "jobs"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
+        if self.unseen is not None and self.unseen < FEW:
+            raise ValueError(f"unseen={self.unseen} must be at least {FEW}.")
+        for argument, known in (("plants", (*CATALOGUES, "all")), ("arms", ARMS)):
+            if other := [name for name in getattr(self, argument) if name not in known]:
+                raise ValueError(f"{argument}: {', '.join(other)} does not exist; choose among {', '.join(known)}.")
+        for system in self.systems:
+            if not any(system in self.systems_of(case) for case in self.cases()):
+                known = dict.fromkeys(name for case in self.cases() for name in CATALOGUES[case].SYSTEMS)
+                raise ValueError(
+                    f"systems: {system} is on none of {', '.join(self.cases())}; choose nothing, or names among "
+                    f"{', '.join(known)}, which a plus combines."
+                )
+
+    def cases(self) -> list[str]:
+        """The plants, and the drone's hop."""
+        return [case for case in CATALOGUES if "all" in self.plants or case in self.plants]
+
+    def systems_of(self, case: str) -> list[str]:
+        """The systems of a plant, in the order of its tables."""
+        known = CATALOGUES[case].SYSTEMS
+        if not self.systems:
+            return ["nothing", *known]
+        return [system for system in self.systems if all(name in known for name in names(system))]
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Every plant with every one of its systems."""
+        return [(case, system) for case in self.cases() for system in self.systems_of(case)]
+
+    def judged(self, case: str) -> int:
+        """Number of unseen episodes."""
+        return self.unseen or UNSEEN[case]
+
+    def options(self, case: str, system: str) -> Options:
+        """Options of the recipe that make the system and its policy."""
+        return (*POLICY[case], *(("--unknown", *names(system)) if names(system) else ()))
+
+    def trainings(self, case: str, system: str) -> dict[str, list[Training]]:
+        """Trainings by arm, one for each seed."""
+        every = arms_of(case)
+        chosen = {name: every[name] for name in self.arms or every if name in every}
+        return {name: self.training(case, system, name, options) for name, options in chosen.items()}
+
+    def training(self, case: str, system: str, name: str, options: Options) -> list[Training]:
+        """The trainings of an arm; its options name the part of the algorithm that runs."""
+        planned, free = "model_based" in options, "model_free" in options
+        few = "receding_horizon" in options
+        judged = ("--unseen", str(FEW)) if few else ("--unseen", str(self.judged(case)), "--unseen-every", "1")
+        rest = tuple(part for part in options if part not in ("--twinning.arm", "model_based", "model_free"))
+        return [
+            Training(
+                recipe=recipe_of(case),
+                arm="model_based" if planned else "model_free" if free else "twinning",
+                seed=seed,
+                variant="nominal",
+                folder=self.folder / case / system / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}",
+                episodes=self.episodes,
+                options=(*rest, *self.options(case, system), *judged),
+            )
+            for seed in range(self.seeds)
+        ]
+
+    def optimum(self, case: str, system: str) -> Yardstick:
+        """The best policy of the class on the true system."""
+        effort = {"starts": self.starts, "iterations": self.iterations, "polish": self.iterations // 3}
+        judged = self.judged(case)
+        options = (*self.options(case, system), "--unseen", str(judged))
+        compute = partial(oracle, recipe_of(case), options, unseen=judged, **effort)
+        return Yardstick(self.folder / case / system / f"oracle-{judged}.json", compute)
+
+    def tasks(self) -> "list[Task]":
+        """Everything that is computed, seed by seed, so that an interrupted study has all arms of the first seeds."""
+        found: list[Task] = [self.optimum(*row) for row in self.rows()]
+        every = [group for row in self.rows() for group in self.trainings(*row).values()]
+        return found + [group[seed] for seed in range(self.seeds) for group in every]
+
+
+def names(system: str) -> Options:
+    """Names of ``--unknown`` of a system."""
+    return () if system == "nothing" else tuple(system.split("+"))
+
+
+def recipe_of(case: str) -> Path:
+    """The recipe of a plant."""
+    return Path(__file__).with_name("flapping_wing.py" if case == "hop" else f"{case}.py")
+
+
+def result(config: Config, case: str, system: str) -> SystemResult | None:
+    """All arms on a system, of the trainings that are finished; None if there are none, or no oracle."""
+    every = config.trainings(case, system)
+    done = {name: [training for training in group if training.done()] for name, group in every.items()}
+    groups = {name: group for name, group in done.items() if group}
+    if not groups or not config.optimum(case, system).done():
+        return None
+    arms = [trained_arm(name, group) for name, group in groups.items()]
+    judged_on_all = [group[0] for name, group in groups.items() if name != "predictive control"]
+    classical = classical_arms(judged_on_all[0]) if judged_on_all else []
+    return SystemResult(
+        case=case.replace("_", " "),
+        system=" + ".join(names(system)),
+        oracle=yardstick_entry("oracle", config.optimum(case, system).run()),
+        arms=[*arms, *classical],
+    )
+
+
+def command(config: Config) -> str:
+    """The command line that makes the page."""
+    usual, found = Config(), ["uv run recipes/worth.py"]
+    for name in ("plants", "systems", "arms", "seeds", "episodes", "unseen", "starts", "iterations"):
+        value = getattr(config, name)
+        if value != getattr(usual, name):
+            found.append(f"--{name} " + (shlex.join(value) if isinstance(value, tuple) else str(value)))
+    return " ".join(found)
+
+
+def write(config: Config) -> Path:
+    """Write the page, its figures and ``worth.json`` from what is kept; return the path of the page."""
+    from rt_torchrl.figures.style import save_figure
+    from rt_torchrl.study.figures import regret  # here, because --help need not wait for Matplotlib
+
+    kept = {row: found for row in config.rows() if (found := result(config, *row)) is not None}
+    if not kept:
+        raise ValueError(f"folder={config.folder} holds no finished training and oracle of this study; compute them.")
+    for (case, system), found in kept.items():
+        save_figure(regret(found), config.folder / f"regret_{case}_{system}.png")
+    results = list(kept.values())
+    page = findings_page(results, PARTS, command(config))
+    (config.folder / "worth.md").write_text(f"# What twinning is worth\n\n{page}\n", encoding="utf-8")
+    if config.page is not None:
+        write_into(config.page, f"worth of {', '.join(config.cases())}", page)
+    numbers = [{"case": found.case, "system": found.system, "least": found.least} for found in results]
+    for number, found in zip(numbers, results, strict=True):
+        number["oracle"] = found.oracle.mean
+        number["arms"] = {arm.name: {"J_a": arm.entry.costs.mean(1).tolist(), "paid": arm.paid} for arm in found.arms}
+    write_results(config.folder / "worth.json", {"config": asdict(config), "systems": numbers})
+    print(json.dumps({found.title: {arm.name: arm.median() for arm in found.arms} for found in results}, indent=1))
+    return config.folder / "worth.md"
+
+
+def main(config: Config) -> None:
+    make_folder("folder", config.folder)
+    if not config.finished:
+        tasks = config.tasks()
+        side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
+    print(f"findings in {write(config)}")
+
+
+if __name__ == "__main__":
+    main_of(Config, main)
