@@ -53,7 +53,7 @@ class Config:
         missing: keep rows in which a sensor lacks its sample; only that sample is left out.
         sensors: states and measurements whose columns the twin is fitted to by maximum likelihood; by default the
             plant's own J_p is used, or all columns of sensors if a state is not measured or a sample is missing.
-        biased: sensors that may be off by a constant, which is estimated; the twin is then fitted by maximum likelihood.
+        biased: sensors that may be off by a constant, which is estimated; the fit is then by maximum likelihood.
         guess: first guesses of the initial values of states that are not measured, as STATE=VALUE.
         dt: control interval of the twin [s]; by default the plant's own.
         gap: longest time between two rows that is bridged [s]; by default three sampling intervals.

@@ -63,9 +63,7 @@ def trained(config: Config, memory: str, seed: int) -> list[dict[str, float]]:
     folder = config.log_dir / memory.replace(",", "").replace(" ", "-") / f"seed-{seed}"
     named = ("--seed", str(seed), "--episodes", str(config.episodes), "--log-dir", str(folder), "--overwrite")
     recipe = load_recipe(Path(__file__).with_name("wind_turbine.py"))
-    options = from_command_line(
-        recipe.Config, [*OPTIONS, *RECORDED, *kept, *named, "--closure", config.closure]
-    )
+    options = from_command_line(recipe.Config, [*OPTIONS, *RECORDED, *kept, *named, "--closure", config.closure])
     plant, found = options.plant(), []
     unseen = UnseenEpisodes(plant, config.unseen)
     classical = unseen.fly_baseline(JonkmanController(plant))

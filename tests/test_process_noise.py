@@ -102,7 +102,10 @@ def test_what_does_not_go_with_process_noise_is_refused():
         (lambda: Estimation(twin, position()).run(parts), "give the estimation its process noise"),
         (lambda: Estimation(twin, position(), process=one).run(parts[1:]), "begin with a record that follows nothing"),
         (lambda: Estimation(twin, position(), process=0.0 * one), r"process=\[0.0\]"),
-        (lambda: Estimation(twin, position(), process=one, spread=0.0 * one), r"no spread=\[0.0\] may be zero beside it"),
+        (
+            lambda: Estimation(twin, position(), process=one, spread=0.0 * one),
+            r"no spread=\[0.0\] may be zero beside it",
+        ),
         (lambda: chained(record, 0, 0.1), "length=0"),
         (lambda: BeliefPrior(Slope(), Belief(torch.zeros(2).double(), torch.eye(2).double()), 0.0), "drift=0.0"),
         (lambda: BeliefPrior(Slope(), Belief(torch.zeros(3).double(), torch.eye(3).double()), 1.0), "of 3 weights"),

@@ -207,9 +207,9 @@ def test_a_biased_sensor_of_the_tank_is_found_in_step_4():
 
 def test_what_only_a_fit_to_sensors_takes_is_refused_without_sensors():
     for options, message in (
-        ({"biased": ("pressure",)}, "belong to a fit"),
-        ({"pushes": 3}, "belong to a fit"),
-        ({"drift": 0.1}, "belong to a fit"),
+        ({"biased": ("pressure",)}, "give sensors, too"),
+        ({"pushes": 3}, "give sensors, too"),
+        ({"drift": 0.1}, "give sensors, too"),
         ({"pushes": 0}, "pushes=0 must be at least 1"),
         ({"drift": -1.0}, "drift=-1.0"),
     ):

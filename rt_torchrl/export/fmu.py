@@ -1,4 +1,4 @@
-"""A policy or a twin as an FMU: FMI 2.0 or 3.0 for co-simulation, from the exported C, for Modelica tools and Simulink."""
+"""A policy or a twin as an FMU for co-simulation, from the exported C, for Modelica tools and Simulink."""
 
 import sys
 import tempfile

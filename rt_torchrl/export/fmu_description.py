@@ -103,5 +103,5 @@ def binaries(version: FMIVersion) -> str:
     if version == "2.0":
         return f"{'win' if system == 'windows' else system}{platform.architecture()[0].removesuffix('bit')}"
     machine = platform.machine().lower()
-    machine = {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(machine, machine)
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
     return f"{machine}-{system}"

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.identification.covariance import named_values
+from rt_torchrl.identification.curve import band
 from rt_torchrl.identification.estimation import Estimation, EstimationConfig
 from rt_torchrl.identification.sensor_record import SensorRecord, sensor_record
 from rt_torchrl.identification.sensors import Sensor
@@ -21,6 +22,8 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
 """Flies the episodes whose records are one simulation, of a plant with a closure."""
+POINTS = 200
+"""Number of visited points, or a few more, at which bands are compared with the true curve."""
 HELD = 20
 """Number of control intervals for which a random command is held."""
 
@@ -82,7 +85,8 @@ def coverage(
     start = copy.deepcopy(twin.closure.state_dict())
     for _ in range(simulations):
         safe_point()
-        records = simulated_records(plant, closure, sensors, share, generator, flights)
+        flown = fly(plant, closure, generator, flights)
+        records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
         twin.closure.load_state_dict(start)
         found = Estimation(twin, sensors, config=config).run(records)
         errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
@@ -99,26 +103,63 @@ def _counted(
     return Coverage(names, inside, known.double().mean(0), ratio)
 
 
-def simulated_records(
+def curve_coverage(
     plant: Plant,
-    closure: nn.Module,
+    start: Callable[[torch.Generator], nn.Module],
     sensors: Sequence[Sensor],
-    share: float,
+    visited: Callable[[Plant, Trajectory], Tensor],
+    *,
+    output: int = 0,
+    simulations: int = 50,
+    share: float = 0.01,
     generator: torch.Generator,
+    config: EstimationConfig | None = None,
     flights: Flights | None = None,
-) -> list[SensorRecord]:
-    """Records of one simulation with white noise, whose guesses of the first states are the true ones.
+) -> Float[Tensor, " {simulations}"]:
+    """How often the bands of a neural closure hold the true curve, where the system has been.
 
     Args:
-        plant: the plant.
-        closure: closure of the simulated system.
-        sensors: sensors.
+        plant: the plant, with its true closure.
+        start: draws the closure that an estimation begins with.
+        sensors: sensors; their noise levels are estimated.
+        visited: features on which the plant calls its closure along a trajectory, in the last dimension.
+        output: number of the closure's output.
+        simulations: number of simulations.
         share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
-        generator: source of initial states, inputs, commands and noise.
-        flights: the episodes; by default one under random commands.
+        generator: source of first closures, initial states, inputs, commands and noise.
+        config: parameters of the estimation, with the prior of the closure's perceptrons.
+        flights: episodes of one simulation; by default one under random commands.
+
+    Returns:
+        Share of the visited points at which the 95 % interval holds the true curve, in each simulation.
     """
-    flown = [random_flight(plant, closure, generator)] if flights is None else flights(plant, closure, generator)
-    records = [sensor_record(plant, sensors, one) for one in flown]
+    found = []
+    for _ in range(simulations):
+        safe_point()
+        flown = fly(plant, plant.closure, generator, flights)
+        records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
+        estimate = Estimation(DigitalTwin(plant, start(generator)), sensors, config=config).run(records)
+        every = torch.cat([visited(plant, one).flatten(0, -2) for one in flown])
+        points = every[:: max(1, len(every) // POINTS)]
+        seen = band(estimate.uncertainty, torch.arange(len(points)).double(), points, output=output)
+        with torch.no_grad():
+            found.append(seen.covers(plant.closure(points)[:, output]))
+    return torch.tensor(found, dtype=torch.float64)
+
+
+def fly(plant: Plant, closure: nn.Module, generator: torch.Generator, flights: Flights | None) -> list[Trajectory]:
+    """Episodes of one simulation; by default one under random commands."""
+    return [random_flight(plant, closure, generator)] if flights is None else flights(plant, closure, generator)
+
+
+def with_noise(records: Sequence[SensorRecord], share: float, generator: torch.Generator) -> list[SensorRecord]:
+    """Records with white noise, whose guesses of the first states stay the true ones.
+
+    Args:
+        records: the records.
+        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
+        generator: source of the noise.
+    """
     readings = torch.cat([record.readings for record in records])
     scale = share * (readings - readings.mean(0)).square().mean(0).sqrt()
     found = []

@@ -108,8 +108,8 @@ class AssimilationConfig:
             raise ValueError(f"drift={self.drift} of the closure's weights must not be negative.")
         if not self.sensors and (self.biased or self.pushes > 1 or self.drift):
             raise ValueError(
-                f"biased={self.biased}, pushes={self.pushes} and drift={self.drift} of the assimilation belong to a fit "
-                "to sensors; give sensors, too."
+                f"biased={self.biased}, pushes={self.pushes} and drift={self.drift} of the assimilation belong to a "
+                "fit to sensors; give sensors, too."
             )
 
 
