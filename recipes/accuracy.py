@@ -20,6 +20,8 @@ from rt_torchrl.twinning.assimilation import Assimilation
 
 EPISODES = {"wind_turbine": 3, "flapping_wing": 2, "cryogenic_tank": 3}
 """Number of real episodes, of which the first one is flown by the classical controller."""
+MEASURED = ("--twinning.assimilation.inputs", "record")
+"""Step 4 replays the measured wind. The drone's default draws it anew, and some draws pass for drag."""
 TO_THE_END = AssimilationConfig(iterations=300, method="levenberg_marquardt", inputs="record")
 """The fit of the best law of a form, to the very episodes that it is judged on."""
 
@@ -62,7 +64,7 @@ class Config:
                 variant="nominal",
                 folder=self.log_dir / plant / f"seed-{seed}",
                 episodes=EPISODES[plant] - 1,
-                options=("--unseen", "2", "--twinning.hypotheses.which", "none"),
+                options=("--unseen", "2", "--twinning.hypotheses.which", "none", *MEASURED),
             )
             for seed in range(self.seeds)
         ]

@@ -11,7 +11,7 @@ if __name__ == "__main__":
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl import EstimationConfig, Plant, check_options, main_of, sensors_of
+from rt_torchrl import EstimationConfig, Plant, Trajectory, check_options, main_of, sensors_of
 from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
@@ -26,7 +26,6 @@ from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.closure_error import visited_features
 from rt_torchrl.identification.coverage import Flights, coverage, curve_coverage, random_flight
-from rt_torchrl.trajectories.trajectory import Trajectory
 
 
 class Case(NamedTuple):
@@ -139,9 +138,9 @@ CURVES: dict[str, CurveCase] = {
     "cascaded_tanks": CurveCase(
         lambda: CascadedTanks(closure=Bent(Hydraulics.true(), wavy_outlet)),
         lambda g: NeuralHydraulics(Hydraulics.true().requires_grad_(True), hidden=HIDDEN, generator=g),
-        ("sensed_level",),
+        ("upper_level", "lower_level"),
         3.0,
-        "rate of the upper level",
+        "the upper tank's rate",
     ),
 }
 """The simulations of curves, by the plant's name; each prior says that a perceptron's weights are of order one."""

@@ -13,7 +13,7 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from rt_torchrl import Run, check_options, main_of
+from rt_torchrl import check_options, main_of
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
@@ -58,6 +58,8 @@ class Config:
 
 def trained(config: Config, memory: str, seed: int) -> list[dict[str, float]]:
     """Costs after every real episode of a training."""
+    from rt_torchrl import Run  # here, because --help need not wait for TorchRL
+
     latest, informative = MEMORIES[memory]
     kept = ("--twinning.records", str(latest), "--twinning.informative", str(informative))
     folder = config.log_dir / memory.replace(",", "").replace(" ", "-") / f"seed-{seed}"
