@@ -5,7 +5,6 @@ import tempfile
 import zipfile
 from importlib.resources import files
 from pathlib import Path
-from typing import get_args
 from uuid import uuid4
 
 import torch
@@ -14,15 +13,15 @@ from torch import nn
 from rt_torchrl.export.c_compiler import compile_c, compiler
 from rt_torchrl.export.c_policy import export_c
 from rt_torchrl.export.c_twin import export_twin
-from rt_torchrl.export.fmu_description import FMIVersion, FMUDescription, binaries, build_description
+from rt_torchrl.export.fmu_description import FMUDescription, binaries, build_description
 from rt_torchrl.plants.plant import Plant
 
 INSTANCE = "fmu_instance.c"
-WRAPPERS: dict[FMIVersion, str] = {"2.0": "fmi2_wrapper.c", "3.0": "fmi3_wrapper.c"}
+WRAPPERS = {"2.0": "fmi2_wrapper.c", "3.0": "fmi3_wrapper.c"}
 SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 
 
-def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant, *, version: FMIVersion = "2.0") -> None:
+def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant, *, version: str = "2.0") -> None:
     """Write a policy as an FMU: the observations are its inputs, the actions its outputs.
 
     The actions follow from the present observations in every call (direct feedthrough); a step of the master is a
@@ -52,9 +51,7 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant, *, vers
         _write(path, described, source, version, output=output, step="")
 
 
-def export_twin_fmu(
-    closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0, version: FMIVersion = "2.0"
-) -> None:
+def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0, version: str = "2.0") -> None:
     """Write a twin as an FMU: commands and exogenous inputs are its inputs, the states its outputs.
 
     A master's step must be a whole number of control intervals; over each interval the inputs are held. The states may
@@ -91,14 +88,12 @@ def _token() -> str:
     return f"{{{uuid4()}}}"
 
 
-def _write(
-    path: Path | str, described: FMUDescription, source: Path, version: FMIVersion, *, output: str, step: str
-) -> None:
+def _write(path: Path | str, described: FMUDescription, source: Path, version: str, *, output: str, step: str) -> None:
     path, found, name = Path(path), compiler(), described.name
     if path.suffix != ".fmu":
         raise ValueError(f"path={path} of an FMU must end in .fmu.")
     if version not in WRAPPERS:
-        raise ValueError(f"version={version!r} of FMI must be one of {', '.join(get_args(FMIVersion))}.")
+        raise ValueError(f"version={version!r} of FMI must be one of {', '.join(WRAPPERS)}.")
     if found is None:
         raise ValueError("an FMU holds machine code, and there is no C compiler here; install one, such as gcc.")
     templates = [files("rt_torchrl.export").joinpath(file) for file in (INSTANCE, WRAPPERS[version])]

@@ -4,12 +4,10 @@ import platform
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 from xml.sax.saxutils import quoteattr
 
 from rt_torchrl.plants.signal import Signal
 
-FMIVersion = Literal["2.0", "3.0"]
 SYSTEMS = {"win32": "windows", "darwin": "darwin"}
 
 
@@ -32,8 +30,8 @@ class FMUDescription:
     outputs: Sequence[tuple[str, Signal]]
     values: Sequence[float]
 
-    def text(self, version: FMIVersion) -> str:
-        """The content of the file."""
+    def text(self, version: str) -> str:
+        """The content of the file, for FMI 2.0 or 3.0."""
         return self._second() if version == "2.0" else self._third()
 
     def _variables(self) -> list[tuple[str, str]]:
@@ -97,7 +95,7 @@ def build_description(name: str, source: str) -> str:
     )
 
 
-def binaries(version: FMIVersion) -> str:
+def binaries(version: str) -> str:
     """Folder of the library for this machine."""
     system = SYSTEMS.get(sys.platform, "linux")
     if version == "2.0":
