@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 MEMORIES = {"last": (1, 0), "last four": (4, 0), "last, and three that tell most": (1, 3)}
 """Numbers of latest episodes and of informative ones, by name."""
+TITLE = "Twins that remember other real episodes, on unseen winds (mean of the seeds; band: their range)"
 OPTIONS = ("--twinning.arm", "model_based", "--untrained", "0", "--unseen", "2", "--threads", "1", "--no-figures")
 RECORDED = ("--twinning.assimilation.inputs", "record", "--twinning.hypotheses.which", "none")
 
@@ -121,17 +122,18 @@ def figure(found: dict[str, list[list[dict[str, float]]]]) -> "Figure":
     from rt_torchrl.figures.style import REAL, ROLES, caption, legend_below, panels
 
     names = list(next(iter(found.values()))[0][0])
-    drawn, axes = panels(1, len(names), title="Twins that remember other real episodes", size=(3.6 * len(names), 3.6))
+    drawn, axes = panels(1, len(names), title=TITLE, size=(3.6 * len(names), 3.6))
     for ax, name in zip(axes.flat, names, strict=True):
         for (memory, trainings), colour in zip(found.items(), (REAL, *ROLES.values()), strict=False):
             costs = curves(trainings, name)
             number = np.arange(1, costs.shape[1] + 1)
             ax.fill_between(number, costs.min(0), costs.max(0), color=colour, alpha=0.15, linewidth=0)
             ax.plot(number, np.exp(np.log(costs).mean(0)), "o-", color=colour, markersize=3, label=memory)
-        ax.set_yscale("log")
+        if name.startswith("J_p"):  # of which a good twin has a hundredth
+            ax.set_yscale("log")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_xlabel("real episodes")
-        caption(ax, name, "unseen winds; band: range of the seeds")
+        caption(ax, name, "")
     legend_below(drawn, [axes.flat[0]])
     return drawn
 
