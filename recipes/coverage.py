@@ -124,7 +124,7 @@ CURVES: dict[str, CurveCase] = {
         lambda: WindTurbine(closure=Bent(SaintDrenan.from_set("BestFitToROSCOTable"), swollen)),
         lambda g: NeuralPowerCoefficient(SaintDrenan.from_set("BestFitToROSCOTable"), hidden=HIDDEN, generator=g),
         ("rotor_speed",),
-        1.0,
+        0.1,
         "C_p",
         turbine_flights,
     ),
@@ -143,7 +143,7 @@ CURVES: dict[str, CurveCase] = {
         "the upper tank's rate",
     ),
 }
-"""The simulations of curves, by the plant's name; each prior says that a perceptron's weights are of order one."""
+"""The simulations of curves, by the plant's name; each prior lets the weights of a perceptron be of order one."""
 
 
 @dataclass(frozen=True, kw_only=True)
