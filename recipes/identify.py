@@ -33,6 +33,7 @@ from rt_torchrl.identification.log_readings import filled, hidden_states, initia
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
 from rt_torchrl.identification.sensor_identification import identify
 from rt_torchrl.identification.sensor_log import Column, SensorLog, checked
+from rt_torchrl.identification.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.shipped_plants import plant_class
 
@@ -52,6 +53,7 @@ class Config:
         missing: keep rows in which a sensor lacks its sample; only that sample is left out.
         sensors: states and measurements whose columns the twin is fitted to by maximum likelihood; by default the
             plant's own J_p is used, or all columns of sensors if a state is not measured or a sample is missing.
+        biased: sensors that may be off by a constant, which is estimated; the fit is then by maximum likelihood.
         guess: first guesses of the initial values of states that are not measured, as STATE=VALUE.
         dt: control interval of the twin [s]; by default the plant's own.
         gap: longest time between two rows that is bridged [s]; by default three sampling intervals.
@@ -70,6 +72,7 @@ class Config:
     drop: bool = False
     missing: bool = False
     sensors: tuple[str, ...] = ()
+    biased: tuple[str, ...] = ()
     guess: tuple[str, ...] = ()
     dt: float | None = None
     gap: float | None = None
@@ -128,7 +131,7 @@ class Config:
     def by_likelihood(self, plant: Plant, log: SensorLog) -> bool:
         """Whether the twin is fitted by maximum likelihood."""
         holes = any(np.isnan(values).any() for values in log.columns.values())
-        return bool(self.sensors or self.guess or holes or hidden_states(plant, log))
+        return bool(self.sensors or self.biased or self.guess or holes or hidden_states(plant, log))
 
     def make_folder(self, plant: str) -> Path:
         """Create the folder of the results and return its path."""
@@ -155,7 +158,7 @@ def main(config: Config) -> None:
     print(report_of_parts(parts, plant, rows=len(log.times)))
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
     if config.by_likelihood(plant, log):
-        sensors = sensors_in(plant, log, config.sensors)
+        sensors = with_biases(sensors_in(plant, log, config.sensors), config.biased)
         task = Estimation(
             DigitalTwin(plant, closure), sensors, spread=initial_spread(plant, log), config=config.estimation
         )

@@ -1,5 +1,7 @@
 """FMUs: a twin taken away as one is the real system of a plant again, and a policy gives its own actions."""
 
+import ctypes
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +20,11 @@ fmpy = pytest.importorskip("fmpy")
 PLANT = WindTurbine(horizon=20.0)
 
 
-@pytest.fixture(scope="module")
-def turbine(tmp_path_factory):
-    """The true turbine as an FMU."""
+@pytest.fixture(scope="module", params=["2.0", "3.0"])
+def turbine(request, tmp_path_factory):
+    """The true turbine as an FMU of both versions."""
     path = tmp_path_factory.mktemp("fmu") / "turbine.fmu"
-    export_twin_fmu(PLANT.closure, path, PLANT)
+    export_twin_fmu(PLANT.closure, path, PLANT, version=request.param)
     return path
 
 
@@ -67,9 +69,10 @@ def test_a_turbine_in_an_fmu_is_the_plants_own(turbine):
 
 
 @needs_compiler
-def test_a_policy_in_an_fmu_gives_its_own_actions(tmp_path):
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_policy_in_an_fmu_gives_its_own_actions(tmp_path, version):
     policy = PLANT.make_policy(torch.Generator().manual_seed(0))
-    export_policy_fmu(policy, tmp_path / "policy.fmu", PLANT)
+    export_policy_fmu(policy, tmp_path / "policy.fmu", PLANT, version=version)
     observations = torch.randn(20, 2, generator=torch.Generator().manual_seed(1)).double()
     names = [f"observation.{signal.name}" for signal in PLANT.observations]
     rows = np.array(
@@ -89,6 +92,22 @@ def test_a_policy_in_an_fmu_gives_its_own_actions(tmp_path):
     actions = np.array([list(row)[1:] for row in found.tolist()])
     # An output of an FMU is read after the step that its inputs were set for.
     np.testing.assert_allclose(actions[1:], expected[:-1], rtol=1e-9)
+
+
+FUNCTIONS = re.compile(r"fmi3\w+(?=TYPE)")
+
+
+@needs_compiler
+def test_an_fmu_of_fmi_3_has_every_function_of_the_standard(tmp_path):
+    """By the header of the standard, which FMPy brings; a master may ask for all."""
+    path = tmp_path / "turbine.fmu"
+    export_twin_fmu(PLANT.closure, path, PLANT, version="3.0")
+    folder = Path(fmpy.extract(str(path), unzipdir=str(tmp_path / "unpacked")))
+    (library,) = (folder / "binaries").glob("*/*")
+    header = Path(fmpy.__file__).parent / "c-code" / "fmi3FunctionTypes.h"
+    names = set(FUNCTIONS.findall(header.read_text(encoding="utf-8")))
+    assert len(names) > 70 and all(hasattr(ctypes.CDLL(str(library)), name) for name in names)
+    assert fmpy.validation.validate_fmu(str(path)) == []
 
 
 SLAVE = """
@@ -139,6 +158,7 @@ def test_what_does_not_fit_an_fmu_is_refused(turbine, tmp_path):
         (lambda: environment(turbine, actions=["command.blade_pitch"]), "must name 2 variables"),
         (lambda: environment(turbine, exogenous=["a", "b"]), "must name 1 variables, or none"),
         (lambda: export_twin_fmu(PLANT.closure, tmp_path / "twin.zip", PLANT), "must end in .fmu"),
+        (lambda: export_twin_fmu(PLANT.closure, tmp_path / "twin.fmu", PLANT, version="1.0"), "version='1.0' of FMI"),
     ):
         with pytest.raises(ValueError, match=message):
             wrong()

@@ -94,12 +94,11 @@ def test_intervals_hold_the_truth_on_each_plant(name):
     from test_export_recipe import recipe
 
     assert (RECIPES / "coverage.py").exists()
-    make, closure_of, sensors = recipe("coverage").CASES[name]
-    plant, generator = make(), torch.Generator().manual_seed(0)
-    config = EstimationConfig(iterations=20)
-    found = coverage(plant, closure_of(plant), sensors_of(plant, sensors), generator=generator, config=config)
-    # The turbine's ten weights are too many for a record of its rotor speed, so that its intervals are too wide.
-    assert 0.90 <= found.mean <= (1.0 if name == "wind_turbine" else 0.98)
+    case = recipe("coverage").CASES[name]
+    plant, generator = case.plant(), torch.Generator().manual_seed(0)
+    given = {"config": EstimationConfig(iterations=20), "flights": case.flights}
+    found = coverage(plant, case.closure(plant), sensors_of(plant, case.sensors), generator=generator, **given)
+    assert 0.90 <= found.mean <= 0.98
     assert (found.error_over_bound[~found.error_over_bound.isnan()] < 1.5).all()
 
 

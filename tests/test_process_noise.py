@@ -102,10 +102,44 @@ def test_what_does_not_go_with_process_noise_is_refused():
         (lambda: Estimation(twin, position()).run(parts), "give the estimation its process noise"),
         (lambda: Estimation(twin, position(), process=one).run(parts[1:]), "begin with a record that follows nothing"),
         (lambda: Estimation(twin, position(), process=0.0 * one), r"process=\[0.0\]"),
-        (lambda: Estimation(twin, position(), process=one, spread=one), "goes with spread=None alone"),
+        (
+            lambda: Estimation(twin, position(), process=one, spread=0.0 * one),
+            r"no spread=\[0.0\] may be zero beside it",
+        ),
         (lambda: chained(record, 0, 0.1), "length=0"),
         (lambda: BeliefPrior(Slope(), Belief(torch.zeros(2).double(), torch.eye(2).double()), 0.0), "drift=0.0"),
         (lambda: BeliefPrior(Slope(), Belief(torch.zeros(3).double(), torch.eye(3).double()), 1.0), "of 3 weights"),
     ):
         with pytest.raises(ValueError, match=message):
             wrong()
+
+
+def test_first_states_may_be_believed_beside_process_noise():
+    """A first state of which something is believed is one more reading of it, of that deviation."""
+    _, values = pushed()
+    spread = 0.3
+    before = np.stack([np.arange(N + 1) > k for k in range(LENGTH, N, LENGTH)], -1).astype(float)
+    inverse = np.linalg.inv(NOISE**2 * np.eye(N + 1) + PUSH**2 * before @ before.T)
+    X, guess = np.stack([np.ones(N + 1), TIMES], -1), np.array([values[0], 0.0])
+    believed = np.diag([1.0 / spread**2, 0.0])
+    expected = np.linalg.solve(X.T @ inverse @ X + believed, X.T @ inverse @ values + believed @ guess)
+    record = sensor_record(Line(), position(), line_segment(values, wind=0.0))
+    given = {"spread": torch.tensor([spread]).double(), "process": torch.tensor([PUSH]).double()}
+    found = Estimation(DigitalTwin(Line(), Slope()), position(), **given).run(chained(record, LENGTH, 0.1))
+    assert found.after["w[0]"] == pytest.approx(expected[1], abs=1e-6)
+    assert found.initial[0, 0].item() == pytest.approx(expected[0], abs=1e-6)
+
+
+def test_what_no_record_has_told_stays_unknown_in_a_belief():
+    """In calm air nothing tells the second slope; then a storm does, as with both records (noise levels aside)."""
+    closure = Slope()
+    task = Estimation(DigitalTwin(Line(), closure), position())
+    calm, storm = (
+        sensor_record(Line(), position(), line_segment((0.5 + 0.3 * z) * TIMES + NOISE * noise_of(N + 1, 5), wind=z))
+        for z in (0.0, 3.0)
+    )
+    belief = Belief.of(task.run([calm]).uncertainty)
+    assert belief.covariance[1, 1] > 1e7 and belief.covariance[0, 0] < 1.0
+    found = task.run([storm], BeliefPrior(closure, belief, 1e-3)).uncertainty
+    alone = Estimation(DigitalTwin(Line(), Slope()), position()).run([calm, storm]).uncertainty
+    assert found.standard_errors()["w[1]"] == pytest.approx(alone.standard_errors()["w[1]"], rel=0.01)

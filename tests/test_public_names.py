@@ -21,17 +21,20 @@ HOMES = {
 }
 """The module that each public name comes from."""
 ROOMS_OF = {
+    "accuracy.py": {"evaluation", "runs", "study", "twinning"},
     "asynchronous.py": {"runs"},
     "benchmark.py": {"trajectories"},
     "cascaded_tanks.py": {"figures", "identification"},
-    "coverage.py": {"identification"},
+    "coverage.py": {"evaluation", "identification"},
     "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},
     "identify.py": {"identification", "figures", "runs"},
     "in_service.py": {"runs", "systems"},
     "jitter.py": {"runs", "systems"},
     "limit.py": {"evaluation", "optimal_control", "runs", "study"},
+    "memory.py": {"evaluation", "figures", "runs"},
     "pareto.py": {"runs", "study"},
+    "partial.py": {"runs", "study"},
     "real_time.py": {"runs"},
     "record_log.py": {"identification", "runs"},
     "soak.py": {"runs"},

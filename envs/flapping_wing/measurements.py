@@ -23,6 +23,13 @@ ACTIONS = (
     Signal(symbol=r"\beta_w", name="stroke_plane_angle", unit="deg", low=-30.0, high=30.0),
 )
 INPUTS = (Signal(symbol=r"u_\infty", name="headwind", unit="m/s"),)
+FILTERED = (
+    Signal(symbol="x_F", name="filtered_position", unit="m"),
+    Signal(symbol="z_F", name="filtered_height", unit="m"),
+)
+"""States that a drone has if one of ``OF_FILTERED`` is observed."""
+POSITION_FILTER = 50.0
+"""ω_F [rad/s]; its lag of 20 ms is short for a flight of seconds."""
 
 
 def error_x(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
@@ -55,8 +62,22 @@ def phase_sine(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tenso
     return torch.sin(2.0 * math.pi * plant.frequency * t)
 
 
+def filtered_rate_x(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The rate of the way forwards [m/s], as the filter of the position tells it."""
+    return POSITION_FILTER * (state[..., -2] - state[..., 0])
+
+
+def filtered_rate_z(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The rate of the way upwards [m/s], as the filter of the height tells it."""
+    return POSITION_FILTER * (state[..., -1] - state[..., 1])
+
+
 STROKE_PLANE = Measurement.of(ACTIONS[1], Component("state", 4), scale=30.0)
 """The stroke plane angle that was applied last, of a drone that remembers it."""
+OF_FILTERED = (
+    Measurement(symbol=r"\dot e_{x,F}", name="filtered_rate_x", unit="m/s", read=filtered_rate_x),
+    Measurement(symbol=r"\dot e_{z,F}", name="filtered_rate_z", unit="m/s", read=filtered_rate_z),
+)
 # ℓ = 2 m and v = 1 m/s: with these, good policies have weights of 1 to 2, which suit one learning rate.
 MEASUREMENTS = (
     Measurement(symbol="e_x", name="error_x", unit="m", read=error_x, scale=2.0),
@@ -67,8 +88,10 @@ MEASUREMENTS = (
     Measurement(symbol=r"\cos 2\pi ft", name="phase_cosine", unit="-", low=-1.0, high=1.0, read=phase_cosine),
     Measurement(symbol=r"\sin 2\pi ft", name="phase_sine", unit="-", low=-1.0, high=1.0, read=phase_sine),
     STROKE_PLANE,
+    *OF_FILTERED,
 )
 ERRORS = tuple(measurement.name for measurement in MEASUREMENTS[:4])
+POSITION = (*ERRORS[:2], *(measurement.name for measurement in OF_FILTERED))
 PHASE = ("phase_cosine", "phase_sine")
 OBSERVATION_SETS = {
     "paper": ERRORS,
@@ -77,6 +100,8 @@ OBSERVATION_SETS = {
     "phase": (*ERRORS, *PHASE),
     "measured": (*ERRORS, *PHASE),
     "measured+wind": (*ERRORS, *PHASE, "headwind"),
+    "position": (*POSITION, *PHASE),
+    "position+wind": (*POSITION, *PHASE, "headwind"),
 }
 """Names of measurements: the paper's errors of position and speed; these with the wind; with the phase of the wing
-beat; and with both."""
+beat; with both; and what a sensor of the position alone tells, with the phase, and with the wind."""

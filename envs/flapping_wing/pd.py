@@ -16,7 +16,7 @@ class TrimmedPD(ClassicalController):
         \beta_w = \beta_0 - K_{P,x}\,(x_f - x) + K_{D,x}\,\dot x
 
     with A_0 = 76.74 deg and β_0 = −12.50 deg, the trim in 1 m/s headwind. Like the policies, it does not measure the
-    wind.
+    wind. On a drone that observes its position alone, the speeds are those of the filters of the position.
 
     The ``placed_gains`` give a point mass two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and g of
     thrust per radian of β_w. From there :func:`~rt_torchrl.baselines.tuning.tune` on twenty gusts finds steeper gains,
@@ -34,7 +34,7 @@ class TrimmedPD(ClassicalController):
     ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 0"]]:
         K_Pz, K_Dz, K_Px, K_Dx = self.log_gains.exp().unbind()
         e_x, e_z = (self.plant.target - state[..., :2]).unbind(-1)
-        v_x, v_z = state[..., 2:4].unbind(-1)
+        v_x, v_z = self.plant.seen_velocity(state).unbind(-1)
         amplitude = self.trim[0] + K_Pz * e_z - K_Dz * v_z
         angle = self.trim[1] - K_Px * e_x + K_Dx * v_x
         return torch.stack([amplitude, angle], -1), memory

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.flapping_wing import measurements as sensors
+from rt_torchrl.envs.flapping_wing import memory
 from rt_torchrl.envs.flapping_wing import merit as judgement
 from rt_torchrl.envs.flapping_wing.costs import TrackingCost, needs_memory, require_rate
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
@@ -62,7 +63,8 @@ class FlappingWing(Plant):
         mass: mass m_b of the body [kg].
         stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; None for none, as in the paper, so that the
             angle may flip within a wing beat. With it the angle that was applied last is a fifth state.
-        observe: names of measurements and observation sets in ``measurements.py``; by default the paper's errors.
+        observe: names of measurements and observation sets in ``measurements.py``; by default the paper's errors. The
+            low-passed positions are two more states, the last ones, if one of these needs them.
 
     Raises:
         ValueError: for a mass or rate that is not positive, a target that is not finite, an unknown measurement, or a
@@ -117,9 +119,11 @@ class FlappingWing(Plant):
         self.cost = TrackingCost() if cost is None else cost
         require_rate(stroke_plane_rate)
         self.stroke_plane_rate, self._greatest_turn = stroke_plane_rate, (stroke_plane_rate or 0.0) * dt
-        if stroke_plane_rate or needs_memory(self.cost) or sensors.STROKE_PLANE in self.observed:
-            self.states = (*sensors.STATES, sensors.ACTIONS[1])
-            self.controller_states = (sensors.ACTIONS[1].name,)
+        turns = stroke_plane_rate or needs_memory(self.cost) or sensors.STROKE_PLANE in self.observed
+        filters = any(measurement in sensors.OF_FILTERED for measurement in self.observed)
+        self.remembered, self.filtered = 1 if turns else 0, 2 if filters else 0
+        held = (*sensors.ACTIONS[1:][: self.remembered], *sensors.FILTERED[: self.filtered])
+        self.states, self.controller_states = (*sensors.STATES, *held), tuple(signal.name for signal in held)
         x_f = torch.tensor(target, dtype=torch.float64)
         self.register_buffer("target", x_f)
         self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
@@ -185,8 +189,10 @@ class FlappingWing(Plant):
         # The air comes with −u_∞ along x, so the body moves with ẋ + u_∞ relative to it.
         relative = torch.cat([velocity[..., :1] + exogenous, velocity[..., 1:]], -1)
         force = self.force(t, relative, action, closure)
-        # The angle that was applied last is held, or there is no such state.
-        return torch.cat([velocity, (force + self.weight) / self.mass, torch.zeros_like(state[..., 4:])], -1)
+        # The angle that was applied last is held, and the filters follow the position, or there are no such states.
+        held = torch.zeros_like(state[..., 4 : 4 + self.remembered])
+        filters = memory.filter_rates(state, self.filtered)
+        return torch.cat([velocity, (force + self.weight) / self.mass, held, filters], -1)
 
     def force(
         self,
@@ -225,12 +231,6 @@ class FlappingWing(Plant):
         change = (command[..., 1] - state[..., 4]).clamp(-self._greatest_turn, self._greatest_turn)
         return torch.stack([command[..., 0], state[..., 4] + change], -1)
 
-    def latch(
-        self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch 2"]
-    ) -> Float[Tensor, "*batch n_s"]:
-        """Remember the stroke plane angle, if there is a state for it."""
-        return torch.cat([state[..., :4], applied[..., 1:]], -1)[..., : len(self.states)]
-
     # The control problem
 
     def running_cost(
@@ -249,6 +249,7 @@ class FlappingWing(Plant):
         """The discrepancy ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
+    latch, controller_start, seen_velocity = memory.latch, memory.started, memory.seen_velocity
     merit, setpoints, categories, make_neural_closure, suspects = (
         judgement.merit,
         judgement.setpoints,
@@ -258,9 +259,9 @@ class FlappingWing(Plant):
     )
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
-        """All states; the stroke plane angle that was applied last is that of the record."""
-        last = torch.cat([actions[:1, 1], actions[:, 1]])
-        return super().complete_states({sensors.ACTIONS[1].name: last} | measured, exogenous, actions)
+        """All states; what a controller remembers follows from the others."""
+        found = memory.completed(self, measured, exogenous, actions)
+        return super().complete_states(found, exogenous, actions)
 
     # Randomness
 

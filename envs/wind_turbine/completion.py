@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.measurements import FAST_FILTER, FAST_SPEED, STATES
+from rt_torchrl.plants.lag import between, lag
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -56,17 +57,3 @@ def started(
     torque = (plant.optimal_gain * omega_g**2).clamp(max=plant.actions[0].high)
     fast = [omega_g] * (len(plant.states) - len(STATES))
     return torch.stack([omega_g, wind, plant.speed_error(omega_g, wind), torque, torch.zeros_like(wind), *fast], -1)
-
-
-def between(values: Float[Tensor, " samples"]) -> Float[Tensor, " n"]:
-    """The mean of the values at both ends of every interval."""
-    return 0.5 * (values[1:] + values[:-1])
-
-
-def lag(start: Tensor, driving: Float[Tensor, " n"], steps: float) -> Float[Tensor, " samples"]:
-    """A first-order lag from ``start``; ``steps`` is dt over its time constant."""
-    from scipy.signal import lfilter  # imported here: loading takes a second, and only logs need it
-
-    decay = math.exp(-steps)
-    ends, _ = lfilter([1.0 - decay], [1.0, -decay], driving.numpy(), zi=[decay * start.item()])
-    return torch.cat([start.reshape(1), torch.from_numpy(ends)])

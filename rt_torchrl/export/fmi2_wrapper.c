@@ -1,39 +1,4 @@
-/* FMI 2.0 for co-simulation around the functions of rt_torchrl. Written by rt_torchrl; do not edit. */
-
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "@HEADER@"
-
-#define COUNT @COUNT@
-#define INTERVAL @INTERVAL@
-#define GUID "@GUID@"
-#if defined _WIN32
-#define FMI __declspec(dllexport)
-#else
-#define FMI
-#endif
-
-typedef void *Component;
-typedef unsigned int Reference;
-enum { OK, WARNING, DISCARD, ERROR, FATAL, PENDING };
-
-typedef struct {
-    double values[COUNT];
-    double t;
-} Instance;
-
-static const double first[COUNT] = {@VALUES@};
-
-static void output(double *v) { @OUTPUT@ }
-
-static void advance(double t, double *v) { @STEP@ }
-
-static void begin(Instance *one) {
-    memcpy(one->values, first, sizeof first);
-    one->t = 0.0;
-}
+/* FMI 2.0 for co-simulation. */
 
 FMI const char *fmi2GetTypesPlatform(void) { return "default"; }
 FMI const char *fmi2GetVersion(void) { return "2.0"; }
@@ -44,12 +9,8 @@ FMI int fmi2SetDebugLogging(Component c, int on, size_t n, const char *const nam
 
 FMI Component fmi2Instantiate(const char *name, int kind, const char *guid, const char *place, const void *functions,
                               int visible, int logging) {
-    Instance *one;
     (void)name, (void)place, (void)functions, (void)visible, (void)logging;
-    if (kind != 1 || strcmp(guid, GUID) != 0) return NULL; /* co-simulation alone */
-    one = malloc(sizeof *one);
-    if (one) begin(one);
-    return one;
+    return kind == 1 ? new_instance(guid) : NULL; /* co-simulation alone */
 }
 
 FMI void fmi2FreeInstance(Component c) { free(c); }
@@ -63,37 +24,12 @@ FMI int fmi2ExitInitializationMode(Component c) { (void)c; return OK; }
 FMI int fmi2Terminate(Component c) { (void)c; return OK; }
 FMI int fmi2Reset(Component c) { begin(c); return OK; }
 
-FMI int fmi2GetReal(Component c, const Reference r[], size_t n, double x[]) {
-    Instance *one = c;
-    size_t k;
-    output(one->values);
-    for (k = 0; k < n; k++) {
-        if (r[k] >= COUNT) return ERROR;
-        x[k] = one->values[r[k]];
-    }
-    return OK;
-}
-FMI int fmi2SetReal(Component c, const Reference r[], size_t n, const double x[]) {
-    Instance *one = c;
-    size_t k;
-    for (k = 0; k < n; k++) {
-        if (r[k] >= COUNT) return ERROR;
-        one->values[r[k]] = x[k];
-    }
-    return OK;
-}
+FMI int fmi2GetReal(Component c, const Reference r[], size_t n, double x[]) { return get(c, r, n, x); }
+FMI int fmi2SetReal(Component c, const Reference r[], size_t n, const double x[]) { return set(c, r, n, x); }
 
 FMI int fmi2DoStep(Component c, double t, double length, int again) {
-    Instance *one = c;
-    double count = length / INTERVAL;
-    long k, steps = (long)floor(count + 0.5);
     (void)again;
-    if (steps < 1 || fabs(count - (double)steps) > 1e-6) return DISCARD; /* no whole number of control intervals */
-    for (k = 0; k < steps; k++) advance(t + (double)k * INTERVAL, one->values);
-    one->t = t + length;
-    for (k = 0; k < COUNT; k++)
-        if (!(fabs(one->values[k]) < HUGE_VAL)) return ERROR; /* diverged */
-    return OK;
+    return step(c, t, length);
 }
 FMI int fmi2CancelStep(Component c) { (void)c; return ERROR; }
 

@@ -1,14 +1,11 @@
-"""A policy or a twin as an FMU: FMI 2.0 for co-simulation, from the exported C, for Modelica tools and Simulink."""
+"""A policy or a twin as an FMU for co-simulation, from the exported C, for Modelica tools and Simulink."""
 
-import platform
 import sys
 import tempfile
 import zipfile
-from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from uuid import uuid4
-from xml.sax.saxutils import quoteattr
 
 import torch
 from torch import nn
@@ -16,14 +13,15 @@ from torch import nn
 from rt_torchrl.export.c_compiler import compile_c, compiler
 from rt_torchrl.export.c_policy import export_c
 from rt_torchrl.export.c_twin import export_twin
+from rt_torchrl.export.fmu_description import FMUDescription, binaries, build_description
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
 
-TEMPLATE = "fmi2_wrapper.c"
+INSTANCE = "fmu_instance.c"
+WRAPPERS = {"2.0": "fmi2_wrapper.c", "3.0": "fmi3_wrapper.c"}
 SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 
 
-def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None:
+def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant, *, version: str = "2.0") -> None:
     """Write a policy as an FMU: the observations are its inputs, the actions its outputs.
 
     The actions follow from the present observations in every call (direct feedthrough); a step of the master is a
@@ -33,10 +31,11 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None
         policy: any ``policy(observation) -> action`` that :func:`export_c` takes.
         path: file to write, such as ``policy.fmu``.
         plant: plant with the policy's observations and actions.
+        version: version of FMI, 2.0 or 3.0.
 
     Raises:
-        ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_c` refuses
-            the policy.
+        ValueError: if the path does not end in ``.fmu``, the version is neither, there is no C compiler, or
+            :func:`export_c` refuses the policy.
     """
     name = f"{plant.name}_policy"
     n_o, n_a = len(plant.observations), len(plant.actions)
@@ -46,10 +45,13 @@ def export_policy_fmu(policy: nn.Module, path: Path | str, plant: Plant) -> None
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "policy.c"
         export_c(policy, source, plant, function=name)
-        _write(path, name, source, plant.dt, inputs, outputs, [0.0] * (n_o + n_a), output=output, step="")
+        described = FMUDescription(
+            name=name, token=_token(), dt=plant.dt, inputs=inputs, outputs=outputs, values=[0.0] * (n_o + n_a)
+        )
+        _write(path, described, source, version, output=output, step="")
 
 
-def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0) -> None:
+def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed: int = 0, version: str = "2.0") -> None:
     """Write a twin as an FMU: commands and exogenous inputs are its inputs, the states its outputs.
 
     A master's step must be a whole number of control intervals; over each interval the inputs are held. The states may
@@ -60,10 +62,11 @@ def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed:
         path: file to write, such as ``twin.fmu``.
         plant: the physics.
         seed: seed of the default initial state.
+        version: version of FMI, 2.0 or 3.0.
 
     Raises:
-        ValueError: if the path does not end in ``.fmu``, there is no C compiler, or :func:`export_twin` refuses the
-            twin.
+        ValueError: if the path does not end in ``.fmu``, the version is neither, there is no C compiler, or
+            :func:`export_twin` refuses the twin.
     """
     name = f"{plant.name}_twin"
     n_a, n_z = len(plant.actions), len(plant.inputs)
@@ -75,36 +78,34 @@ def export_twin_fmu(closure: nn.Module, path: Path | str, plant: Plant, *, seed:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "twin.c"
         export_twin(closure, source, plant, name=name)
-        _write(path, name, source, plant.dt, inputs, outputs, values, output="(void)v;", step=step)
+        described = FMUDescription(
+            name=name, token=_token(), dt=plant.dt, inputs=inputs, outputs=outputs, values=values
+        )
+        _write(path, described, source, version, output="(void)v;", step=step)
 
 
-def _write(
-    path: Path | str,
-    name: str,
-    source: Path,
-    dt: float,
-    inputs: Sequence[tuple[str, Signal]],
-    outputs: Sequence[tuple[str, Signal]],
-    values: Sequence[float],
-    *,
-    output: str,
-    step: str,
-) -> None:
-    path, found = Path(path), compiler()
+def _token() -> str:
+    return f"{{{uuid4()}}}"
+
+
+def _write(path: Path | str, described: FMUDescription, source: Path, version: str, *, output: str, step: str) -> None:
+    path, found, name = Path(path), compiler(), described.name
     if path.suffix != ".fmu":
         raise ValueError(f"path={path} of an FMU must end in .fmu.")
+    if version not in WRAPPERS:
+        raise ValueError(f"version={version!r} of FMI must be one of {', '.join(WRAPPERS)}.")
     if found is None:
         raise ValueError("an FMU holds machine code, and there is no C compiler here; install one, such as gcc.")
-    guid = f"{{{uuid4()}}}"
-    text = files("rt_torchrl.export").joinpath(TEMPLATE).read_text(encoding="utf-8")
+    templates = [files("rt_torchrl.export").joinpath(file) for file in (INSTANCE, WRAPPERS[version])]
+    text = "".join(template.read_text(encoding="utf-8") for template in templates)
     replaced = {
         "@HEADER@": source.with_suffix(".h").name,
-        "@COUNT@": str(len(values)),
-        "@VALUES@": ", ".join(repr(value) for value in values),
-        "@INTERVAL@": repr(dt),
+        "@COUNT@": str(len(described.values)),
+        "@VALUES@": ", ".join(repr(value) for value in described.values),
+        "@INTERVAL@": repr(described.dt),
         "@OUTPUT@": output,
         "@STEP@": step or "(void)t;",
-        "@GUID@": guid,
+        "@GUID@": described.token,
     }
     for word, value in replaced.items():
         text = text.replace(word, value)
@@ -113,49 +114,9 @@ def _write(
     wrapper.write_text(text + source.read_text(encoding="utf-8"), encoding="utf-8")
     library = compile_c(found, wrapper)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as fmu:
-        fmu.writestr("modelDescription.xml", _description(name, guid, dt, inputs, outputs, values))
-        fmu.write(library, f"binaries/{_platform()}/{name}{SUFFIXES.get(sys.platform, '.so')}")
+        fmu.writestr("modelDescription.xml", described.text(version))
+        fmu.write(library, f"binaries/{binaries(version)}/{name}{SUFFIXES.get(sys.platform, '.so')}")
         for file in (wrapper, source.with_suffix(".h")):
             fmu.write(file, f"sources/{file.name}")
-
-
-def _platform() -> str:
-    system = {"win32": "win", "darwin": "darwin"}.get(sys.platform, "linux")
-    return f"{system}{platform.architecture()[0].removesuffix('bit')}"
-
-
-def _description(
-    name: str,
-    guid: str,
-    dt: float,
-    inputs: Sequence[tuple[str, Signal]],
-    outputs: Sequence[tuple[str, Signal]],
-    values: Sequence[float],
-) -> str:
-    """The text of ``modelDescription.xml``; a variable is called KIND.NAME, such as ``state.rotor_speed``."""
-    rows = []
-    for k, (kind, signal) in enumerate((*inputs, *outputs)):
-        is_input = k < len(inputs)
-        causality = "input" if is_input else "output"
-        # What a state starts with may be set; an action follows from the observation.
-        initial = "" if is_input else ' initial="exact"' if kind == "state" else ' initial="calculated"'
-        start = f' start="{values[k]!r}"' if is_input or kind == "state" else ""
-        rows.append(
-            f'<ScalarVariable name={quoteattr(f"{kind}.{signal.name}")} valueReference="{k}" '
-            f'causality="{causality}" variability="continuous"{initial} description={quoteattr(signal.unit)}>'
-            f"<Real{start}/></ScalarVariable>"
-        )
-    first = len(inputs) + 1
-    unknowns = "".join(f'<Unknown index="{first + k}"/>' for k in range(len(outputs)))
-    calculated = "".join(f'<Unknown index="{first + k}"/>' for k, (kind, _) in enumerate(outputs) if kind != "state")
-    initials = f"<InitialUnknowns>{calculated}</InitialUnknowns>" if calculated else ""
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<fmiModelDescription fmiVersion="2.0" modelName={quoteattr(name)} guid="{guid}" '
-        'generationTool="rt_torchrl" variableNamingConvention="structured">'
-        f'<CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="true"/>'
-        f'<DefaultExperiment startTime="0" stepSize="{dt!r}"/>'
-        f"<ModelVariables>{''.join(rows)}</ModelVariables>"
-        f"<ModelStructure><Outputs>{unknowns}</Outputs>{initials}</ModelStructure>"
-        "</fmiModelDescription>\n"
-    )
+        if version == "3.0":
+            fmu.writestr("sources/buildDescription.xml", build_description(name, wrapper.name))

@@ -1,7 +1,7 @@
 """How often intervals hold the truth: an estimation from many simulated records with noise."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.identification.covariance import named_values
+from rt_torchrl.identification.curve import band
 from rt_torchrl.identification.estimation import Estimation, EstimationConfig
 from rt_torchrl.identification.sensor_record import SensorRecord, sensor_record
 from rt_torchrl.identification.sensors import Sensor
@@ -19,6 +20,10 @@ from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
+Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
+"""Flies the episodes whose records are one simulation, of a plant with a closure."""
+POINTS = 200
+"""Number of visited points, or a few more, at which bands are compared with the true curve."""
 HELD = 20
 """Number of control intervals for which a random command is held."""
 
@@ -53,6 +58,7 @@ def coverage(
     share: float = 0.01,
     generator: torch.Generator,
     config: EstimationConfig | None = None,
+    flights: Flights | None = None,
 ) -> Coverage:
     """Simulate records under the closure, add noise, estimate, and compare with the closure.
 
@@ -63,9 +69,10 @@ def coverage(
         closure: closure of the simulated system, which the twin can represent exactly.
         sensors: sensors; their noise levels are estimated.
         simulations: number of simulated records.
-        share: standard deviation of the noise, as a share of the RMS deviation of each reading from its mean.
+        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
         generator: source of initial states, inputs, commands and noise.
         config: parameters of the estimation.
+        flights: episodes of one simulation; by default one under random commands.
 
     Raises:
         ValueError: if there is no simulation, or the noise is no positive share.
@@ -78,9 +85,10 @@ def coverage(
     start = copy.deepcopy(twin.closure.state_dict())
     for _ in range(simulations):
         safe_point()
-        record = with_noise(sensor_record(plant, sensors, random_flight(plant, closure, generator)), share, generator)
+        flown = fly(plant, closure, generator, flights)
+        records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
         twin.closure.load_state_dict(start)
-        found = Estimation(twin, sensors, config=config).run([record])
+        found = Estimation(twin, sensors, config=config).run(records)
         errors.append(torch.stack(list(named_values(twin.closure).values())).detach() - truth)
         bounds_found.append(torch.tensor(list(found.uncertainty.standard_errors().values()), dtype=torch.float64))
     return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(bounds_found))
@@ -95,19 +103,86 @@ def _counted(
     return Coverage(names, inside, known.double().mean(0), ratio)
 
 
-@torch.no_grad()
-def random_flight(plant: Plant, closure: nn.Module, generator: torch.Generator) -> Trajectory:
-    """One episode of the plant under random commands in the middle of their ranges, each held for some intervals."""
-    start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
-    low, high = bounds(plant.actions)
-    drawn = torch.rand(1, -(-plant.n_steps // HELD), len(low), generator=generator, dtype=torch.float64)
-    share = 0.3 + 0.4 * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
-    return Rollout(plant, closure)(start, inputs, low + share * (high - low)).each()[0]
+def curve_coverage(
+    plant: Plant,
+    start: Callable[[torch.Generator], nn.Module],
+    sensors: Sequence[Sensor],
+    visited: Callable[[Plant, Trajectory], Tensor],
+    *,
+    output: int = 0,
+    simulations: int = 50,
+    share: float = 0.01,
+    generator: torch.Generator,
+    config: EstimationConfig | None = None,
+    flights: Flights | None = None,
+) -> Float[Tensor, " {simulations}"]:
+    """How often the bands of a neural closure hold the true curve, where the system has been.
+
+    Args:
+        plant: the plant, with its true closure.
+        start: draws the closure that an estimation begins with.
+        sensors: sensors; their noise levels are estimated.
+        visited: features on which the plant calls its closure along a trajectory, in the last dimension.
+        output: number of the closure's output.
+        simulations: number of simulations.
+        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
+        generator: source of first closures, initial states, inputs, commands and noise.
+        config: parameters of the estimation, with the prior of the closure's perceptrons.
+        flights: episodes of one simulation; by default one under random commands.
+
+    Returns:
+        Share of the visited points at which the 95 % interval holds the true curve, in each simulation.
+    """
+    found = []
+    for _ in range(simulations):
+        safe_point()
+        flown = fly(plant, plant.closure, generator, flights)
+        records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
+        estimate = Estimation(DigitalTwin(plant, start(generator)), sensors, config=config).run(records)
+        every = torch.cat([visited(plant, one).flatten(0, -2) for one in flown])
+        points = every[:: max(1, len(every) // POINTS)]
+        seen = band(estimate.uncertainty, torch.arange(len(points)).double(), points, output=output)
+        with torch.no_grad():
+            found.append(seen.covers(plant.closure(points)[:, output]))
+    return torch.tensor(found, dtype=torch.float64)
 
 
-def with_noise(record: SensorRecord, share: float, generator: torch.Generator) -> SensorRecord:
-    """The record with white noise, whose guess of the first state stays the true one."""
-    readings = record.readings
+def fly(plant: Plant, closure: nn.Module, generator: torch.Generator, flights: Flights | None) -> list[Trajectory]:
+    """Episodes of one simulation; by default one under random commands."""
+    return [random_flight(plant, closure, generator)] if flights is None else flights(plant, closure, generator)
+
+
+def with_noise(records: Sequence[SensorRecord], share: float, generator: torch.Generator) -> list[SensorRecord]:
+    """Records with white noise, whose guesses of the first states stay the true ones.
+
+    Args:
+        records: the records.
+        share: standard deviation of the noise, as a share of the RMS deviation of a sensor's readings from their mean.
+        generator: source of the noise.
+    """
+    readings = torch.cat([record.readings for record in records])
     scale = share * (readings - readings.mean(0)).square().mean(0).sqrt()
-    noise = torch.randn(readings.shape, generator=generator, dtype=torch.float64)
-    return record._replace(readings=readings + scale * noise)
+    found = []
+    for record in records:
+        noise = torch.randn(record.readings.shape, generator=generator, dtype=torch.float64)
+        found.append(record._replace(readings=record.readings + scale * noise))
+    return found
+
+
+@torch.no_grad()
+def random_flight(
+    plant: Plant, closure: nn.Module, generator: torch.Generator, *, low: float = 0.3, high: float = 0.7
+) -> Trajectory:
+    """One episode of the plant under random commands, each held for some intervals.
+
+    Args:
+        plant: the plant.
+        closure: closure of the simulated system.
+        generator: source of initial state, inputs and commands.
+        low, high: least and greatest command, as shares of its range.
+    """
+    start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    least, greatest = bounds(plant.actions)
+    drawn = torch.rand(1, -(-plant.n_steps // HELD), len(least), generator=generator, dtype=torch.float64)
+    share = low + (high - low) * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
+    return Rollout(plant, closure)(start, inputs, least + share * (greatest - least)).each()[0]

@@ -55,6 +55,8 @@ def table_of_sensors(metrics: dict[str, Any]) -> str:
             lines.append(f"    {label:<30}{_shown(rms['before']):>12}{_shown(rms['after']):>12}")
     levels = ", ".join(f"{name} {value:.3g}" for name, value in metrics["noise"].items())
     lines.append(f"  noise of the sensors: {levels}")
+    biases = ", ".join(f"{name} {value:.3g}" for name, value in metrics["bias"].items() if value)
+    lines += [f"  bias of the sensors: {biases}"] if biases else []
     correlation = ", ".join(f"{name} {_shown(value)}" for name, value in metrics["autocorrelation"].items())
     lines.append(f"  correlation of neighbouring residuals: {correlation}")
     lines += weight_lines(metrics["weights"])

@@ -107,7 +107,7 @@ class Estimation:
         spread: standard deviation of the initial states about their guess: zero for a state that is known, infinite for
             one of which only the readings tell. None lets all be unknown.
         process: standard deviation of what process noise does to every state from a record to one that follows it, see
-            :func:`chained`; None if there is none.
+            :func:`chained`; None if there is none. No state is known then, so that no ``spread`` may be zero.
         config: parameters of the estimation.
     """
 
@@ -130,10 +130,11 @@ class Estimation:
             )
         self.process = process
         fits = process is None or (process.shape == unknown.shape and bool((process > 0.0).all()))
-        if process is not None and not (fits and bool(self.spread.isinf().all())):
+        if process is not None and not (fits and bool((self.spread > 0.0).all())):
             raise ValueError(
                 f"process={process.tolist()} must hold a positive number for each of "
-                f"{', '.join(state.name for state in twin.plant.states)}, and goes with spread=None alone."
+                f"{', '.join(state.name for state in twin.plant.states)}, and "
+                f"no spread={self.spread.tolist()} may be zero beside it."
             )
 
     def run(self, records: Sequence[SensorRecord], belief: BeliefPrior | None = None) -> Estimate:

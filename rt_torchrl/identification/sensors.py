@@ -5,6 +5,7 @@ r"""Sensors: what is measured of a real system, as the likelihood of an identifi
 The plant knows nothing of its sensors here: they belong to the log or to the real system.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,6 +84,21 @@ def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:
             f"choose among {', '.join(known)}."
         )
     return tuple(known[name] for name in names)
+
+
+def with_biases(sensors: Sequence[Sensor], names: Sequence[str]) -> tuple[Sensor, ...]:
+    """The sensors, of which the named ones have a constant bias that is estimated.
+
+    Raises:
+        ValueError: if a name is none of the sensors.
+    """
+    known = [sensor.name for sensor in sensors]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(
+            f"biased={tuple(names)}: {', '.join(unknown)} is none of the sensors; choose among {', '.join(known)}."
+        )
+    return tuple(dataclasses.replace(sensor, bias=sensor.bias or sensor.name in names) for sensor in sensors)
 
 
 def read(

@@ -54,6 +54,13 @@ class AssimilationConfig:
             states, about what the plant usually draws. The prior is then the stiffness of the likelihood, J_p is half
             the mean square of the residuals in units of the noise, and ``stop_ratio`` has no effect. Sensors need
             ``levenberg_marquardt``, the inputs of the ``record``, ``initial="estimated"`` and whole records.
+        biased: names of the sensors that may be off by a constant, which is estimated.
+        pushes: number of parts of a record between which something beside the twin may push the states (weak
+            constraint); 1 for none. The pushes are unknowns beside the weights, which they then bend no longer.
+        push: size of a push, its standard deviation as a share of each state's usual size.
+        drift: standard deviation by which each weight of the closure may change from episode to episode, where a change
+            of 1 is a factor of e for a logarithm. What earlier episodes told is then kept as a belief that fades, and
+            each episode adds its record. With 0 the records alone tell the weights.
         descent: parameters of the closure's descent.
     """
 
@@ -65,6 +72,10 @@ class AssimilationConfig:
     segment: int = 0
     initial: Literal["measured", "estimated"] = "measured"
     sensors: tuple[str, ...] = ()
+    biased: tuple[str, ...] = ()
+    pushes: int = 1
+    push: float = 0.01
+    drift: float = 0.0
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self) -> None:
@@ -86,6 +97,19 @@ class AssimilationConfig:
             raise ValueError(
                 f"sensors={self.sensors} of the assimilation need initial='estimated' and segment=0; they are "
                 f"{self.initial!r} and {self.segment}."
+            )
+        self._check_likelihood()
+
+    def _check_likelihood(self) -> None:
+        """Check what only a fit to sensors takes."""
+        if self.pushes < 1 or not self.push > 0.0:
+            raise ValueError(f"pushes={self.pushes} must be at least 1, and push={self.push} positive.")
+        if not self.drift >= 0.0:
+            raise ValueError(f"drift={self.drift} of the closure's weights must not be negative.")
+        if not self.sensors and (self.biased or self.pushes > 1 or self.drift):
+            raise ValueError(
+                f"biased={self.biased}, pushes={self.pushes} and drift={self.drift} of the assimilation belong to a "
+                "fit to sensors; give sensors, too."
             )
 
 

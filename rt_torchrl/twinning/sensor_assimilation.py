@@ -7,8 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.identification.estimation import Estimate, Estimation, EstimationConfig
-from rt_torchrl.identification.sensor_record import SensorRecord, sensor_record
-from rt_torchrl.identification.sensors import Sensor, sensors_of
+from rt_torchrl.identification.first_values import state_sizes
+from rt_torchrl.identification.sensor_record import SensorRecord, chained, sensor_record
+from rt_torchrl.identification.sensors import Sensor, sensors_of, with_biases
+from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.measurement import Component
@@ -21,6 +23,8 @@ STARTS = 10
 """Number of first weights in the first episode, because one sensor may leave several local minima."""
 ROUNDS = 4
 """Greatest number of rounds in which the noise levels follow the residuals, in an episode."""
+KNOWN = 1e-6
+"""Spread of first states that are known, as a share of their usual size, where pushes make all states unknowns."""
 DRAWS = 200
 """Number of initial states that a plant draws, to learn how hidden ones depend on those that are read."""
 
@@ -38,36 +42,47 @@ class SensorAssimilation(Assimilation):
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
         super().__init__(twin, config)
-        self.sensors = sensors_of(twin.plant, config.sensors)
+        self.sensors = with_biases(sensors_of(twin.plant, config.sensors), config.biased)
         self.estimate: Estimate | None = None
         self.begun = False
+        self.belief: Belief | None = None
 
     def _descend(self, replayed: Trajectory) -> Descended:
         plant, config = self.twin.plant, self.config
         records = [sensor_record(plant, self.sensors, record) for record in replayed.each()]
         first = FirstStates(plant, self.sensors)
         records = [record._replace(guess=first.guess(record)) for record in records]
-        estimation = Estimation(
-            self.twin,
-            self.sensors,
-            spread=first.spread,
-            config=EstimationConfig(
-                iterations=max(config.iterations, 1),
-                rounds=ROUNDS,
-                prior=config.prior,
-                starts=1 if self.begun else STARTS,
-            ),
-        )
+        estimation, records = self._task(records, first.spread)
         if not config.iterations:
             return Descended(float("nan"), float("nan"), float("nan"), 0)
         start = [w.detach().clone() for w in self.twin.closure.parameters()]
-        self.estimate = estimation.run(records)
-        self.begun = True
+        closure, drift = self.twin.closure, config.drift
+        believed = BeliefPrior(closure, self.belief, drift) if drift and self.belief is not None else None
+        self.estimate = estimation.run(records, believed)
+        self.begun, self.belief = True, Belief.of(self.estimate.uncertainty) if drift else None
         found = [w.detach().clone() for w in self.twin.closure.parameters()]
         noise, samples = self.estimate.likelihood.noise, sum(int(record.seen.sum()) for record in records)
         costs = [self._misfit(estimation, records, noise, weights) for weights in (start, found)]
         before, after = (found.cost.item() / samples for found in costs)
         return Descended(before, after, costs[0].gradient.norm().item(), self.estimate.iterations)
+
+    def _task(
+        self, records: list[SensorRecord], spread: Float[Tensor, " n_s"]
+    ) -> tuple[Estimation, list[SensorRecord]]:
+        """The estimation, and the records in the parts between which something may push."""
+        plant, config, process = self.twin.plant, self.config, None
+        if config.pushes > 1:
+            sizes = state_sizes(plant, torch.stack([record.guess for record in records]), self.sensors, records)
+            process, spread = config.push * sizes, torch.maximum(spread, KNOWN * sizes)
+            length = -(-len(records[0].actions) // config.pushes)
+            records = [part for record in records for part in chained(record, length, plant.dt)]
+        options = EstimationConfig(
+            iterations=max(config.iterations, 1),
+            rounds=ROUNDS,
+            prior=config.prior,
+            starts=1 if self.begun else STARTS,
+        )
+        return Estimation(self.twin, self.sensors, spread=spread, process=process, config=options), records
 
     @torch.no_grad()
     def _misfit(
@@ -79,20 +94,22 @@ class SensorAssimilation(Assimilation):
         return estimation.fit_initial_states(records, noise).normal_equations()
 
     def report(self) -> dict[str, float]:
-        """Noise levels and standard errors of the last update, by name."""
+        """Noise levels, biases and standard errors of the last update, by name."""
         if self.estimate is None:
             return {}
         errors = self.estimate.uncertainty.standard_errors()
-        return {f"noise/{name}": value for name, value in self.estimate.noise.items()} | {
-            f"standard_error/{name}": value for name, value in errors.items()
-        }
+        found = {f"noise/{name}": value for name, value in self.estimate.noise.items()}
+        found |= {f"bias/{name}": self.estimate.biases[name] for name in self.config.biased}
+        return found | {f"standard_error/{name}": value for name, value in errors.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"begun": self.begun}
+        belief = None if self.belief is None else self.belief._asdict()
+        return super().state_dict() | {"begun": self.begun, "belief": belief}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self.begun = state["begun"]
+        self.begun, belief = state["begun"], state["belief"]
+        self.belief = None if belief is None else Belief(**belief)
 
 
 class FirstStates:
