@@ -31,6 +31,7 @@ TAGS = {
     "critic_loss": "model-free/critic loss",
     "value": "model-free/mean value of the policy",
     "exploration": "model-free/exploration strength",
+    "ended_after": "cost/control intervals until the early end of the real episode",
     "solve_median": "predictive control/median time of a solve (ms)",
     "solve_max": "predictive control/longest solve (ms)",
     "late_solves": "predictive control/late solves",
@@ -109,7 +110,7 @@ class Dashboard:
             rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
             table = "\n".join(["| time in the episode [s] | fault | detail |", "|---|---|---|", *rows])
             self._writer.add_text("faults", table, step)
-        for key in (key for key in record if key.startswith(("faults/", "violations/"))):
+        for key in (key for key in record if key.startswith(("faults/", "violations/", "excess/", "multiplier/"))):
             self._scalar(key, record[key], step)
         for name, seconds in record["seconds"].items():
             self._scalar(f"seconds/{name}", seconds, step)

@@ -79,7 +79,8 @@ class Planning:
         while self.others:
             other = self._from_others(self.others.pop(), planned_on, judged_on)
             found = found if other is None else other
-        return found
+        constraints = self.virtual.constraints
+        return merged(found, findings(**constraints.report())) if constraints else found
 
     def remember(self) -> None:
         """Plan from the present weights, too, the next time; state feedback has none."""
@@ -89,14 +90,14 @@ class Planning:
     def _from_others(self, weights: dict[str, Tensor], planned_on: Scenario, judged_on: Scenario) -> TensorDict | None:
         """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
         policy = self.planner.policy
-        best, least = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on)
+        best, least = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on)
         policy.load_state_dict(weights)
         self.planner.restart()
         try:
             found = self.planner.plan(planned_on)
         except FloatingPointError:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
-        if found is not None and self.virtual.cost(policy, judged_on) < least:
+        if found is not None and self.virtual.price(policy, judged_on) < least:
             return planned(found, accepted=True)
         policy.load_state_dict(best)
         self.planner.restart()
@@ -114,7 +115,7 @@ class Planning:
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
-        cost = judgement.expected(policy, self.virtual.cost(policy, judged_on).item()) if judged else 0.0
+        cost = judgement.expected(policy, self.virtual.price(policy, judged_on).item()) if judged else 0.0
         accepted = not judged or not judgement.worse(cost, incumbent)
         if not accepted:
             policy.load_state_dict(before)

@@ -84,8 +84,7 @@ class TrackRecord:
         return list(self._flown)[-COMPARED:]
 
     def _predicted(self, flown: Flown, virtual: VirtualEpisodes) -> float:
-        start = Scenario(flown.trajectory.states[:1], flown.trajectory.exogenous[None])
-        return virtual.cost(self._policy(flown), start).item()
+        return virtual.cost(self._policy(flown), virtual.repeated(flown.trajectory)).item()
 
     def policy_flown(self) -> nn.Module:
         """The policy that has flown the latest episode, with the weights that it had in it."""
