@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,9 +13,7 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, 
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
 from rt_torchrl.twinning.flight import Flight
-
-if TYPE_CHECKING:
-    from rt_torchrl.twinning.planners.constraints import Constraints
+from rt_torchrl.twinning.planners.constraints import Constraints
 
 
 class VirtualEpisodes:
@@ -28,11 +26,12 @@ class VirtualEpisodes:
         generator: source of every draw.
     """
 
+    constraints: Constraints | None = None
+    """Bounds on states, whose price counts where policies are compared; None for none."""
+
     def __init__(self, twin: DigitalTwin, config: ExogenousConfig, experience: int, *, generator: torch.Generator):
         self.twin, self.config, self.generator = twin, config, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
-        self.constraints: Constraints | None = None
-        """Bounds on states, whose price counts where policies are compared; None for none."""
 
     def wanting(self, arm: str) -> bool:
         """Whether an arm with a twin still needs the inputs of one whole real episode."""
