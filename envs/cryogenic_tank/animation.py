@@ -87,16 +87,8 @@ class _Scene:
     @property
     def moving(self) -> list[Artist]:
         """What :meth:`show` moves."""
-        parts = [*self.traces, self.caption]
-        return [
-            self.liquid,
-            self.shell,
-            self.valve,
-            self.puffs,
-            self.arrow,
-            self.note,
-            *(artist for part in parts for artist in part.moving),
-        ]
+        own: list[Artist] = [self.liquid, self.shell, self.valve, self.puffs, self.arrow, self.note]
+        return [*own, *self.caption.moving, *(artist for trace in self.traces for artist in trace.moving)]
 
     def show(self, k: int) -> None:
         """Move everything to sample ``k``."""

@@ -40,9 +40,9 @@ def require_end_cost(plant: "Plant") -> None:
     Raises:
         ValueError: if there is no finite ``end_cost``.
     """
-    inner = plant
-    while isinstance(getattr(inner, "base", None), Ending):
-        inner = inner.base  # an extension ends where its plant does
+    inner: Ending = plant
+    while isinstance(base := getattr(inner, "base", None), Ending):
+        inner = base  # an extension ends where its plant does
     if type(inner).ended is not Ending.ended and plant.end_cost is None:
         raise ValueError(
             f"plant {plant.name!r} defines ended() and no end_cost; set it to the cost of each moment after an early "

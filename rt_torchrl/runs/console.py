@@ -3,7 +3,9 @@
 import ast
 import difflib
 import runpy
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -70,12 +72,25 @@ def recipe(name: str) -> Path:
     return found
 
 
+def call_of(name: str) -> str:
+    """How a recipe is called here: by the command or, in a checkout, by its file."""
+    return f"{PROGRAM} {name}" if (PACKAGE / "recipes").is_dir() else f"recipes/{name}.py"
+
+
 def listing() -> str:
     """The recipes with what each one is for."""
     known = recipes()
     names = [name for name in FIRST if name in known] + [name for name in known if name not in FIRST]
-    width = max(map(len, names), default=0)
-    rows = [f"  {name:{width}}  {purpose(known[name])}" for name in names]
+    width, columns = max(map(len, names), default=0), shutil.get_terminal_size().columns
+    rows = [
+        textwrap.fill(
+            purpose(known[name]),
+            max(columns, 2 * width),
+            initial_indent=f"  {name:{width}}  ",
+            subsequent_indent=" " * (width + 4),
+        )
+        for name in names
+    ]
     return "\n".join(
         [
             f"usage: {PROGRAM} RECIPE [OPTIONS]",

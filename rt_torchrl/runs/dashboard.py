@@ -11,6 +11,8 @@ from torch.utils.tensorboard.summary import hparams
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
 
+    from rt_torchrl.runs.mlflow_logger import MLflowLogger
+
 TAGS = {
     "real_cost": "cost/real episode (live policy)",
     "J_a_model_based": "cost/J_a model-based (twin)",
@@ -58,7 +60,7 @@ class Dashboard:
         loggers: further loggers.
     """
 
-    def __init__(self, folder: Path, loggers: "Sequence[Logger]" = ()):
+    def __init__(self, folder: Path, loggers: "Sequence[Logger | MLflowLogger]" = ()):
         self._writer, self._loggers = SummaryWriter(str(folder)), loggers
         self._writer.add_custom_scalars({"cost": {"all costs": ["Multiline", COSTS]}})
 

@@ -1,0 +1,43 @@
+"""Weights & Biases and MLflow beside TensorBoard, without a network: what they are told is read back."""
+
+import pytest
+from linear_quadratic import LinearQuadratic
+from small_runs import SMALL
+
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
+
+REAL = "cost/real episode (live policy)"
+
+
+def trained(folder, logger):
+    config = RunConfig(
+        episodes=2, log_dir=folder, unseen=3, untrained=0, figures=False, loggers=(logger,), twinning=SMALL
+    )
+    metrics = Run(config, LinearQuadratic(horizon=2.0)).train()
+    return [episode["real_cost"] for episode in metrics["episodes"]]
+
+
+def test_weights_and_biases_has_the_curves_and_the_options(tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb", reason="needs wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    costs = trained(tmp_path / "run", "wandb")
+    (file,) = (tmp_path / "run").rglob("*.wandb")
+    written = file.read_bytes()
+    for said in (REAL, "twinning.virtual_episodes", *map(repr, costs)):
+        assert said.encode() in written, said
+    assert wandb.run is None  # so that the next run of this process begins another one
+
+
+def test_mlflow_has_the_curves_and_the_options(tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow", reason="needs mlflow")
+    monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    costs = trained(tmp_path / "run", "mlflow")
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'run' / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("linear_quadratic")
+    (run,) = client.search_runs([experiment.experiment_id])
+    name = "cost/real episode live policy"  # MLflow takes no brackets
+    assert [point.value for point in client.get_metric_history(run.info.run_id, name)] == pytest.approx(costs)
+    assert run.data.params["twinning.virtual_episodes"] == "2" and run.info.status == "FINISHED"
+    assert mlflow.active_run() is None
