@@ -12,11 +12,14 @@ from linear_quadratic import LinearClosure, LinearGain
 from small_runs import SMALL
 from test_real_system import MILLIMETRES, Rig, connected
 
-from rt_torchrl import DigitalTwin, PlannerConfig, PlantEnv, ReinforcementTwinning
+from rt_torchrl import DigitalTwin, PlannerConfig, PlantEnv, ReinforcementTwinning, check_plant
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.figures import figures_of
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimal_control.command_cost import CommandCost
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.runs.results import episode_record
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
@@ -165,7 +168,7 @@ def test_a_right_twin_foretells_the_cost_of_an_episode_that_ended():
     assert difference == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("system", ["simulation", "real"])
+@pytest.mark.parametrize("system", [pytest.param("simulation", marks=pytest.mark.slow), "real"])
 def test_a_training_learns_from_episodes_of_unequal_length(system):
     plant = Falling(noise=0.01)
     config = dataclasses.replace(
@@ -176,7 +179,15 @@ def test_a_training_learns_from_episodes_of_unequal_length(system):
     )
     env = PlantEnv(plant, seed=1) if system == "simulation" else connected(plant, rig=Rig(plant, seed=1))
     found = algorithm(env, plant, config)
-    reports = [found.episode() for _ in range(5)]
+    reports = [found.episode()]
+    if system == "simulation":
+        snapshot = Snapshot.take(
+            found, plant.make_closure(torch.Generator().manual_seed(0)), [episode_record(reports[0], episode=0)]
+        )
+        n = len(found.short_term[-1].actions)
+        assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
+        assert {"states", "actions", "exogenous"} <= figures_of(snapshot).keys()
+    reports += [found.episode() for _ in range(4)]
     lengths = [len(flown.trajectory.actions) for flown in found.track_record._flown]
     first = reports[0]
     assert lengths[0] == first["ended_after"] < plant.n_steps and len(set(lengths)) > 1
@@ -219,6 +230,15 @@ def test_a_plant_that_ends_at_no_cost_is_refused():
 
     with pytest.raises(ValueError, match=r"'falling' defines ended\(\) and no end_cost"):
         DigitalTwin(Free(), LinearClosure(Free.true_closure))
+    with pytest.raises(ValueError, match=r"end_cost: plant 'falling' defines ended\(\) and no end_cost"):
+        check_plant(Free(), steps=5, traced=False)
+
+    class Vague(Falling):
+        def ended(self, state):
+            return state[..., :1].abs() > self.reach
+
+    with pytest.raises(ValueError, match=r"ended: returns torch.bool of shape \(5, 4, 1\)"):
+        check_plant(Vague(), steps=5, traced=False)
 
     class Begun(Falling):
         reach = 0.0

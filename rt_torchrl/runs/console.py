@@ -98,7 +98,8 @@ def listing() -> str:
             *rows,
             f"  {'FILE.py':{width}}  A recipe of your own.",
             "",
-            f"{PROGRAM} RECIPE --help lists the options of a recipe. A first run: {PROGRAM} wind_turbine --quick",
+            f"{PROGRAM} RECIPE --help lists the options of a recipe.",
+            f"A first run: {PROGRAM} wind_turbine --quick",
         ]
     )
 
