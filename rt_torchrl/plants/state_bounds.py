@@ -9,6 +9,9 @@ from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant
 
+OUTSIDE = " outside [%]"
+"""End of the name of how often a state is outside."""
+
 
 class StateBounds:
     """Least and greatest values of some states that sensors read.
@@ -53,7 +56,7 @@ class StateBounds:
         found: dict[str, Tensor] = {}
         outside = self.shares(states[:, 1:]).unbind(-1)
         for name, unit, width, share in zip(self.names, self._units, self._widths, outside, strict=True):
-            found[f"{name} outside [%]"] = 100.0 * (share > 0.0).double().mean(-1)
+            found[f"{name}{OUTSIDE}"] = 100.0 * (share > 0.0).double().mean(-1)
             found[f"{name} beyond [{unit}]"] = width * share.amax(-1)
         return found
 
