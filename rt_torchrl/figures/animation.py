@@ -3,7 +3,7 @@
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -22,6 +22,7 @@ DOTS = 80
 """Dots per inch."""
 
 
+@runtime_checkable
 class Scene(Protocol):
     """A picture of a plant at any sample of a record."""
 

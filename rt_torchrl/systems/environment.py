@@ -180,8 +180,10 @@ class PlantEnv(EnvBase):
         # A compiled step may reuse its output buffer.
         self._state = transition.state.clone()
         self._step_count = self._step_count + 1
-        terminated = self.plant.ended(self._state).unsqueeze(-1)
-        truncated = (self._step_count >= self.plant.n_steps).unsqueeze(-1) & ~terminated
+        over = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        ends = self.plant.end_cost is not None
+        terminated = self.plant.ended(self._state).unsqueeze(-1) if ends else torch.zeros_like(over)
+        truncated = over & ~terminated
         ended = truncated.squeeze(-1) * self.plant.terminal_cost(self._state) / self.plant.dt
         return self._observed(
             {

@@ -198,8 +198,7 @@ class RealSystem(EnvBase):
         stepped = self.env.step(self._reported.set(self._actuation.key, action))
         self._step_count += 1
         self._require_reported(stepped["next"])
-        state = self._state.read(stepped["next"], self.plant.states, "state").to(self.device)
-        over = bool(self.plant.ended(state).any())
+        over = self.plant.end_cost is not None and self._ended(stepped["next"])
         last = self._step_count >= self.plant.n_steps and not over
         if stepped["next", "done"].any() and not (last or over):
             raise ended_early(stepped["next"], self._step_count, self.plant)
@@ -216,6 +215,11 @@ class RealSystem(EnvBase):
         if last:
             cost = cost + self.plant.terminal_cost(after["state"]) / self.plant.dt
         return after.set("reward", -cost.unsqueeze(-1))
+
+    def _ended(self, found: TensorDictBase) -> bool:
+        """Whether the episode of the plant has ended in the state that the environment reports."""
+        state = self._state.read(found, self.plant.states, "state").to(self.device)
+        return bool(self.plant.ended(state).any())
 
     def _require_reported(self, found: TensorDictBase) -> None:
         """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""
