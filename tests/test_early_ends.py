@@ -19,7 +19,9 @@ from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.optimal_control.command_cost import CommandCost
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.runs.operated import operation_of
 from rt_torchrl.runs.results import episode_record
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
@@ -245,6 +247,12 @@ def test_a_plant_that_ends_at_no_cost_is_refused():
 
     with pytest.raises(ValueError, match="draws initial states in which the episode has ended"):
         PlantEnv(Begun()).reset()
+
+
+def test_windows_of_operation_are_refused(tmp_path):
+    config = RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
+    with pytest.raises(ValueError, match="'falling' may end early, which windows of operation do not"):
+        operation_of(config, PlantEnv(Falling()), None, Falling(), {}, folder=tmp_path)
 
 
 def test_inputs_are_continued_without_a_jump():
