@@ -9,6 +9,7 @@ import pytest
 import torch
 from falling_plant import Falling
 from linear_quadratic import LinearClosure, LinearGain
+from printed_commands import blocks
 from small_runs import SMALL
 from test_real_system import MILLIMETRES, Rig, connected
 
@@ -25,7 +26,7 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import continued, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, continued, control_cost
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
 
@@ -253,6 +254,16 @@ def test_windows_of_operation_are_refused(tmp_path):
     config = RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
     with pytest.raises(ValueError, match="'falling' may end early, which windows of operation do not"):
         operation_of(config, PlantEnv(Falling()), None, Falling(), {}, folder=tmp_path)
+
+
+def test_the_plant_of_the_documentation_breaks_its_rod():
+    scope = {}
+    exec(compile("\n".join(blocks("real_system.md", "python")), "docs/real_system.md", "exec"), scope)
+    plant = scope["Fragile"]()
+    assert plant.ended(torch.tensor([[3.0, -7.6], [7.6, 7.4]]).double()).tolist() == [True, False]
+    start, inputs = plant.draw_initial_state(3, torch.Generator().manual_seed(0)), torch.zeros(3, 5, 0).double()
+    flown = Trajectory(torch.full((3, 6, 2), 8.0).double(), torch.zeros(3, 5, 1).double(), inputs)
+    assert control_cost(plant, flown).tolist() == [20.0] * 3 and not plant.ended(start).any()
 
 
 def test_inputs_are_continued_without_a_jump():
