@@ -4,6 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if __name__ == "__main__":
@@ -212,6 +213,12 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
     return figures.figures_of(snapshot)
 
 
+def animate(snapshot: "Snapshot", path: Path) -> None:
+    from rt_torchrl.envs.cryogenic_tank.animation import save_animation
+
+    save_animation(snapshot, path)
+
+
 def main(config: Config) -> None:
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
@@ -222,6 +229,7 @@ def main(config: Config) -> None:
         plant_figures=plant_figures,
         baselines=VALVES,
         first=PIValve,
+        animate=animate,
     ).train()
 
 

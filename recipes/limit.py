@@ -32,8 +32,8 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.runs.command_line import load_recipe
+from rt_torchrl.runs.configured_plant import plant_of
 from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.runs.run_config import plant_of
 
 CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "wind_turbine": {"Jonkman": JonkmanController},

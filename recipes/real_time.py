@@ -13,8 +13,8 @@ import torch
 import tyro
 
 from rt_torchrl import check_options, load_run, main_of
+from rt_torchrl.runs.configured_plant import physics_of, plant_of
 from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.runs.run_config import physics_of, plant_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -214,6 +214,12 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
     return figures.figures_of(snapshot)
 
 
+def animate(snapshot: "Snapshot", path: Path) -> None:
+    from rt_torchrl.envs.wind_turbine.animation import save_animation
+
+    save_animation(snapshot, path)
+
+
 def main(config: Config) -> None:
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
     from rt_torchrl.envs.wind_turbine.rosco import RoscoController, rosco_turbine
@@ -223,7 +229,8 @@ def main(config: Config) -> None:
         env = partial(rosco_turbine, plant, seed=config.seed, device=require_device(config.device))
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
     believed = config.believed()
-    Run(config, plant, believed=believed, plant_figures=plant_figures, first=JonkmanController, **system).train()
+    drawing = {"plant_figures": plant_figures, "animate": animate}
+    Run(config, plant, believed=believed, first=JonkmanController, **drawing, **system).train()
 
 
 if __name__ == "__main__":

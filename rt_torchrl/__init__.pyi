@@ -73,6 +73,7 @@ from .twinning.learners import (
     TD3Config,
 )
 from .twinning.planners import (
+    ConstraintsConfig,
     Planner,
     PlannerConfig,
     RecedingHorizonPlanner,
@@ -114,6 +115,7 @@ __all__ = [
     "ClassicalController",
     "Component",
     "ConnectedPlant",
+    "ConstraintsConfig",
     "ContractReport",
     "Decaying",
     "DecisionTree",

@@ -246,21 +246,22 @@ def test_power_and_speed_against_their_references(turbine):
     assert units == ["m/s]", "rad/s]", "MW]", "kN m]", "deg]"]
 
 
-def test_power_coefficient_of_each_closure(turbine):
+def test_power_coefficient_of_true_table_and_twin_side_by_side(turbine):
     figure = turbine_figures.power_coefficient(turbine)
-    left, right = figure.axes
-    curves = {curve.get_gid(): curve for curve in left.lines if curve.get_gid()}
-    closures = {"true": turbine.plant.closure, "twin": turbine.closure, "initial twin": turbine.initial_closure}
-    for name, closure in closures.items():
-        curve = curves[f"{name}, 10 deg"]
-        expected = closure(torch.tensor([curve.get_xdata()[77], 10.0], dtype=torch.float64)).item()
+    table, law, error = figure.axes[:3]
+    values = [ax.collections[0].get_array().reshape(81, 89) for ax in (table, law, error)]
+    corners = table.collections[0].get_coordinates()
+    ratio, pitch = corners[40, 50]
+    for closure, found in zip((turbine.plant.closure, turbine.closure), values, strict=False):
+        expected = closure(torch.tensor([ratio, pitch], dtype=torch.float64)).item()
         # A batch may round differently from a single point.
-        assert curve.get_ydata()[77] == pytest.approx(expected, rel=1e-12)
+        assert found[40, 50] == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(values[2], values[1] - values[0], rtol=0, atol=1e-12)
     lam = 63.0 * turbine.record.states[:-1, 0] / turbine.record.exogenous[:, 0]
     visited = torch.stack([lam, turbine.record.actions[:, 1]], -1)
     true, twin = (closure(visited).squeeze(-1).detach() for closure in (turbine.plant.closure, turbine.closure))
-    np.testing.assert_allclose(line(right, "true").get_ydata(), true, rtol=1e-12)
-    np.testing.assert_allclose(line(right, "twin").get_ydata(), twin, rtol=1e-12)
+    for ax in (table, law, error):
+        np.testing.assert_allclose(np.stack(line(ax, "visited").get_data(), -1), visited, rtol=1e-12)
     assert f"visited: {(twin - true).square().mean().sqrt():.2g}" in figure._suptitle.get_text()
 
 

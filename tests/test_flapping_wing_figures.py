@@ -11,9 +11,10 @@ from PIL import Image
 from torch import nn
 
 from rt_torchrl.envs.flapping_wing import figures
-from rt_torchrl.envs.flapping_wing.animation import FRAMES, RATE, save_animation
+from rt_torchrl.envs.flapping_wing.animation import save_animation
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.figures.animation import FRAMES, RATE
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.trajectories.trajectory import Trajectory
 

@@ -28,6 +28,7 @@ ROOMS_OF = {
     "coverage.py": {"evaluation", "identification"},
     "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},
+    "gallery.py": {"runs"},
     "identify.py": {"identification", "figures", "runs"},
     "in_service.py": {"runs", "systems"},
     "jitter.py": {"runs", "systems"},

@@ -13,7 +13,7 @@ from test_export_recipe import recipe
 
 from rt_torchrl import load_run
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.report_page import numbers, story, write_report
+from rt_torchrl.runs.report_page import bounds, numbers, story, write_report
 
 SMALL = Path(__file__).with_name("small_recipe.py")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -64,6 +64,24 @@ def test_the_story_has_a_sentence_for_each_event():
         "1 of 2 plans were better than the policy before and were kept.",
         "The last episode costs not finite, with the model-based policy.",
     ]
+
+
+def test_bounded_states_have_a_table():
+    def merit(outside):
+        beyond = {"mean": outside / 10.0}
+        return {"speed outside [%]": {"mean": outside}, "speed beyond [m/s]": beyond, "mean power [MW]": {"mean": 4.0}}
+
+    unseen = {
+        "merit": {"model_based": merit(0.0), "model_free": merit(5.0)},
+        "baselines": {"PI": {"merit": merit(2.0)}},
+    }
+    assert bounds({"summary": {"unseen": unseen}}) == [
+        ["mean over the episodes", "model-based", "model-free", "PI"],
+        ["speed outside [%]", "0", "5", "2"],
+        ["speed beyond [m/s]", "0", "0.5", "0.2"],
+    ]
+    free = {"merit": {"model_based": {}, "model_free": {}}, "baselines": {}}
+    assert bounds({"summary": {"unseen": free}}) == []
 
 
 def test_a_run_without_results_has_no_report(page, tmp_path):

@@ -7,7 +7,7 @@ from served_plants import free_port
 from test_export_recipe import leave_run, recipe
 
 from rt_torchrl.export.program import export_program
-from rt_torchrl.runs.run_config import physics_of
+from rt_torchrl.runs.configured_plant import physics_of
 
 PACE = 5.0  # a period of 0.1 s, for a machine that does other things too
 

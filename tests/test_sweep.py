@@ -100,3 +100,17 @@ def test_a_search_finds_the_least_cost_and_goes_on(tmp_path, monkeypatch):
     assert table[1].split()[1:] == ["0.5", "--x", "3"]
     failed = sum(one.value is None for one in study.trials)
     assert failed == 0 or f"{failed} trials failed" in table[-1]
+
+
+@pytest.mark.nightly
+def test_a_search_with_real_trainings(tmp_path, capsys):
+    """Four gradients a plan are better than none, and the search finds it, by the command as printed."""
+    pytest.importorskip("optuna", reason="a search needs the extra sweep")
+    over = ("twinning.planner.iterations=0|4",)
+    given = "--twinning.arm model_based"
+    options = {"given": given, "trials": 6, "over": over, "log_dir": tmp_path, "jobs": 1, "seeds": (0,)}
+    recipe("sweep").main(recipe("sweep").Config(plant=str(SMALL), **options))
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[-6].split()[2:] == ["--twinning.planner.iterations", "4"]
+    best = json.loads((tmp_path / SMALL.stem / f"trial-{rows[-6].split()[0]}" / "seed-0" / "metrics.json").read_text())
+    assert float(rows[-6].split()[1]) == pytest.approx(best["summary"]["unseen"]["J_a_model_based"]["mean"], rel=1e-4)

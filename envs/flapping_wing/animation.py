@@ -5,17 +5,12 @@ from typing import cast
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.animation import PillowWriter
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.artist import Artist
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.figures.animation import MovingCaption, save_scene
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array, caption, last_episode, legend_below, panels
-
-FRAMES = 125
-"""Greatest number of frames, for the paper's five seconds in real time."""
-RATE = 25
-"""Frames per second."""
+from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array, last_episode, legend_below, panels
 
 
 def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
@@ -35,18 +30,7 @@ def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     Raises:
         ValueError: if the file has another suffix.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".gif":
-        raise ValueError(f"path={str(path)!r} of the animation must end in '.gif', the format it is written in.")
-    scene = _Scene(snapshot)
-    last = len(snapshot.record.actions)
-    frames = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
-    writer = PillowWriter(fps=RATE)
-    with writer.saving(scene.figure, str(path), dpi=80):
-        for k in frames:
-            scene.show(k)
-            writer.grab_frame()
-    return path
+    return save_scene(_Scene(snapshot), len(snapshot.record.states), path)
 
 
 class _Scene:
@@ -61,13 +45,8 @@ class _Scene:
         self.actions, self.wind = array(snapshot.record.actions)[held], array(snapshot.record.exogenous)[held, 0]
         title = f"Flight, episode {last_episode(snapshot)}"
         self.figure, ((self.ax,),) = panels(1, title=title, size=(6.2, 6.4))
-        FigureCanvasAgg(self.figure)
         self._draw_still()
         self._prepare_moving()
-        # The layout of the first frame is kept, because nothing may jump and a layout takes longer than the drawing.
-        self.show(0)
-        self.figure.draw_without_rendering()
-        self.figure.set_layout_engine("none")
 
     def _draw_still(self) -> None:
         ax, target = self.ax, array(self.plant.target)
@@ -80,6 +59,7 @@ class _Scene:
 
     def _prepare_moving(self) -> None:
         ax = self.ax
+        self.caption = MovingCaption(ax)
         bar = {"solid_capstyle": "round"}
         (self.trail,) = ax.plot([], [], color="0.6", linewidth=1.4)
         (self.plane,) = ax.plot([], [], color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$", **bar)
@@ -90,6 +70,12 @@ class _Scene:
         arrow = {"color": SAMPLES, "scale": 12.0, "scale_units": "width", "width": 0.009}
         self.arrow = ax.quiver([0.2], [0.93], [0.0], [0.0], transform=ax.transAxes, **arrow)
         self.wind_text = ax.text(0.2, 0.96, "", transform=ax.transAxes, ha="center", fontsize=9)
+
+    @property
+    def moving(self) -> list[Artist]:
+        """What :meth:`show` moves."""
+        drone: list[Artist] = [self.trail, self.plane, self.normal, self.wing, self.body]
+        return [*drone, self.arrow, self.wind_text, *self.caption.moving]
 
     def show(self, k: int) -> None:
         """Move everything to sample ``k``."""
@@ -106,7 +92,7 @@ class _Scene:
         self.arrow.set_UVC([-self.wind[k]], [0.0])
         self.wind_text.set_text(f"headwind {round(self.wind[k], 1) + 0.0:.1f} m/s")
         note = rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
-        caption(self.ax, f"time {t:.2f} s", note)
+        self.caption.show(f"time {t:.2f} s", note)
 
 
 def _stroke_axes(beta_w: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

@@ -4,15 +4,14 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
-    CLOSURE_LINES,
     FILTERED,
     LIMITS,
     REAL,
@@ -29,11 +28,12 @@ from rt_torchrl.figures.style import (
     time_axis,
 )
 
-PITCHES = (0.0, 5.0, 10.0, 15.0)
-"""Pitch angles at which C_p is drawn [deg]."""
-PITCH_COLOURS = colormaps["viridis"]([0.0, 0.35, 0.65, 0.9])
-LEAST_SHOWN = -0.25
-"""C_p below which operating points are only counted: an overspeeding rotor brakes at a C_p down to about -1."""
+LEAST_RATIO = 2.0
+"""Least tip-speed ratio at which C_p is drawn."""
+CONTOURS = (0.1, 0.2, 0.3, 0.4, 0.45)
+GREATEST_SHOWN = 0.1
+"""Difference of C_p at which its colours end."""
+VISITED = "#D55E00"
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -85,25 +85,35 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
 
 
 def power_coefficient(snapshot: Snapshot) -> Figure:
-    """C_p over λ at four pitch angles, and in the last episode over the wind speed (paper, fig. 14b).
+    """C_p over λ and β: the true table, the learned law beside it, and their difference (paper, fig. 14b).
 
-    The left panel shows the true table, the learned law and the law that the training started from. Each tick at the
-    top is a λ of the episode, in the colour of the pitch angle within 2.5 deg of its own, because a twin can only know
-    what was visited. Curves are pale outside the range of those λ.
+    Dots are operating points of the last episode, because a twin can only know what was visited. The colours of the
+    difference end at ``GREATEST_SHOWN``, which they reach far from the dots.
     """
-    visited = _Visited.of(snapshot)
+    visited, grid = _Visited.of(snapshot), _Grid.of(snapshot)
     true, learned, initial = visited.C_p.values()
     rms, rms_initial = (np.sqrt(np.mean((C_p - true) ** 2)) for C_p in (learned, initial))
-    figure, ((left, right),) = panels(
-        1,
-        2,
-        title=f"Power coefficient, RMS error where visited: {rms:.2g}, initial twin {rms_initial:.2g}",
-        size=(11.0, 4.8),
-        width_ratios=(1.25, 1.0),
-    )
-    _draw_curves(left, snapshot, visited)
-    _draw_over_wind(right, visited)
-    legend_below(figure, [left])
+    title = f"Power coefficient, RMS error where visited: {rms:.2g}, initial twin {rms_initial:.2g}"
+    figure, axes = panels(1, 3, title=title, size=(12.0, 4.8), sharex=True, sharey=True)
+    table, law, error = axes.flat
+    for ax, name in ((table, "true"), (law, "twin")):
+        drawn = grid.draw(ax, grid.C_p[name], cmap="viridis", vmin=0.0, vmax=0.5)
+        lines = ax.contour(grid.lam, grid.beta, grid.C_p[name], CONTOURS, colors="white", linewidths=0.8)
+        ax.clabel(lines, fontsize=8)
+    caption(table, "true $C_p$ [-]" if snapshot.known else "$C_p$ of the plant's own table [-]")
+    caption(law, "$C_p$ of the twin [-]")
+    figure.colorbar(drawn, ax=[table, law], extend="both", pad=0.01)
+    ends = {"cmap": "RdBu", "vmin": -GREATEST_SHOWN, "vmax": GREATEST_SHOWN}
+    drawn = grid.draw(error, grid.C_p["twin"] - grid.C_p["true"], **ends)
+    figure.colorbar(drawn, ax=error, extend="both", pad=0.02)
+    caption(error, "twin less true [-]")
+    for ax in axes.flat:
+        ax.plot(visited.lam, visited.beta, ".", color=VISITED, markersize=2.5, alpha=0.6, label="visited")
+        ax.set_xlabel(r"tip-speed ratio $\lambda$ [-]")
+    table.set_ylabel(r"blade pitch $\beta$ [deg]")
+    table.set_xlim(grid.lam[0], grid.lam[-1])
+    table.set_ylim(grid.beta[0], grid.beta[-1])
+    legend_below(figure, [table])
     return figure
 
 
@@ -140,40 +150,28 @@ class _Visited(NamedTuple):
         return cls(array(lam), array(beta), array(wind), C_p)
 
 
+class _Grid(NamedTuple):
+    """C_p under each closure over λ and β, ``n_beta n_lambda``, in a range that holds all visited points."""
+
+    lam: np.ndarray
+    beta: np.ndarray
+    C_p: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> "_Grid":
+        visited = _Visited.of(snapshot)
+        like: dict[str, Any] = {"dtype": torch.float64, "device": snapshot.record.states.device}
+        lam = torch.linspace(LEAST_RATIO, max(13.0, visited.lam.max()), 89, **like)
+        beta = torch.linspace(0.0, max(20.0, visited.beta.max()), 81, **like)
+        pitch, ratio = torch.meshgrid(beta, lam, indexing="ij")
+        C_p = {name: _evaluate(closure, ratio, pitch) for name, closure in closures(snapshot).items()}
+        return cls(array(lam), array(beta), C_p)
+
+    def draw(self, ax: Axes, values: np.ndarray, **colours: Any) -> QuadMesh:
+        """Values over the grid as colours, which end where ``colours`` says."""
+        return ax.pcolormesh(self.lam, self.beta, values, shading="gouraud", **colours)
+
+
 @torch.no_grad()
 def _evaluate(closure: nn.Module, lam: Tensor, beta: Tensor) -> np.ndarray:
     return array(closure(torch.stack([lam, beta], -1)).squeeze(-1))
-
-
-def _draw_curves(ax: Axes, snapshot: Snapshot, visited: _Visited) -> None:
-    like: dict[str, Any] = {"dtype": torch.float64, "device": snapshot.record.states.device}
-    lam = torch.linspace(2.0, max(13.0, visited.lam.max()), 200, **like)
-    for k, (pitch, colour) in enumerate(zip(PITCHES, PITCH_COLOURS, strict=True)):
-        near = visited.lam[np.abs(visited.beta - pitch) <= 2.5]
-        inside = (array(lam) >= near.min(initial=np.inf)) & (array(lam) <= near.max(initial=-np.inf))
-        for (name, style), closure in zip(CLOSURE_LINES.items(), closures(snapshot).values(), strict=True):
-            values = _evaluate(closure, lam, torch.full_like(lam, pitch))
-            look = {"color": colour, "linestyle": style, "linewidth": 1.6}
-            ax.plot(array(lam), values, alpha=0.25, gid=f"{name}, {pitch:g} deg", **look)
-            ax.plot(array(lam), np.where(inside, values, np.nan), **look)
-        ax.plot(near, np.full_like(near, 0.585 - 0.02 * k), "|", color=colour, markersize=6, alpha=0.6)
-        ax.plot([], [], color=colour, label=rf"$\beta$ = {pitch:g} deg")
-    for name, style in CLOSURE_LINES.items():
-        ax.plot([], [], color=REAL, linestyle=style, label=name)
-    ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=0)
-    ax.set_ylim(-0.1, 0.6)
-    ax.set_xlim(lam[0].item(), lam[-1].item())
-    caption(ax, "$C_p$ [-] at four pitch angles", r"ticks: visited $\lambda$, $\beta$ within 2.5 deg")
-    ax.set_xlabel(r"tip-speed ratio $\lambda$ [-]")
-
-
-def _draw_over_wind(ax: Axes, visited: _Visited) -> None:
-    ax.plot(visited.wind, visited.C_p["true"], "o", color=REAL, markersize=4, alpha=0.5, label="true")
-    ax.plot(visited.wind, visited.C_p["twin"], ".", color=TWIN, markersize=3, alpha=0.8, label="twin")
-    hidden = (visited.C_p["true"] < LEAST_SHOWN).mean()
-    least = min(visited.C_p["true"].min(), visited.C_p["twin"].min()) - 0.03
-    ax.set_ylim(bottom=max(least, LEAST_SHOWN))
-    caption(ax, "$C_p$ [-] in the last episode")
-    legend_above(ax)
-    note = f" ({hidden:.0%} of the true points lie below)" if hidden else ""
-    ax.set_xlabel(f"wind speed $u$ [m/s]{note}")

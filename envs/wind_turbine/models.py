@@ -10,11 +10,11 @@ from torch import Tensor, nn
 DATA = Path(__file__).parent / "data"
 MEANINGS = {
     "c1": "factor of the exponential term of C_p",
-    "c2": "factor of 1/ξ in this term",
-    "c3": "factor of β in this term",
-    "c4": "factor of ξβ in this term",
-    "c5": "factor of β^x in this term",
-    "c6": "constant in this term",
+    "c2": "factor of 1/ξ in the exponential term",
+    "c3": "factor of β in the exponential term",
+    "c4": "factor of ξβ in the exponential term",
+    "c5": "factor of β^x in the exponential term",
+    "c6": "constant in the exponential term",
     "c7": "factor of 1/ξ in the exponent",
     "c8": "factor of λ in C_p",
     "c9": "factor of β in 1/ξ",

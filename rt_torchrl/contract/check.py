@@ -10,6 +10,7 @@ from torch import nn
 from rt_torchrl.contract.calls import Calls
 from rt_torchrl.contract.costs import costs
 from rt_torchrl.contract.draws import draws, modules
+from rt_torchrl.contract.ends import ends
 from rt_torchrl.contract.gradients import gradients
 from rt_torchrl.contract.methods import methods
 from rt_torchrl.contract.periods import periods
@@ -23,6 +24,7 @@ ALWAYS = ("signals", "draws", "closures and policy")
 ON_FLIGHTS: dict[str, Check] = {
     "shapes and purity": methods,
     "costs": costs,
+    "early ends": ends,
     "periods": periods,
     "stability of the step": stability,
     "gradients": gradients,
@@ -75,10 +77,10 @@ def check_plant(
 
     The function flies ``episodes`` short flights under random commands, and checks the plant at the states that they
     visit: signals and their ranges; shapes, precision and finiteness of every method under any leading dimensions;
-    purity; draws and their generator; closures and policy; the applied action of the step against the actuators; costs;
-    a turn of a periodic state, which must change nothing; gradients against finite differences; forward mode and one
-    graph, which the engines and the compiler need; and the stability of the step. A check is left out if an earlier
-    violation makes it impossible.
+    purity; draws and their generator; closures and policy; the applied action of the step against the actuators; costs,
+    also of an early end; a turn of a periodic state, which must change nothing; gradients against finite differences;
+    forward mode and one graph, which the engines and the compiler need; and the stability of the step. A check is left
+    out if an earlier violation makes it impossible.
 
     Args:
         plant: the plant, with the time step of its training; one on another device is checked by a copy on the CPU.

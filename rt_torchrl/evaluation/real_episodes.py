@@ -2,7 +2,7 @@
 
 import torch
 from jaxtyping import Bool, Float
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
@@ -11,7 +11,7 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, continued, control_cost
 
 
 class RealEpisodes(UnseenEpisodes):
@@ -62,13 +62,20 @@ class RealEpisodes(UnseenEpisodes):
         kept = self._system.state_dict()
         self._system.set_seed(UNSEEN_SEED)
         try:
-            found = TensorDict.cat(
-                [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(count)]
-            )
+            flown = [self._system.rollout(self.plant.n_steps, self._actor(policy)) for _ in range(count)]
         finally:
             self._system.load_state_dict(kept)
-        states = torch.cat([found["state"], found["next", "state"][:, -1:]], 1)
-        return Trajectory(states, found["next", "applied"], found["exogenous"])
+        return batch_of([self._to_the_horizon(episode[0]) for episode in flown])
+
+    def _to_the_horizon(self, episode: TensorDictBase) -> Trajectory:
+        """The trajectory of an episode; one that ended early stays in the state in which it ended."""
+        rest = self.plant.n_steps - len(episode)
+        end, action = episode["next", "state"][-1:], episode["next", "applied"][-1:]
+        return Trajectory(
+            torch.cat([episode["state"], end.expand(rest + 1, -1)]),
+            torch.cat([episode["next", "applied"], action.expand(rest, -1)]),
+            continued(episode["exogenous"], self.plant.n_steps),
+        )
 
     def _actor(self, policy: nn.Module) -> TensorDictModule:
         """The policy at the beginning of an episode."""

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 
+if TYPE_CHECKING:
+    from rt_torchrl.plants.state_bounds import StateBounds
+
 UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
 VALIDATION_SEED = 2_000_000
@@ -28,7 +31,7 @@ class UnseenEpisodes:
 
     The true closure is the plant's own; assign :attr:`closure` for a system that has worn. Controllers that are flown
     beside policies are made for :attr:`physics`, the plant itself; assign the plant that is known of a system with
-    states that no sensor reads.
+    states that no sensor reads. :attr:`bounds` on states are counted among the plant's own quantities.
 
     Args:
         plant: the real system in simulation.
@@ -53,6 +56,7 @@ class UnseenEpisodes:
         self.plant, self._compiled = plant, compiled
         self.closure: nn.Module | None = plant.closure
         self.physics = plant
+        self.bounds: StateBounds | None = None
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
 
@@ -127,7 +131,8 @@ class UnseenEpisodes:
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities in flown episodes."""
         costs = control_cost(self.plant, flown)
-        return Judged(costs, self.plant.merit(flown.states, flown.actions, flown.exogenous))
+        found = self.plant.merit(flown.states, flown.actions, flown.exogenous)
+        return Judged(costs, found | (self.bounds.merit(flown.states) if self.bounds else {}))
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:
         """The kinds of episodes for which this plant's results are also shown separately."""

@@ -1,5 +1,6 @@
 """Figures over the episodes: costs, roles, computing time and closure weights."""
 
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -103,18 +104,18 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
     Args:
         snapshot: snapshot whose episodes report ``closure``, see :func:`tracked_weights`.
         labels: label with unit, and factor from the coefficient to that unit, by the coefficient's name; by default the
-            name with the unit that the closure states is the label.
+            label is the name with the unit and the meaning that the closure states.
     """
     columns = tracked_weights(snapshot.episodes)
     true, start = (_numbers(named_weights(c)) for c in (snapshot.plant.closure, snapshot.initial_closure))
     true = true if snapshot.known else {}
-    units = {name: about["unit"] for name, about in described_weights(snapshot.initial_closure).items()}
+    described = described_weights(snapshot.initial_closure)
     wide = min(3, len(columns))
     rows = -(-len(columns) // wide)
-    size = (0.6 + 3.6 * wide, 1.3 + 2.6 * rows)
+    size = (0.6 + 3.6 * wide, 1.3 + 2.8 * rows)
     figure, axes = panels(rows, wide, title="Closure weights of the twin over the episodes", size=size, sharex=True)
     for ax, (name, found) in zip(axes.flat, columns.items(), strict=False):
-        label, factor = (labels or {}).get(name, (_label(name, units.get(name)), 1.0))
+        label, factor = (labels or {}).get(name, (_label(name, described.get(name, {})), 1.0))
         ax.plot(np.arange(len(found)), factor * found, "o-", color=TWIN, linewidth=1.4, markersize=4, label="twin")
         if name in start:
             ax.axhline(factor * start[name], color="0.55", linestyle=(0, (1, 1.5)), linewidth=1.5, label="start")
@@ -136,10 +137,11 @@ def closure_weights(snapshot: Snapshot, labels: Mapping[str, tuple[str, float]] 
     return figure
 
 
-def _label(name: str, unit: str | None) -> str:
-    """The label of a panel: the name of a weight, with its unit if there is one."""
-    words = name.replace("_", " ")
-    return words if unit in (None, "-") else f"{words} [{unit}]"
+def _label(name: str, about: Mapping[str, str]) -> str:
+    """The label of a panel: the name of a weight, with its unit if there is one, and below it what it means."""
+    unit, meaning = about.get("unit"), about.get("meaning", "")
+    words = name.replace("_", " ") + ("" if unit in (None, "-") else f" [{unit}]")
+    return "\n".join([words, *textwrap.wrap(meaning, 44)])
 
 
 def tracked_weights(episodes: list[dict[str, Any]]) -> dict[str, Float[np.ndarray, " episodes"]]:

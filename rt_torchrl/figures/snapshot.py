@@ -54,8 +54,10 @@ class Snapshot:
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
         replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None], start=record.start)
-        # An episode of which only a part is sound has no process.
-        fitted = algorithm.virtual.processes and algorithm.short_term.whole(twin.plant.n_steps, latest=1)
+        n, flight = len(record.actions), algorithm.flights.latest
+        # An episode of which only a part is sound has no process; that of one that ended early goes on to the horizon.
+        whole = algorithm.short_term.whole(twin.plant.n_steps, latest=1) or (flight is not None and flight.ended)
+        fitted = algorithm.virtual.processes and whole
         process = algorithm.virtual.processes[-1] if fitted else None
         generator = torch.Generator(device=record.states.device).manual_seed(0)
         return cls(
@@ -67,7 +69,7 @@ class Snapshot:
             live=algorithm.referee.live,
             record=record,
             replay=replay.states[0],
-            large_scale=None if process is None else process.mean,
-            realisations=None if process is None else process.sample(5, generator),
+            large_scale=None if process is None else process.mean[:n],
+            realisations=None if process is None else process.sample(5, generator)[:, :n],
             episodes=episodes,
         )

@@ -78,8 +78,8 @@ class CommandCost:
         terminal: cost V after the window; None for none.
 
     Raises:
-        ValueError: if an action has no finite range, the penalty is negative, ``hold`` is below 1 or a weight is not in
-            double precision.
+        ValueError: if an action has no finite range, episodes of the plant may end early, the penalty is negative,
+            ``hold`` is below 1 or a weight is not in double precision.
     """
 
     def __init__(
@@ -97,6 +97,11 @@ class CommandCost:
         if unbounded:
             raise ValueError(
                 f"actions {', '.join(unbounded)} of plant {plant.name!r} have no finite range; give them low and high."
+            )
+        if plant.end_cost is not None:
+            raise ValueError(
+                f"episodes of plant {plant.name!r} may end early, which optimal commands do not consider: leave out "
+                "model predictive control and the limit of the cost (--limit-episodes 0)."
             )
         if hold < 1:
             raise ValueError(f"hold={hold} must be at least 1 control interval.")

@@ -15,12 +15,14 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.ending import Ending
 from rt_torchrl.plants.episode_length import whole_steps
 from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.plants.measurement import Measurement, Preview, chosen
+from rt_torchrl.plants.merits import Merits
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
 
@@ -32,7 +34,7 @@ class Transition(NamedTuple):
     applied: Tensor
 
 
-class Plant(nn.Module, ABC):
+class Plant(nn.Module, Ending, Merits, ABC):
     """Physics and control problem of one system; ``envs/`` holds examples.
 
     A subclass declares its signals in the four class attributes (``inputs`` may be empty), and defines
@@ -213,28 +215,6 @@ class Plant(nn.Module, ABC):
         self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
     ) -> Float[Tensor, "*batch"]:
         r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`."""
-
-    def merit(
-        self,
-        states: Float[Tensor, "batch samples n_s"],
-        applied: Float[Tensor, "batch n n_a"],
-        exogenous: Float[Tensor, "batch n n_z"],
-    ) -> dict[str, Float[Tensor, " batch"]]:
-        """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""
-        return {}
-
-    def setpoints(
-        self,
-        states: Float[Tensor, "*batch n n_s"],
-        applied: Float[Tensor, "*batch n n_a"],
-        exogenous: Float[Tensor, "*batch n n_z"],
-    ) -> dict[str, tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]]:
-        """Quantities to be held, named with their units: value and setpoint in each interval; by default none."""
-        return {}
-
-    def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
-        """Kinds of episodes, by name, for which results are also shown separately; by default none."""
-        return {}
 
     def complete_states(
         self,

@@ -11,6 +11,8 @@ from torch.utils.tensorboard.summary import hparams
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
 
+    from rt_torchrl.runs.mlflow_logger import MLflowLogger
+
 TAGS = {
     "real_cost": "cost/real episode (live policy)",
     "J_a_model_based": "cost/J_a model-based (twin)",
@@ -32,6 +34,7 @@ TAGS = {
     "critic_loss": "model-free/critic loss",
     "value": "model-free/mean value of the policy",
     "exploration": "model-free/exploration strength",
+    "ended_after": "cost/control intervals until the early end of the real episode",
     "solve_median": "predictive control/median time of a solve (ms)",
     "solve_max": "predictive control/longest solve (ms)",
     "late_solves": "predictive control/late solves",
@@ -60,7 +63,7 @@ class Dashboard:
         loggers: further loggers.
     """
 
-    def __init__(self, folder: Path, loggers: "Sequence[Logger]" = ()):
+    def __init__(self, folder: Path, loggers: "Sequence[Logger | MLflowLogger]" = ()):
         self._writer, self._loggers = SummaryWriter(str(folder)), loggers
         self._writer.add_custom_scalars({"cost": {"all costs": ["Multiline", COSTS]}})
 
@@ -112,7 +115,7 @@ class Dashboard:
             rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
             table = "\n".join(["| time in the episode [s] | fault | detail |", "|---|---|---|", *rows])
             self._writer.add_text("faults", table, step)
-        for key in (key for key in record if key.startswith(("faults/", "violations/"))):
+        for key in (key for key in record if key.startswith(("faults/", "violations/", "excess/", "multiplier/"))):
             self._scalar(key, record[key], step)
         for name, seconds in record["seconds"].items():
             self._scalar(f"seconds/{name}", seconds, step)

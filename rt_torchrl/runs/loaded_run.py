@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import what_if
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.run_config import MakesPlant, RunConfig, plant_of
+from rt_torchrl.runs.configured_plant import MakesPlant, plant_of
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
 from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named

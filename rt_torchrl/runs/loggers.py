@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from rt_torchrl.runs.mlflow_logger import MLflowLogger
+
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type: it loads TorchRL
 
@@ -25,7 +27,7 @@ def require_loggers(names: Sequence[LoggerName]) -> None:
             raise ValueError(f"loggers={name!r} needs a package that is not installed: pip install {package}.")
 
 
-def make_loggers(names: Sequence[LoggerName], folder: Path, plant: str) -> "list[Logger]":
+def make_loggers(names: Sequence[LoggerName], folder: Path, plant: str) -> "list[Logger | MLflowLogger]":
     """The loggers of a run.
 
     Args:
@@ -38,7 +40,9 @@ def make_loggers(names: Sequence[LoggerName], folder: Path, plant: str) -> "list
     from torchrl.record.loggers import get_logger
 
     here = str(folder)
-    here = str(folder)
-    places = {"csv": (here, "csv"), "wandb": (here, folder.name), "mlflow": (str(folder / "mlflow"), plant)}
+    places = {"csv": (here, "csv"), "wandb": (here, folder.name)}
     options: dict[str, Any] = {"wandb_kwargs": {"project": f"rt_torchrl {plant}"}}
-    return [get_logger(name, *places[name], **options) for name in names]
+    return [
+        MLflowLogger(folder, plant) if name == "mlflow" else get_logger(name, *places[name], **options)
+        for name in names
+    ]

@@ -52,9 +52,15 @@ def operation_of(
         folder: run folder, for the log of the events.
 
     Raises:
-        ValueError: if the wall clock is asked for and there is no function that makes the real system, the device is
-            not the CPU, or what acts cannot be sent to another process; or the events to be replayed cannot be read.
+        ValueError: if episodes of the plant may end early; the wall clock is asked for and there is no function that
+            makes the real system, the device is not the CPU, or what acts cannot be sent to another process; or the
+            events to be replayed cannot be read.
     """
+    if plant.end_cost is not None:
+        raise ValueError(
+            f"episodes of plant {plant.name!r} may end early, which windows of operation do not; leave out "
+            "--asynchronous."
+        )
     options = config.operation
     crew = Crew(
         make_env or (lambda: env),

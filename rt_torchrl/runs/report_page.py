@@ -10,6 +10,7 @@ from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.style import REAL, REFERENCE, ROLES, TWIN, array, role_name, time_axis
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.state_bounds import OUTSIDE
 from rt_torchrl.runs.loaded_run import LoadedRun
 from rt_torchrl.runs.settings import RAN, read_settings
 
@@ -62,6 +63,7 @@ def write_report(run: LoadedRun) -> Path:
         folder=run.folder.name,
         numbers=numbers(metrics),
         story=story(metrics),
+        bounds=bounds(metrics),
         parts=parts,
         ran=(read_settings(run.folder).get(RAN) or [{}])[-1],
     )
@@ -81,6 +83,22 @@ def numbers(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return shown
 
 
+def bounds(metrics: dict[str, Any]) -> list[list[str]]:
+    """How often, and how far at most, bounded states were beyond their bounds on the unseen episodes.
+
+    Returns:
+        Rows of a table, the names of the controllers first; none without bounds.
+    """
+    unseen = metrics["summary"]["unseen"]
+    merits: dict[str, Any] = {role_name(role): unseen["merit"][role] for role in ROLES}
+    merits |= {name: law["merit"] for name, law in unseen["baselines"].items()}
+    first = next(iter(merits.values()))
+    bounded = {name.removesuffix(OUTSIDE) for name in first if name.endswith(OUTSIDE)}
+    shown = [name for name in first if name.split(" ")[0] in bounded]
+    rows = [[name, *(_text(merit[name]["mean"]) for merit in merits.values())] for name in shown]
+    return [["mean over the episodes", *merits], *rows] if rows else []
+
+
 def story(metrics: dict[str, Any]) -> list[str]:
     """What happened in the training, a sentence for each event, in the order of the episodes."""
     told: list[str] = []
@@ -92,6 +110,8 @@ def story(metrics: dict[str, Any]) -> list[str]:
             )
         if not told or k == 0:
             told.append(f"Episode {k}: the {live} policy acts first and costs {_text(episode['real_cost'])}.")
+        if "ended_after" in episode:
+            told.append(f"Episode {k}: the episode ends early, after {episode['ended_after']:g} control intervals.")
         if episode.get("event") == "swap":
             told.append(f"Episode {k}: the {live} policy hands over to the other one.")
         if episode.get("event") == "clone":

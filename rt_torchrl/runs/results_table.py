@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
 
 SCREEN = 24
@@ -190,5 +191,5 @@ def next_steps(metrics: dict[str, Any], folder: Path) -> str:
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
     else:
-        steps.append(f"take the controller away: recipes/export.py {folder}")
+        steps.append(f"take the controller away: {call_of('export')} {folder}")
     return "\n".join(f"  next: {step}" for step in steps)

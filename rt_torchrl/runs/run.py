@@ -22,6 +22,7 @@ from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.state_bounds import StateBounds
 from rt_torchrl.runs import checkpoint, reference, results
 from rt_torchrl.runs.callbacks import Callback
 from rt_torchrl.runs.dashboard import Dashboard
@@ -118,6 +119,7 @@ class Run:
             self._make_algorithm(system, make_env, physics, device=device, compiled=compiled)
             self.unseen = judged_on(plant, real, self.config.unseen, device=device, compiled=compiled)
             self.unseen.physics = physics
+            self.unseen.bounds = StateBounds(plant, config.twinning.bounded_states)
             self.baselines = {
                 name: law(physics, compiled=compiled).to(device) for name, law in (baselines or {}).items()
             }

@@ -16,8 +16,9 @@ from rt_torchrl.identification.sensor_log import READERS, Column, checked, read_
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.loaded_run import load_run
-from rt_torchrl.runs.run_config import STARTS, MakesPlant, RunConfig
+from rt_torchrl.runs.run_config import STARTS, RunConfig
 from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.referees import ROLES, Role

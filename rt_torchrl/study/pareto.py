@@ -14,8 +14,9 @@ from rt_torchrl import figures
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.configured_plant import physics_of, plant_of
 from rt_torchrl.runs.results_file import write_results
-from rt_torchrl.runs.run_config import RunConfig, physics_of, plant_of
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.study.yardsticks import TRAINING_SEED, Options, configured
 
 

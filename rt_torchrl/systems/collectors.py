@@ -78,8 +78,8 @@ class EpisodeCollector:
         """Fly one episode; its TensorDict has the batch size ``batch n``.
 
         Raises:
-            EpisodeEndedError: if the system fails in the episode, or ends it before its horizon; it holds the intervals
-                before.
+            EpisodeEndedError: if the system fails in the episode, or ends it before its horizon where the plant does
+                not; it holds the intervals before.
             DivergenceError: if the system is a simulation that diverges.
         """
         flown: list[TensorDictBase] = []
@@ -101,10 +101,17 @@ class EpisodeCollector:
                 said = f"the system failed in interval {k}, at {k * plant.dt:g} s: {_said(error)}"
                 raise EpisodeEndedError(said, together(flown)) from error
             flown.append(stepped.copy())
+            if terminated(stepped["next"], plant):
+                break
             if stepped["next", "done"].any() and k + 1 < plant.n_steps:
                 raise EpisodeEndedError(str(ended_early(stepped["next"], k + 1, plant)), together(flown))
             now = self.env.step_mdp(stepped)
         return cast(TensorDict, together(flown))
+
+
+def terminated(found: TensorDictBase, plant: Plant) -> bool:
+    """Whether the end of an interval is the early end of an episode."""
+    return plant.end_cost is not None and bool(found["terminated"].any())
 
 
 def together(flown: list[TensorDictBase]) -> TensorDictBase | None:
@@ -206,21 +213,31 @@ def flown(
     drive: Drive,
     factors: Tensor,
 ) -> TensorDict:
-    """The entries of an episode, computed from its true states, with the batch size ``n batch``."""
+    """The entries of an episode, computed from its true states, with the batch size ``n batch``.
+
+    An episode that ends early has only the intervals before its end.
+    """
+    ends = plant.ended(states[1:]).any(-1)
+    n = int(ends.int().argmax()) + 1 if ends.any() else len(command)
+    states, command, drive, factors = states[: n + 1], command[:n], part_of(drive, 0, n), factors[: n + 1]
+    over = ends[n - 1 : n].unsqueeze(-1)
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)
-    reward[-1] -= plant.terminal_cost(states[-1]) / plant.dt
+    reward[-1] -= ~ends[n - 1] * plant.terminal_cost(states[-1]) / plant.dt
     # There is no input after the last interval; the last input takes its place.
     exogenous = torch.cat([drive.exogenous, drive.exogenous[-1:]])
     t = plant.dt * torch.arange(len(states), dtype=torch.float64, device=states.device).unsqueeze(-1)
     truncated = torch.zeros(*reward.shape, 1, dtype=torch.bool, device=states.device)
-    truncated[-1] = True
+    truncated[-1] = ~over
     felt = states * factors
     seen = {"state": felt[..., : len(plant.readings)], "exogenous": exogenous}
     seen["observation"] = plant.observe(t, felt, exogenous)
     seen["applied"] = torch.cat([torch.zeros_like(applied[:1]), applied])
     never = torch.zeros_like(truncated)
-    ended = {"reward": reward.unsqueeze(-1), "done": truncated, "truncated": truncated.clone(), "terminated": never}
+    terminal = never.clone()
+    terminal[-1] = over
+    ended = {"reward": reward.unsqueeze(-1), "done": truncated | terminal, "truncated": truncated}
+    ended["terminated"] = terminal
     begun = {key: never.clone() for key in ("done", "truncated", "terminated")}
     return TensorDict(
         {key: value[:-1] for key, value in seen.items()}

@@ -32,7 +32,8 @@ class PlantEnv(EnvBase):
     ``action``                             n_a     the command, within the ranges of the plant's actions
     ``("next", "applied")``                n_a     the action that the actuators applied
     ``("next", "reward")``                 1       −L_a(t_k, s_k, a_k, z_k); at the horizon also −Φ_a(s_n)/Δt
-    ``("next", "truncated")``, ``"done"``  1       true at the horizon; ``terminated`` is never true
+    ``("next", "truncated")``              1       true at the horizon
+    ``("next", "terminated")``             1       true where the plant's episode has ended early (:meth:`Plant.ended`)
     =====================================  ======  ===================================================================
 
     Args:
@@ -119,6 +120,8 @@ class PlantEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         batch, (state, exogenous) = self.batch_size[0], self._draw()
+        if self.plant.ended(state).any():
+            raise ValueError(f"plant {self.plant.name!r} draws initial states in which the episode has ended.")
         self._goes_on = False
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():
@@ -177,15 +180,18 @@ class PlantEnv(EnvBase):
         # A compiled step may reuse its output buffer.
         self._state = transition.state.clone()
         self._step_count = self._step_count + 1
-        truncated = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        over = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
+        ends = self.plant.end_cost is not None
+        terminated = self.plant.ended(self._state).unsqueeze(-1) if ends else torch.zeros_like(over)
+        truncated = over & ~terminated
         ended = truncated.squeeze(-1) * self.plant.terminal_cost(self._state) / self.plant.dt
         return self._observed(
             {
                 "applied": transition.applied.clone(),
                 "reward": -(cost + ended).unsqueeze(-1),
-                "done": truncated,
-                "terminated": torch.zeros_like(truncated),
-                "truncated": truncated.clone(),
+                "done": truncated | terminated,
+                "terminated": terminated,
+                "truncated": truncated,
             }
         )
 
@@ -241,7 +247,7 @@ def declare_specs(env: EnvBase, plant: Plant) -> None:
 
 
 def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:
-    """The error that says that an environment has ended an episode before the horizon.
+    """The error that says that an environment has ended an episode where its plant does not.
 
     Args:
         found: the environment's report at the end of the episode.
@@ -251,8 +257,9 @@ def ended_early(found: TensorDictBase, count: int, plant: Plant) -> ValueError:
     terminated = "terminated" in found and found["terminated"].any()
     return ValueError(
         f"the environment {'terminated' if terminated else 'truncated'} the episode after {count} of {plant.n_steps} "
-        f"control intervals of plant {plant.name!r}. Reinforcement Twinning needs whole episodes and does not treat "
-        f"termination yet: use a horizon of at most {count * plant.dt:g} s, or an environment that goes on."
+        f"control intervals of plant {plant.name!r}, which does not end there. If it may, let the plant say so by "
+        f"ended(state) and end_cost; or use a horizon of at most {count * plant.dt:g} s, or an environment that goes "
+        "on."
     )
 
 

@@ -31,9 +31,9 @@ class RealSystem(EnvBase):
 
     State and exogenous input are read from the environment's report. Observation and reward are the plant's own
     functions of them, and so mean the same on the real system and on its twin; the environment's own reward is not
-    used. An episode is as long as the plant's and takes one reset, at its beginning. The environment must not end an
-    episode earlier, neither by a time limit nor by a terminal state, because the algorithm does not treat termination
-    yet.
+    used. An episode is as long as the plant's and takes one reset, at its beginning. It ends early in a state in which
+    the plant says so (:meth:`Plant.ended`), whether or not the environment ends it there. The environment must not end
+    an episode elsewhere, neither by a time limit nor by a terminal state of its own.
 
     Args:
         env: TorchRL environment of one system, with batch size () or (1,); a Gymnasium environment goes into TorchRL's
@@ -54,7 +54,7 @@ class RealSystem(EnvBase):
         ValueError: if ``env`` is not a TorchRL environment or is a batch of systems, an entry is missing or misshapen,
             a constant input is not finite, the plant has states that no sensor reads, the environment's range of an
             action does not contain the plant's, or its time limit is shorter than the plant's horizon; in a step, if an
-            entry that is read is not reported, or the episode ends before the horizon.
+            entry that is read is not reported, or the environment ends the episode where the plant does not.
     """
 
     observation_spec: Composite
@@ -197,9 +197,10 @@ class RealSystem(EnvBase):
         action = self._actuation.action(command[0]).reshape(spec.shape).to(spec.device, spec.dtype)
         stepped = self.env.step(self._reported.set(self._actuation.key, action))
         self._step_count += 1
-        last = self._step_count >= self.plant.n_steps
         self._require_reported(stepped["next"])
-        if stepped["next", "done"].any() and not last:
+        over = self.plant.end_cost is not None and self._ended(stepped["next"])
+        last = self._step_count >= self.plant.n_steps and not over
+        if stepped["next", "done"].any() and not (last or over):
             raise ended_early(stepped["next"], self._step_count, self.plant)
         self._reported = self.env.step_mdp(stepped)
         if self._applied is None:
@@ -209,9 +210,16 @@ class RealSystem(EnvBase):
         t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
         cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
         after = self._entries(applied, ended=last)
+        if over:
+            after["done"], after["terminated"] = (torch.ones_like(after["done"]) for _ in range(2))
         if last:
             cost = cost + self.plant.terminal_cost(after["state"]) / self.plant.dt
         return after.set("reward", -cost.unsqueeze(-1))
+
+    def _ended(self, found: TensorDictBase) -> bool:
+        """Whether the episode of the plant has ended in the state that the environment reports."""
+        state = self._state.read(found, self.plant.states, "state").to(self.device)
+        return bool(self.plant.ended(state).any())
 
     def _require_reported(self, found: TensorDictBase) -> None:
         """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""

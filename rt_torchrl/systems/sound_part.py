@@ -56,7 +56,8 @@ class SoundPart(NamedTuple):
     """What can be learned from a real episode.
 
     ``parts`` holds the first interval, and the one after the last, of each sound part; ``longest`` is the longest one.
-    ``whole`` says whether all intervals of the horizon are sound, ``reason`` why not.
+    ``whole`` says whether all intervals are sound, to the horizon or to the early end of the episode; ``reason`` says
+    why not.
     """
 
     parts: list[tuple[int, int]]
@@ -94,7 +95,9 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
     sound = (~wrong).tolist()
     starts = [k for k, good in enumerate(sound) if good and (k == 0 or not sound[k - 1])]
     ends = [k + 1 for k, good in enumerate(sound) if good and (k + 1 == len(sound) or not sound[k + 1])]
-    whole = len(episode) == plant.n_steps and all(sound)
+    # An episode that is over at once shows less than a fault leaves.
+    over = len(episode) >= SHORTEST and plant.end_cost is not None and bool(episode["next", "terminated"][-1].any())
+    whole = (len(episode) == plant.n_steps or over) and all(sound)
     return SoundPart(list(zip(starts, ends, strict=True)), faults, "; ".join(said), whole)
 
 

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.ending import final_cost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel, ParallelInTime
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
@@ -115,9 +116,11 @@ class Rollout:
             ValueError, DivergenceError: as :meth:`__call__`.
         """
         drive = self._drive(initial_state, exogenous, command, start)
-        found = self._engine.costs(self.interval, initial_state, drive)
+        # What is replayed runs on after an end, so that only its trajectory says when it ended.
+        summed = self.plant.end_cost is None or self.interval.policy is not None
+        found = self._engine.costs(self.interval, initial_state, drive) if summed else None
         if found is not None and all_finite(found):
-            first = self.plant.terminal_cost(initial_state) / self.plant.dt  # the sum holds the change from it
+            first = final_cost(self.plant, initial_state) / self.plant.dt  # the sum holds the change from it
             return (found + first) / exogenous.shape[1]
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
 
@@ -159,12 +162,10 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
     """The reason why an engine cannot roll a plant out, for a message; None if it can."""
     if engine not in ENGINES:
         return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
-    if plant.own_scheme and not ENGINES[engine].own_scheme:
+    if (plant.own_scheme or plant.end_cost is not None) and not ENGINES[engine].own_scheme:
         others = _listed(name for name, kind in ENGINES.items() if kind.own_scheme)
-        return (
-            f"engine={engine!r} integrates the vector field, but plant {plant.name!r} steps by a scheme of its own; "
-            f"use {others}."
-        )
+        does = "steps by a scheme of its own" if plant.own_scheme else "has episodes that end early"
+        return f"engine={engine!r} integrates the vector field, but plant {plant.name!r} {does}; use {others}."
     return None
 
 

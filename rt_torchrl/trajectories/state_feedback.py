@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.ending import held
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -93,7 +94,7 @@ class RememberingInterval(Interval):
         command, memory = self.answer(state, drive.command)
         s = state[..., : len(self.plant.states)]
         end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
-        return torch.cat([end, memory], -1)
+        return torch.cat([held(self.plant, s, end), memory], -1)
 
 
 @torch.no_grad()

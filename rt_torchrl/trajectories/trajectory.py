@@ -94,13 +94,30 @@ def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: flo
 
 
 def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"]:
-    r"""J_a of each trajectory, :math:`\frac1{T_o}\big(\int L_a\,dt + \Phi_a(s_n)\big)` by its samples."""
+    r"""J_a of each trajectory, :math:`\frac1{T_o}\big(\int L_a\,dt + \Phi_a(s_n)\big)` by its samples.
+
+    Where it ends early, it costs L_e from there on; see :mod:`rt_torchrl.plants.ending`.
+    """
     states, actions, exogenous, start = trajectory
     n = actions.shape[-2]
     clock = plant.dt * torch.arange(n, dtype=torch.float64, device=states.device)
     t = (start.unsqueeze(-1) if isinstance(start, Tensor) else start) + clock
-    running = plant.running_cost(t, states[..., :-1, :], actions, exogenous).mean(-1)
-    return running + plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
+    running = plant.running_cost(t, states[..., :-1, :], actions, exogenous)
+    if plant.end_cost is None:
+        return running.mean(-1) + plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
+    over = plant.ended(states).cumsum(-1) > 0  # a trajectory may leave the state again in which it ended
+    running = torch.where(over[..., :-1], torch.full_like(running, plant.end_cost), running).mean(-1)
+    last = plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
+    return running + torch.where(over[..., -1], torch.zeros_like(last), last)
+
+
+def continued(inputs: Float[Tensor, "n_e n_z"], n: int) -> Float[Tensor, "n n_z"]:
+    """Exogenous inputs of n intervals, of which a record that ended early holds the first ones.
+
+    The record is gone through forwards and backwards in turn, so that no input jumps where the record ends.
+    """
+    place = torch.arange(n, device=inputs.device) % (2 * len(inputs))
+    return inputs[torch.where(place < len(inputs), place, 2 * len(inputs) - 1 - place)]
 
 
 def identification_cost(

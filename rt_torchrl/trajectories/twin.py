@@ -7,6 +7,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.ending import require_end_cost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.fingerprint import fingerprint
 from rt_torchrl.trajectories.rollout import Engine, Rollout
@@ -28,9 +29,13 @@ class DigitalTwin:
         closure: the learned closure g(·; w_p).
         engine: gradient engine, see :mod:`rt_torchrl.trajectories.rollout`.
         compiled: compile the engine.
+
+    Raises:
+        ValueError: if episodes of the plant end early at no cost.
     """
 
     def __init__(self, plant: Plant, closure: nn.Module, *, engine: Engine = "native", compiled: bool = False):
+        require_end_cost(plant)
         self.plant, self.closure = plant, closure
         self._engine, self._compiled = engine, compiled
         self._replay = self._rollout(closure, None)

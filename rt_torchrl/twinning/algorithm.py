@@ -93,6 +93,7 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.virtual.constraints = getattr(self.planner, "constraints", None)
         system = env.system if isinstance(env, Operation) else env
         self.clearance = Clearance(system, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
@@ -194,8 +195,7 @@ class ReinforcementTwinning:
 
     def fit_exogenous(self) -> TensorDict:
         """Step 3: fit a Gaussian process to the exogenous input of this episode, if it is whole."""
-        if self.short_term.whole(self.twin.plant.n_steps, latest=1):
-            self.virtual.learn(self.short_term[-1])
+        self.virtual.learn_flight(self.flights.latest)
         return findings()
 
     def assimilate(self, records: Sequence[Trajectory] = ()) -> TensorDict:
@@ -247,12 +247,12 @@ class ReinforcementTwinning:
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
     def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
-        """Mean J_a of policies over virtual episodes; infinite for one with which a sound twin diverges.
+        """What policies cost over virtual episodes; infinite for one with which a sound twin diverges.
 
         Raises:
             DivergenceError: if the twin diverges under the weights that have just flown, too.
         """
-        costs = {role: self.virtual.cost(self.policies[role], episodes) for role in roles}
+        costs = {role: self.virtual.price(self.policies[role], episodes) for role in roles}
         if not all(cost.isfinite() for cost in costs.values()):
             self.track_record.require_sound_twin(self.virtual, episodes)
         return costs

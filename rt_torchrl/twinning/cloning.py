@@ -70,7 +70,7 @@ class Cloning:
         before, (live_cost, replaced) = copy.deepcopy(idle.state_dict()), costs
         source = record if isinstance(live, StateFeedback) else seen()
         error = self.distillation.imitate(live, idle, seen=source, draw=lambda: self.virtual.draw(self.count))
-        cost = self.virtual.cost(idle, judged_on).item()
+        cost = self.virtual.price(idle, judged_on).item()
         found = {"distillation_error": error, "distillation_cost_ratio": cost / live_cost}
         if not worse(cost, replaced):
             return findings(**found)
@@ -112,15 +112,15 @@ class Cloning:
     def _imitated(
         self, teacher: nn.Module | None, role: Role, policy: nn.Module, records: Trajectory, judged_on: Scenario
     ) -> TensorDict:
-        before, start = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
+        before, start = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on).item()
         if teacher is None:
             error = self.distillation.of_record(policy, records)
             wanted = control_cost(self.virtual.twin.plant, records).mean().item()
         else:
             draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
             error = self.distillation.imitate(teacher, policy, seen=records, draw=draw)
-            wanted = self.virtual.cost(teacher, judged_on).item()
-        cost = self.virtual.cost(policy, judged_on).item()
+            wanted = self.virtual.price(teacher, judged_on).item()
+        cost = self.virtual.price(policy, judged_on).item()
         found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": cost / wanted}
         if cost <= start:
             return findings(**found)

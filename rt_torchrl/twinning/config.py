@@ -69,6 +69,11 @@ class TwinningConfig:
     referee: RefereeConfig = field(default_factory=RefereeConfig)
     distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
+    @property
+    def bounded_states(self) -> dict[str, tuple[float, float]]:
+        """Bounds on states by name, of the limits and of the constraints of plans, which come first."""
+        return {**self.limits.states, **self.planner.constraints.states}
+
     def __post_init__(self) -> None:
         check_options(self)
         for argument in ("realisations", "records", "virtual_episodes"):

@@ -36,7 +36,8 @@ class Flight(NamedTuple):
         refused: why earlier attempts could not be learned from.
         faults: faults of the system in this episode and in the earlier attempts.
         others: transitions of its other sound parts, each with the number of its first interval.
-        whole: whether the record is that of a whole episode.
+        whole: whether the record is that of a whole episode, to its horizon or to its early end.
+        after: number of control intervals after an early end, and what each of them costs, L_e.
     """
 
     transitions: TensorDict
@@ -45,11 +46,18 @@ class Flight(NamedTuple):
     faults: Sequence[Fault] = ()
     others: Sequence[tuple[int, TensorDict]] = ()
     whole: bool = True
+    after: tuple[int, float] = (0, 0.0)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode has ended early, before the last interval of the horizon."""
+        return bool(self.after[0])
 
     @property
     def cost(self) -> Tensor:
-        """J_a as measured, in the sound part."""
-        return -self.transitions["next", "reward"].mean()
+        """J_a as measured, in the sound part and after an early end."""
+        rewards, (count, each) = self.transitions["next", "reward"], self.after
+        return -(rewards.sum() - count * each) / (len(rewards) + count)
 
     def parts(self, dt: float) -> list[tuple[int, TensorDict]]:
         """The transitions of all sound parts, in their order, each with the number of its first interval."""
@@ -67,6 +75,8 @@ class Flight(NamedTuple):
             for fault in self.faults:
                 counts[fault.kind] += 1.0
             found.update(findings(**{f"faults/{kind}": count for kind, count in counts.items()}))
+        if self.ended:
+            found.update(findings(ended_after=float(len(self.transitions))))
         if not self.whole:
             found.update(findings(sound_intervals=float(sum(len(part) for _, part in self.parts(1.0)))))
         return found
@@ -95,6 +105,8 @@ class RealFlights:
         self._least = max(SHORTEST, least_sound * plant.n_steps)
         self.faults: list[Fault] = []
         """Faults of the system in the episodes since :meth:`begin`."""
+        self.latest: Flight | None = None
+        """The flight that was flown last."""
 
     def begin(self) -> None:
         """Begin an episode of the algorithm."""
@@ -129,7 +141,9 @@ class RealFlights:
         states = torch.cat([transitions["state"], transitions["next", "state"][-1:]])
         start = first * self.plant.dt
         record = Trajectory(states, transitions["action"], transitions["exogenous"], start)
-        return Flight(transitions, record, refused, faults, others, found.whole)
+        after = (self.plant.n_steps - len(episode), self.plant.end_cost or 0.0) if found.whole else (0, 0.0)
+        self.latest = Flight(transitions, record, refused, faults, others, found.whole, after)
+        return self.latest
 
     def fly_first(self, policy: nn.Module) -> Flight:
         """Fly one whole episode without exploration."""
@@ -155,11 +169,11 @@ class RealFlights:
 
 
 def _transitions(episode: TensorDictBase, part: tuple[int, int]) -> TensorDict:
-    """The transitions of a part of an episode; the last one is truncated."""
+    """The transitions of a part of an episode; the last one is truncated, unless the episode ends there early."""
     first, last = part
     found = episode[first:last].clone() if last - first < len(episode) else episode
     # The learner learns from the action that was applied.
     found["action"] = found["next", "applied"]
-    for key in ("done", "truncated"):
-        found["next", key][-1] = True
+    found["next", "done"][-1] = True
+    found["next", "truncated"][-1] = ~found["next", "terminated"][-1]
     return found

@@ -69,7 +69,8 @@ class Learning:
         """
         shortest, bound = getattr(self.learner, "shortest", 1), getattr(self.learner, "from_the_start", False)
         for first, transitions in parts:
-            if len(transitions) >= shortest and not (bound and first):
+            over = bool(transitions["next", "terminated"][-1].any())  # with an end, few intervals are enough
+            if (over or len(transitions) >= shortest) and not (bound and first):
                 self.learner.store(transitions)
 
     def update(self) -> TensorDict:
@@ -90,9 +91,9 @@ class Learning:
         """
         policy = self.learner.policy
         self.adopt(policy)
-        after, found = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on).item()
+        after, found = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on).item()
         policy.load_state_dict(self._before)
-        earlier = self.virtual.cost(policy, judged_on).item()
+        earlier = self.virtual.price(policy, judged_on).item()
         if worse(found, earlier):
             self.learner.restart()
             reason = f"update refused: J_a of model_free would be {found:.4g}, it was {earlier:.4g}"

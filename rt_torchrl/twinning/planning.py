@@ -84,7 +84,8 @@ class Planning:
             found = found if other is None else other
         if self.config.approach and episode == self.config.approach_at:
             found = self._approached(found, planned_on, judged_on)
-        return found
+        constraints = self.virtual.constraints
+        return merged(found, findings(**constraints.report())) if constraints else found
 
     def _approached(self, found: TensorDict, planned_on: Scenario, judged_on: Scenario) -> TensorDict:
         """The best plan by small steps from the present weights and from the first ones, or the plan found so far."""
@@ -116,20 +117,26 @@ class Planning:
     ) -> TensorDict | None:
         """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
         policy = self.planner.policy
-        best, least = copy.deepcopy(policy.state_dict()), self.virtual.cost(policy, judged_on)
+        best, least = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on)
         policy.load_state_dict(weights)
         self.planner.restart()
         try:
             if approach:
-                by_small_steps(policy, lambda: self.virtual.twin.cost(policy, *planned_on), approach)
+                by_small_steps(policy, lambda: self._priced(policy, planned_on), approach)
             found = self.planner.plan(planned_on)
         except FloatingPointError:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
-        if found is not None and self.virtual.cost(policy, judged_on) < least:
+        if found is not None and self.virtual.price(policy, judged_on) < least:
             return planned(found, accepted=True)
         policy.load_state_dict(best)
         self.planner.restart()
         return None
+
+    def _priced(self, policy: nn.Module, episodes: Scenario) -> Tensor:
+        """The mean J_a with the price of leaving the bounds, if there are some, for a descent."""
+        twin, constraints = self.virtual.twin, self.virtual.constraints
+        cost = twin.cost(policy, *episodes)
+        return constraints.priced(cost, twin.control(policy, *episodes)) if constraints else cost
 
     def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         policy = self.planner.policy
@@ -143,7 +150,7 @@ class Planning:
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
-        cost = judgement.expected(policy, self.virtual.cost(policy, judged_on).item()) if judged else 0.0
+        cost = judgement.expected(policy, self.virtual.price(policy, judged_on).item()) if judged else 0.0
         accepted = not judged or not judgement.worse(cost, incumbent)
         if not accepted:
             policy.load_state_dict(before)

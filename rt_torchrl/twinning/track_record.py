@@ -84,8 +84,7 @@ class TrackRecord:
         return list(self._flown)[-COMPARED:]
 
     def _predicted(self, flown: Flown, virtual: VirtualEpisodes) -> float:
-        start = Scenario(flown.trajectory.states[:1], flown.trajectory.exogenous[None])
-        return virtual.cost(self._policy(flown), start).item()
+        return virtual.cost(self._policy(flown), virtual.repeated(flown.trajectory)).item()
 
     @property
     def latest_record(self) -> Trajectory:

@@ -8,9 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, pieces_of_equal_length
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
+from rt_torchrl.twinning.flight import Flight
+from rt_torchrl.twinning.planners.constraints import Constraints
 
 
 class VirtualEpisodes:
@@ -23,6 +26,9 @@ class VirtualEpisodes:
         generator: source of every draw.
     """
 
+    constraints: Constraints | None = None
+    """Bounds on states, whose price counts where policies are compared; None for none."""
+
     def __init__(self, twin: DigitalTwin, config: ExogenousConfig, experience: int, *, generator: torch.Generator):
         self.twin, self.config, self.generator = twin, config, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
@@ -34,6 +40,21 @@ class VirtualEpisodes:
     def learn(self, record: Trajectory) -> None:
         """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
         self.processes.append(self._process(record))
+
+    def learn_flight(self, flight: Flight | None) -> None:
+        """The same of a flight, if it is whole; inputs of one that ended early are continued to the horizon."""
+        if flight is None or not flight.whole:
+            return
+        record, n = flight.record, self.twin.plant.n_steps
+        self.learn(record._replace(exogenous=continued(record.exogenous, n)) if flight.ended else record)
+
+    def repeated(self, record: Trajectory) -> Scenario:
+        """The start and the inputs of a real episode, which are continued to the horizon if it ended early."""
+        plant = self.twin.plant
+        acted = record.exogenous[:, : len(plant.acting_inputs)]
+        whole = len(acted) >= plant.n_steps or plant.end_cost is None
+        inputs = record.exogenous if whole else plant.with_previews(continued(acted, plant.n_steps))
+        return Scenario(record.states[:1], inputs[None])
 
     def paired(self, records: Sequence[Trajectory]) -> tuple[list[Trajectory], list[ExogenousProcess]]:
         """The latest records that have a process, and these processes, in pairs.
@@ -77,6 +98,14 @@ class VirtualEpisodes:
         except DivergenceError:
             return torch.full((), torch.inf, dtype=torch.float64, device=episodes.initial_state.device)
         return cost.nan_to_num(nan=torch.inf, posinf=torch.inf)
+
+    @torch.no_grad()
+    def price(self, policy: nn.Module, episodes: Scenario) -> Tensor:
+        """The cost by which policies are compared: mean J_a, with the price of leaving the bounds if there are some."""
+        cost = self.cost(policy, episodes)
+        if not self.constraints or not cost.isfinite() or isinstance(policy, StateFeedback):
+            return cost
+        return self.constraints.priced(cost, self.twin.control(policy, *episodes))
 
     def state_dict(self) -> dict[str, Any]:
         return {"processes": [process.state_dict() for process in self.processes]}

@@ -86,7 +86,7 @@ class Extension(Plant):
         self.base, self.name, self.unread = base, base.name, base.unread + len(hidden)
         self.states, self.actions, self.inputs = (*base.states, *hidden), base.actions, base.inputs
         self.observations, self.observed, self.previews = base.observations, base.observed, base.previews
-        self.controller_states = base.controller_states
+        self.controller_states, self.end_cost = base.controller_states, base.end_cost
         self._fresh = None if own is None else own.fresh
 
     # The additional dynamics
@@ -199,6 +199,9 @@ class Extension(Plant):
 
     def terminal_cost(self, state: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch"]:
         return self.base.terminal_cost(self.split(state)[0])
+
+    def ended(self, state: Float[Tensor, "*batch n_s"]) -> Bool[Tensor, "*batch"]:
+        return self.base.ended(self.split(state)[0])
 
     def discrepancy(
         self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]

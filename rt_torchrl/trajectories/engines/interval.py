@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.plants.ending import cost_rate, final_cost, held
 from rt_torchrl.plants.plant import Plant
 
 
@@ -25,7 +26,8 @@ class Interval(nn.Module):
     Args:
         plant: the physics; holds no trained weights.
         closure: the true or the learned closure.
-        policy: policy that computes the command from the observation; None takes the command from the drive.
+        policy: policy that computes the command from the observation; None takes the command from the drive. With a
+            policy an episode that has ended early stays in its state; a record is replayed without regard to ends.
     """
 
     def __init__(self, plant: Plant, closure: nn.Module, policy: nn.Module | None):
@@ -40,7 +42,8 @@ class Interval(nn.Module):
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """The state at the end of the interval."""
-        return self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure).state
+        end = self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure).state
+        return end if self.policy is None else held(self.plant, state, end)
 
 
 class CostInterval(nn.Module):
@@ -63,8 +66,8 @@ class CostInterval(nn.Module):
         plant, s = self.interval.plant, state[..., :-1]
         applied = plant.actuate(s, self.interval.command(s, drive))
         end = self.interval(s, drive)
-        change = (plant.terminal_cost(end) - plant.terminal_cost(s)) / plant.dt
-        cost = state[..., -1] + plant.running_cost(drive.t, s, applied, drive.exogenous) + change
+        change = (final_cost(plant, end) - final_cost(plant, s)) / plant.dt
+        cost = state[..., -1] + cost_rate(plant, drive.t, s, applied, drive.exogenous) + change
         return torch.cat([end, cost.unsqueeze(-1)], -1)
 
 

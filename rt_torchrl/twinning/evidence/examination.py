@@ -132,8 +132,8 @@ class RealJudge:
     def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
         """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""
         flown = [one for one in self.differences.policies if same_architecture(one, policy)]
-        costs = [self.expected(one, self.virtual.cost(one, episodes).item()) for one in flown]
-        present = self.expected(policy, self.virtual.cost(policy, episodes).item())
+        costs = [self.expected(one, self.virtual.price(one, episodes).item()) for one in flown]
+        present = self.expected(policy, self.virtual.price(policy, episodes).item())
         if not costs or not min(costs) < RECALLED_BELOW * present:
             return None
         return copy.deepcopy(flown[costs.index(min(costs))].state_dict())

@@ -78,7 +78,7 @@ class ActorCritic(ABC):
                 f"return_steps={config.return_steps} exceeds the {plant.n_steps} control intervals of an episode of "
                 f"plant {plant.name!r}; use at most a tenth of them, or a longer horizon."
             )
-        self.config, self.policy, self.generator = config, policy, generator
+        self.config, self.policy, self.generator, self._end_cost = config, policy, generator, plant.end_cost
         self.batch_size = min(config.batch_size, plant.n_steps)
         self.memory = LongTermMemory(config.memory, generator=generator)
         self.critics = nn.ModuleList(self.make_critics(plant)).to(generator.device)
@@ -142,13 +142,24 @@ class ActorCritic(ABC):
 
         The last m − 1 intervals are left out. With shorter sums there, the values of the observations at the end of
         episodes, such as a target that is reached, would depend on hardly anything but themselves and drift without
-        bound.
+        bound. Where an episode ends early they stay: their sums end with the value of its end, which is known.
         """
-        whole = len(episode) - self.config.return_steps + 1
-        transitions = episode.select(*TRANSITION)
+        over = self._end_cost is not None and bool(episode["next", "terminated"][-1].any())
+        whole = len(episode) if over else len(episode) - self.config.return_steps + 1
+        transitions = episode.select(*TRANSITION).clone()
+        if over:
+            transitions["next", "reward"][-1] += self.end_value()
         transitions["next", "reward"] = self.config.reward_scale * transitions["next", "reward"]
         returns = self._returns(transitions.unsqueeze(0))[0, :whole]
+        if over:  # TorchRL moves all that is next, but not what says whether it is an end
+            last = torch.arange(whole, device=returns.device) + returns["steps_to_next_obs"].flatten() == whole
+            returns["next", "terminated"] = last.unsqueeze(-1)
         return returns.select(*TRANSITION, "steps_to_next_obs", strict=False)
+
+    def end_value(self) -> float:
+        r"""What comes after the last reward of an episode that ends early, :math:`-\gamma L_e/(1 - \gamma)`."""
+        discount = self.config.discount
+        return -discount * (self._end_cost or 0.0) / (1.0 - discount)
 
     @torch.no_grad()
     def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:

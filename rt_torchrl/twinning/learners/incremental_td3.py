@@ -66,6 +66,11 @@ class IncrementalTD3:
     """
 
     def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator):
+        if plant.end_cost is not None:
+            raise ValueError(
+                f"algorithm='incremental_td3' learns from episodes up to their horizon, and those of plant "
+                f"{plant.name!r} may end early; use ddpg or td3."
+            )
         self.config, self.policy, self.generator = config, policy, generator
         device, own = generator.device, config.incremental
         intervals = decision_intervals(config.discount, own.decisions)

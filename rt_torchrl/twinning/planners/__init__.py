@@ -5,6 +5,8 @@ from torch import nn
 
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.planners.constraints import Constraints
+from rt_torchrl.twinning.planners.constraints_config import ConstraintsConfig
 from rt_torchrl.twinning.planners.planner import Planner, PlannerConfig, ShortHorizonConfig
 from rt_torchrl.twinning.planners.receding_horizon import RecedingHorizonPlanner
 from rt_torchrl.twinning.planners.short_horizon import ShortHorizon
@@ -38,6 +40,8 @@ def make_planner(twin: DigitalTwin, policy: nn.Module, config: PlannerConfig, *,
 
 
 __all__ = [
+    "Constraints",
+    "ConstraintsConfig",
     "Planner",
     "PlannerConfig",
     "RecedingHorizonPlanner",

@@ -9,6 +9,7 @@ from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.twinning.planners.constraints_config import ConstraintsConfig
 
 
 @runtime_checkable
@@ -104,6 +105,7 @@ class PlannerConfig:
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
+        constraints: bounds on states that plans over whole episodes keep.
         descent: parameters of the policy's descent over whole episodes.
         short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
             use.
@@ -116,6 +118,7 @@ class PlannerConfig:
     approach: int = 0
     approach_at: int = 3
     experience: int = 100
+    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
@@ -126,6 +129,11 @@ class PlannerConfig:
             raise ValueError(
                 f"method={self.method!r} of the planning does not go with short_horizon.window="
                 f"{self.short_horizon.window}; a positive window belongs to short_horizon alone."
+            )
+        if self.constraints.states and (self.short_horizon.window or self.method == "receding_horizon"):
+            raise ValueError(
+                f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
+                "planner.method and short_horizon.window as they are, or leave the constraints out."
             )
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")

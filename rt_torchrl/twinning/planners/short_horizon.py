@@ -47,7 +47,7 @@ class ShortHorizon:
         generator: source of the critic's initial weights.
 
     Raises:
-        ValueError: if a window is longer than an episode.
+        ValueError: if a window is longer than an episode, or episodes of the plant may end early.
     """
 
     gradient_limit = 1.0
@@ -61,6 +61,11 @@ class ShortHorizon:
             raise ValueError(
                 f"window={short.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
                 f"{twin.plant.name!r}; 0 plans over whole episodes."
+            )
+        if twin.plant.end_cost is not None:
+            raise ValueError(
+                f"window={short.window} plans for a process that goes on, and episodes of plant {twin.plant.name!r} "
+                "may end early; 0 plans over whole episodes."
             )
         self.twin, self.policy, self.iterations, self.config = twin, policy, config.iterations, short
         n_o = len(twin.plant.observations)

@@ -2,11 +2,13 @@
 
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.planners.constraints import Constraints
 from rt_torchrl.twinning.planners.planner import PlannerConfig
 
 
@@ -17,15 +19,29 @@ class WholeEpisodes:
         twin: twin with the best closure so far, w_p*.
         policy: policy π_mb, updated in place.
         config: parameters of step 5.
+
+    The attribute ``constraints`` prices what leaves the bounds of ``config.constraints``, in the plans and where the
+    algorithm compares policies on the twin.
     """
 
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
+        self.constraints = Constraints(twin.plant, config.constraints)
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradient steps; the policy keeps the best weights seen in them."""
-        return self.descent.run(lambda: self.twin.cost(self.policy, *episodes), self.config.iterations)
+
+        def cost() -> Tensor:
+            found = self.twin.cost(self.policy, *episodes)
+            return self.constraints.priced(found, self.twin.control(self.policy, *episodes)) if constrained else found
+
+        constrained = bool(self.constraints)
+        found = self.descent.run(cost, self.config.iterations)
+        if constrained:
+            with torch.no_grad():
+                self.constraints.update(self.twin.control(self.policy, *episodes))
+        return found
 
     def refuse(self) -> None:
         """Forget the state of the optimiser, because it led to the plan that was refused."""
@@ -36,7 +52,10 @@ class WholeEpisodes:
         self.descent.restart()
 
     def state_dict(self) -> dict[str, Any]:
-        return self.descent.state_dict()
+        priced = {"constraints": self.constraints.state_dict()} if self.constraints else {}
+        return self.descent.state_dict() | priced
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.descent.load_state_dict(state)
+        if self.constraints:
+            self.constraints.load_state_dict(state["constraints"])
+        self.descent.load_state_dict({name: part for name, part in state.items() if name != "constraints"})

@@ -1,0 +1,77 @@
+r"""The price of trajectories that leave bounds on states, beside J_a.
+
+With g the distance of a state beyond one of its bounds (negative within), in shares of the width between them, the
+augmented Lagrangian of Powell, Hestenes and Rockafellar and, with μ = 0, a penalty are
+
+.. math::
+    J_a + J_0\sum_i\overline{\frac{\max(0, \mu_i + \rho g_i)^2}{2\rho}}
+
+with the mean over all intervals and episodes. After every plan :math:`\mu_i` grows by ρ times the mean excess where
+there is one: it is the common multiplier of a bound in all intervals. States within μ/ρ of a bound have a price, too,
+so that plans keep some distance from it. J_0 is the cost of the first policy that is priced.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.state_bounds import StateBounds
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.twinning.planners.constraints_config import ConstraintsConfig
+
+
+class Constraints:
+    """Prices trajectories of the twin; the module says how.
+
+    Args:
+        plant: plant of the twin.
+        config: bounds, method and weight.
+
+    Raises:
+        ValueError: if the plant has no such state.
+    """
+
+    def __init__(self, plant: Plant, config: ConstraintsConfig):
+        self.bounds, self.config = StateBounds(plant, config.states), config
+        self.reference = 0.0
+        self.multipliers = [0.0 for _ in self.bounds.names]
+        self._excess = list(self.multipliers)
+
+    def __bool__(self) -> bool:
+        """Whether there is any bound."""
+        return bool(self.bounds.names)
+
+    def priced(self, cost: Float[Tensor, ""], flown: Trajectory) -> Float[Tensor, ""]:
+        """A mean J_a with the price of the trajectories that it is the mean of."""
+        if not self:
+            return cost
+        self.reference = self.reference or abs(cost.item()) or 1.0
+        rho, sides = self.config.weight, self.bounds.beyond(flown.states[:, 1:])
+        forces = [torch.relu(side.new_tensor(self.multipliers) + rho * side) for side in sides]
+        price = sum((force.square().mean((0, 1)).sum() for force in forces), start=torch.zeros_like(cost))
+        return cost + self.reference * price / (2.0 * rho)
+
+    @torch.no_grad()
+    def update(self, flown: Trajectory) -> None:
+        """Raise the multipliers of an augmented Lagrangian by the excess of a plan's trajectories."""
+        shares = self.bounds.shares(flown.states[:, 1:])
+        self._excess = shares.mean((0, 1)).tolist()
+        if self.config.method == "augmented_lagrangian":
+            beyond = (shares.sum((0, 1)) / (shares > 0.0).sum((0, 1)).clamp_min(1)).tolist()
+            raised = zip(self.multipliers, beyond, strict=True)
+            self.multipliers = [mu + self.config.weight * excess for mu, excess in raised]
+
+    def report(self) -> dict[str, float]:
+        """Mean excess of the last plan in shares of the width, and the multiplier, of each bounded state."""
+        found = {f"excess/{name}": share for name, share in zip(self.bounds.names, self._excess, strict=True)}
+        return found | {f"multiplier/{name}": mu for name, mu in zip(self.bounds.names, self.multipliers, strict=True)}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"reference": self.reference, "multipliers": list(self.multipliers), "excess": list(self._excess)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.reference, self.multipliers = state["reference"], list(state["multipliers"])
+        self._excess = list(state["excess"])

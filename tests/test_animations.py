@@ -1,0 +1,80 @@
+"""Animations of turbine and tank against the numbers they are drawn from, and their shared parts."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from figure_reading import snapshot_of
+from matplotlib.figure import Figure
+from PIL import Image
+
+from rt_torchrl.envs.cryogenic_tank import animation as tank
+from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.wind_turbine import animation as turbine
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.figures.animation import RATE, Trace, save_scene, shown_samples
+
+
+@pytest.fixture(scope="module")
+def blowing():
+    plant = WindTurbine(horizon=10.0)
+    return snapshot_of(plant, plant.make_closure(torch.Generator().manual_seed(0)), shift=0.1)
+
+
+@pytest.fixture(scope="module")
+def boiling():
+    return snapshot_of(CryogenicTank(horizon=600.0), ConstantCoefficients.true(), shift=1.0)
+
+
+@pytest.mark.parametrize(("scene", "snapshot"), [(turbine, "blowing"), (tank, "boiling")])
+def test_it_has_a_frame_for_each_interval(scene, snapshot, tmp_path, request):
+    path = scene.save_animation(request.getfixturevalue(snapshot), tmp_path / "last.gif")
+    with Image.open(path) as animation:
+        assert animation.n_frames == 20 and animation.info["duration"] == 1000 / RATE
+        first = np.asarray(animation.convert("RGB"))
+        animation.seek(19)
+        assert (np.asarray(animation.convert("RGB")) != first).any()
+
+
+def test_the_rotor_shows_wind_and_pitch_and_turns_with_its_speed(blowing):
+    scene, record = turbine._Scene(blowing), blowing.record
+    angles = []
+    for k in (7, 8):
+        scene.show(k)
+        tip = scene.blades[0].get_xy()[2:4].mean(0) - [0.0, turbine.HUB]
+        assert math.hypot(*tip) == pytest.approx(turbine.TIP)
+        angles.append(math.atan2(*tip))
+    speed = record.states[8, 0].item() / WindTurbine.rated_rotor_speed
+    assert abs(angles[1] - angles[0]) == pytest.approx(math.radians(turbine.TURN * speed))
+    assert scene.note.get_text() == f"wind {record.exogenous[8, 0]:.1f} m/s"
+    line, end = scene.traces[1].moving
+    assert np.array_equal(line.get_ydata(), 97.0 * record.states[:9, 0].numpy())
+    assert end.get_xdata().tolist() == [4.0]
+
+
+def test_the_level_is_that_of_a_sphere(boiling):
+    for height in (-1.0, -0.3, 0.0, 0.5, 1.0):
+        assert tank.level(0.25 * (1.0 + height) ** 2 * (2.0 - height)) == pytest.approx(height, abs=1e-4)
+    scene = tank._Scene(boiling)
+    scene.show(5)
+    surface = scene.liquid.get_xy()[:, 1].max()
+    assert surface == pytest.approx(tank.level(boiling.record.states[5, 1].item() / 60.0), abs=1e-9)
+    assert f"load {boiling.record.exogenous[5, 0]:.0f} W" in scene.note.get_text()
+
+
+def test_frames_are_spread_over_the_samples():
+    assert shown_samples(3) == [0, 1, 2]
+    many = shown_samples(1200)
+    assert len(many) == 125 and many[0] == 0 and many[-1] == 1199
+
+
+def test_a_trace_keeps_its_axes_and_another_format_is_refused(blowing, tmp_path):
+    ax = Figure().subplots()
+    trace = Trace(ax, np.arange(4.0), np.array([0.0, 9.0, 1.0, 2.0]), "x [m]")
+    limits = ax.get_ylim()
+    trace.show(0)
+    assert ax.get_ylim() == limits and trace.moving[0].get_ydata().tolist() == [0.0]
+    with pytest.raises(ValueError, match=r"must end in '\.gif'"):
+        save_scene(turbine._Scene(blowing), 20, tmp_path / "last.mp4")

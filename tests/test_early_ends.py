@@ -1,0 +1,271 @@
+"""Episodes that end early: their costs and gradients, what a real one leaves in the memories, and whole trainings.
+
+The oracle is a loop over the plant's own step that stops where the rod lies on the ground, and sums of costs by hand.
+"""
+
+import dataclasses
+
+import pytest
+import torch
+from falling_plant import Falling
+from linear_quadratic import LinearClosure, LinearGain
+from printed_commands import blocks
+from small_runs import SMALL
+from test_real_system import MILLIMETRES, Rig, connected
+
+from rt_torchrl import DigitalTwin, PlannerConfig, PlantEnv, ReinforcementTwinning, check_plant
+from rt_torchrl.evaluation.real_episodes import RealEpisodes
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.figures import figures_of
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.optimal_control.command_cost import CommandCost
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.runs.operated import operation_of
+from rt_torchrl.runs.results import episode_record
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory, continued, control_cost
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
+
+WEAK, STRONG = [[0.1, 0.1]], [[4.0, 2.5]]
+
+
+def drawn(plant, count=6, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+
+
+def by_hand(plant, policy, state, inputs):
+    """Number of intervals flown and J_a of one episode."""
+    total = 0.0
+    for k, z in enumerate(inputs):
+        t, action = torch.tensor(k * plant.dt).double(), policy(state)
+        total += plant.running_cost(t, state, action, z).item()
+        state = plant.step(t, state, action, z, plant.closure).state
+        if abs(state[0]) > plant.reach:
+            return k + 1, (total + (len(inputs) - k - 1) * plant.end_cost) / len(inputs)
+    return len(inputs), (total + 0.5 * state[0].item() ** 2 / plant.dt) / len(inputs)
+
+
+@pytest.mark.parametrize("engine", ["native", "parallel", "autograd"])
+@pytest.mark.parametrize("gain", [WEAK, STRONG])
+def test_the_cost_of_an_episode_that_ends_is_the_sum_by_hand(engine, gain):
+    plant, policy = Falling(), LinearGain(gain)
+    start, inputs = drawn(plant)
+    found = [by_hand(plant, policy, *episode) for episode in zip(start, inputs, strict=True)]
+    assert all(n < plant.n_steps for n, _ in found) == (gain is WEAK)
+    rollout = Rollout(plant, plant.closure, policy, engine=engine)
+    expected = torch.tensor([cost for _, cost in found], dtype=torch.float64)
+    # Rounding of fifty sums.
+    torch.testing.assert_close(rollout.costs(start, inputs).detach(), expected, rtol=1e-10, atol=0.0)
+    flown = rollout(start, inputs)
+    torch.testing.assert_close(control_cost(plant, flown).detach(), expected, rtol=1e-10, atol=0.0)
+    for states, (n, _) in zip(flown.states, found, strict=True):
+        assert (states[n:] == states[n]).all()
+
+
+@pytest.mark.parametrize("engine", ["native", "autograd"])
+def test_the_gradient_is_that_of_the_same_end(engine):
+    """Between two weights whose episodes end after the same numbers of intervals, the cost is smooth."""
+    plant, policy = Falling(), LinearGain(WEAK)
+    start, inputs = drawn(plant)
+    rollout = Rollout(plant, plant.closure, policy, engine=engine)
+    rollout.costs(start, inputs).mean().backward()
+    step = 1e-5
+    for k in range(2):
+        ends = []
+        for sign in (1.0, -1.0):
+            other = LinearGain(WEAK)
+            other.gain.data[0, k] += sign * step
+            each = [by_hand(plant, other, *episode) for episode in zip(start, inputs, strict=True)]
+            ends.append(([n for n, _ in each], sum(cost for _, cost in each) / len(each)))
+        (n_up, up), (n_down, down) = ends
+        assert n_up == n_down
+        # Central differences with a step of 1e-5.
+        assert policy.gain.grad[0, k].item() == pytest.approx((up - down) / (2 * step), rel=1e-6)
+
+
+def test_an_engine_that_integrates_the_field_is_refused():
+    plant = Falling()
+    with pytest.raises(ValueError, match=r"odeint_adjoint.*'falling' has episodes that end early; use native"):
+        Rollout(plant, plant.closure, LinearGain(WEAK), engine="odeint_adjoint")
+    with pytest.raises(ValueError, match="may end early, which optimal commands do not consider"):
+        CommandCost(plant, plant.closure)
+
+
+def test_a_replay_goes_on_where_the_record_does():
+    plant = Falling()
+    start, inputs = drawn(plant)
+    pushed = torch.full((*inputs.shape[:2], 1), 2.0, dtype=torch.float64)
+    states = Rollout(plant, plant.closure)(start, inputs, pushed).states
+    assert states[:, -1, 0].abs().min() > 2.0 * plant.reach
+
+
+def actor_of(plant, policy):
+    live = LivePolicy(plant, policy, ExplorationConfig(), generator=torch.Generator().manual_seed(0))
+    live.begin(policy, strength=0.0)
+    return live
+
+
+def test_both_collectors_fly_the_same_episode_to_its_end():
+    plant, policy = Falling(), LinearGain(WEAK)
+    one, other = (
+        kind(env, actor_of(plant, policy), *rest).rollout()
+        for kind, env, rest in (
+            (FlightCollector, PlantEnv(plant, seed=1), ()),
+            (EpisodeCollector, PlantEnv(plant, seed=1), (plant,)),
+        )
+    )
+    assert one.shape == other.shape and one.shape[1] < plant.n_steps
+    assert one["next", "terminated"].flatten().tolist() == [False] * (one.shape[1] - 1) + [True]
+    ends = [("next", key) for key in ("reward", "done", "terminated", "truncated")]
+    for key in ("state", "observation", "action", *ends):
+        # Machine code rounds differently.
+        torch.testing.assert_close(one[key], other[key], rtol=1e-12, atol=1e-12)
+
+
+def test_sums_of_rewards_end_with_the_known_value_of_the_end():
+    plant = Falling()
+    config = LearnerConfig(return_steps=4, discount=0.9, reward_scale=0.5, critic_hidden=(8,), batch_size=8)
+    learner = make_learner(plant, LinearGain(WEAK), config, generator=torch.Generator().manual_seed(0))
+    assert isinstance(learner, DDPG)
+    episode = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, LinearGain(WEAK)), plant).rollout()[0]
+    found, n = learner.transitions(episode), len(episode)
+    rewards = episode["next", "reward"].flatten().tolist()
+    after = [-plant.end_cost] * 3000  # 0.9 to this power is zero
+    assert len(found) == n
+    for k in range(n):
+        ends = k + 4 >= n
+        ahead = [*rewards[k:], *after] if ends else rewards[k : k + 4]
+        summed = 0.5 * sum(0.9**j * reward for j, reward in enumerate(ahead))
+        assert found["next", "reward"][k].item() == pytest.approx(summed, rel=1e-9)
+        assert found["next", "terminated"][k].item() == ends
+        if ends:  # nothing is bootstrapped
+            q = learner.critic(found["observation"][k : k + 1], found["action"][k : k + 1]).item()
+            assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
+
+
+def test_a_learner_that_needs_the_horizon_is_refused():
+    config = LearnerConfig(algorithm="incremental_td3")
+    with pytest.raises(ValueError, match="'falling' may end early; use ddpg or td3"):
+        make_learner(Falling(), LinearGain(WEAK), config, generator=torch.Generator().manual_seed(0))
+
+
+def algorithm(env, plant, config=SMALL, closure=None):
+    generator = torch.Generator().manual_seed(0)
+    twin = DigitalTwin(plant, plant.make_closure(generator) if closure is None else closure)
+    policies = {role: LinearGain(WEAK) for role in ("model_free", "model_based")}
+    return ReinforcementTwinning(env, twin, **policies, config=config, generator=generator)
+
+
+def test_a_right_twin_foretells_the_cost_of_an_episode_that_ended():
+    plant = Falling(noise=0.0)  # no input has to be continued
+    quiet = dataclasses.replace(SMALL, exploration=ExplorationConfig(spread=0.0))
+    found = algorithm(PlantEnv(plant, seed=1), plant, quiet, LinearClosure(plant.true_closure))
+    found.interact()
+    assert len(found.short_term[-1].actions) < plant.n_steps
+    (difference,) = found.track_record.differences(found.virtual).values
+    assert difference == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("system", [pytest.param("simulation", marks=pytest.mark.slow), "real"])
+def test_a_training_learns_from_episodes_of_unequal_length(system):
+    plant = Falling(noise=0.01)
+    config = dataclasses.replace(
+        SMALL,
+        records=2,
+        assimilation=AssimilationConfig(iterations=20, inputs="record", method="levenberg_marquardt"),
+        planner=PlannerConfig(iterations=30, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+    )
+    env = PlantEnv(plant, seed=1) if system == "simulation" else connected(plant, rig=Rig(plant, seed=1))
+    found = algorithm(env, plant, config)
+    reports = [found.episode()]
+    if system == "simulation":
+        snapshot = Snapshot.take(
+            found, plant.make_closure(torch.Generator().manual_seed(0)), [episode_record(reports[0], episode=0)]
+        )
+        n = len(found.short_term[-1].actions)
+        assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
+        assert {"states", "actions", "exogenous"} <= figures_of(snapshot).keys()
+    reports += [found.episode() for _ in range(4)]
+    lengths = [len(flown.trajectory.actions) for flown in found.track_record._flown]
+    first = reports[0]
+    assert lengths[0] == first["ended_after"] < plant.n_steps and len(set(lengths)) > 1
+    record, n = found.track_record._flown[0].trajectory, lengths[0]
+    t = plant.dt * torch.arange(n).double()
+    running = plant.running_cost(t, record.states[:-1], record.actions, record.exogenous).sum()
+    expected = (running + (plant.n_steps - n) * plant.end_cost) / plant.n_steps
+    assert first["real_cost"].item() == pytest.approx(expected.item(), rel=1e-9)
+    # Records of unequal length, without noise of sensors, say all of four weights.
+    torch.testing.assert_close(found.twin.closure.matrix, torch.tensor(plant.true_closure).double(), rtol=0, atol=1e-4)
+    assert "ended_after" not in reports[-1] and reports[-1]["real_cost"] < 0.1 * first["real_cost"]
+    other = algorithm(env, plant, config)
+    other.load_state_dict(found.state_dict())
+    assert [len(record.actions) for record in other.short_term] == lengths[-2:]
+
+
+def test_real_episodes_cost_what_simulated_ones_do():
+    plant, policy = Falling(noise=0.0), LinearGain(WEAK)
+    real = RealEpisodes(connected(plant, rig=Rig(plant, seed=1)), 3)
+    flown = real.fly(policy)
+    unseen = UnseenEpisodes(plant, 3)
+    unseen.initial_state, unseen.exogenous = flown.states[:, 0], flown.exogenous
+    # Millimetres and back are rounded.
+    torch.testing.assert_close(control_cost(plant, flown), unseen.control_costs(policy), rtol=1e-9, atol=0.0)
+    assert MILLIMETRES[0] == 1e3 and (flown.states[:, -1, 0].abs() > plant.reach).all()
+
+
+def test_an_end_where_the_plant_has_none_is_refused():
+    plant = Falling()
+    plant.reach = 100.0  # so that the plant goes on
+    env = connected(plant, rig=Rig(plant, ends_after=12, terminates=True, seed=3))
+    found = algorithm(env, plant)
+    with pytest.raises(ValueError, match=r"terminated the episode after 12 of 50 .* does not end there.*end_cost"):
+        found.episode()
+
+
+def test_a_plant_that_ends_at_no_cost_is_refused():
+    class Free(Falling):
+        end_cost = None
+
+    with pytest.raises(ValueError, match=r"'falling' defines ended\(\) and no end_cost"):
+        DigitalTwin(Free(), LinearClosure(Free.true_closure))
+    with pytest.raises(ValueError, match=r"end_cost: plant 'falling' defines ended\(\) and no end_cost"):
+        check_plant(Free(), steps=5, traced=False)
+
+    class Vague(Falling):
+        def ended(self, state):
+            return state[..., :1].abs() > self.reach
+
+    with pytest.raises(ValueError, match=r"ended: returns torch.bool of shape \(5, 4, 1\)"):
+        check_plant(Vague(), steps=5, traced=False)
+
+    class Begun(Falling):
+        reach = 0.0
+
+    with pytest.raises(ValueError, match="draws initial states in which the episode has ended"):
+        PlantEnv(Begun()).reset()
+
+
+def test_windows_of_operation_are_refused(tmp_path):
+    config = RunConfig(asynchronous=True, log_dir=tmp_path, twinning=SMALL)
+    with pytest.raises(ValueError, match="'falling' may end early, which windows of operation do not"):
+        operation_of(config, PlantEnv(Falling()), None, Falling(), {}, folder=tmp_path)
+
+
+def test_the_plant_of_the_documentation_breaks_its_rod():
+    scope = {}
+    exec(compile("\n".join(blocks("real_system.md", "python")), "docs/real_system.md", "exec"), scope)
+    plant = scope["Fragile"]()
+    assert plant.ended(torch.tensor([[3.0, -7.6], [7.6, 7.4]]).double()).tolist() == [True, False]
+    start, inputs = plant.draw_initial_state(3, torch.Generator().manual_seed(0)), torch.zeros(3, 5, 0).double()
+    flown = Trajectory(torch.full((3, 6, 2), 8.0).double(), torch.zeros(3, 5, 1).double(), inputs)
+    assert control_cost(plant, flown).tolist() == [20.0] * 3 and not plant.ended(start).any()
+
+
+def test_inputs_are_continued_without_a_jump():
+    record = torch.arange(3.0).double().unsqueeze(-1)
+    assert continued(record, 8).flatten().tolist() == [0, 1, 2, 2, 1, 0, 0, 1]
