@@ -54,6 +54,10 @@ class BumplessPolicy(LivePolicy):
         super().begin(policy, strength=strength)
         self._former = self._offset = None
 
+    def begin_window(self) -> None:
+        """Begin a window of operation without a reset: the plant's clock begins anew, and all else goes on."""
+        self._intervals = 0
+
     def hand_over(self, policy: nn.Module, *, strength: float) -> None:
         """Let a policy take over in the next interval.
 

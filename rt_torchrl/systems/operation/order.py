@@ -19,6 +19,7 @@ class Order(NamedTuple):
         weights: its weights.
         strength: strength ξ of the exploration.
         episode: number of the learner's episode, which says whether weights are drawn anew.
+        found: what was found about the policy before, such as ``predicted_violations``, by name.
     """
 
     version: int
@@ -26,12 +27,20 @@ class Order(NamedTuple):
     weights: dict[str, Tensor]
     strength: float
     episode: int
+    found: dict[str, float | str] | None = None
 
     @classmethod
-    def of(cls, version: int, name: str, policy: nn.Module, *, strength: float, episode: int) -> "Order":
-        """The order of a policy as it is now; later changes of the policy do not reach it."""
+    def of(cls, version: int, name: str, policy: nn.Module, **given: Any) -> "Order":
+        """The order of a policy as it is now; later changes of the policy do not reach it.
+
+        Args:
+            version: number of the order.
+            name: name of the policy.
+            policy: the policy.
+            given: the other attributes.
+        """
         weights = {key: value.detach().clone() for key, value in policy.state_dict().items()}
-        return cls(version, name, weights, strength, episode)
+        return cls(version, name, weights, **given)
 
     def made(self, policies: dict[str, nn.Module]) -> nn.Module:
         """The policy with these weights, as a module of its own.
