@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from fault_counts import count
-from fault_victim import EPISODES, QUICK, victim
+from fault_victim import EPISODES, QUICK, SHIPPED, victim
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from tensordict.nn import TensorDictModule
@@ -40,6 +40,8 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 LATER = ("sklearn.svm", "scipy.interpolate", "torch.utils.tensorboard", "rt_torchrl.trajectories.engines.native")
 """What a training imports when it first needs it."""
 KILLS, KILLS_IN_WRITING, TERMINATIONS, DAMAGES = 40, 12, 20, 240
+KILLS_OF_A_PLANT = 2
+"""Kills of the training of each shipped plant, with and without acting while it learns."""
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +70,8 @@ def trained(tmp_path_factory, server):
     return folder, deterministic(folder), times[-1]
 
 
-def started(server, folder, options, kill_at=None):
-    process = server.Process(target=victim, args=(folder, options, kill_at))
+def started(server, folder, options, kill_at=None, plant=None):
+    process = server.Process(target=victim, args=(folder, options, kill_at, plant))
     process.start()
     return process
 
@@ -79,11 +81,11 @@ def deterministic(folder):
     return [{**record, "seconds": None} for record in load_tensors(folder / "checkpoint.pt")["episodes"]]
 
 
-def require_resumed(server, folder, trained):
+def require_resumed(server, folder, trained, options=None, plant=None):
     """The rest of the training: as if nothing had happened, to the bit, in its episodes and in its weights."""
     whole_folder, episodes, _ = trained
     begun = (folder / "config.json").exists()
-    process = started(server, folder, {"resume": begun})
+    process = started(server, folder, {"resume": begun} | (options or {}), plant=plant)
     process.join()
     assert process.exitcode == 0 and deterministic(folder) == episodes
     assert not list(folder.glob(".*.partial"))
@@ -93,16 +95,16 @@ def require_resumed(server, folder, trained):
             assert torch.equal(weight, other[role][name])
 
 
-def require_survived(server, folder, trained, number, what, stop):
+def require_survived(server, folder, trained, number, what, stop, **of):
     """A training that ``stop`` ends at a random moment loses at most the episode under way."""
     moment = random.Random(number).uniform(0.05, 1.0) * trained[2]
-    process = started(server, folder, {})
+    process = started(server, folder, of.get("options", {}), plant=of.get("plant"))
     time.sleep(moment)
     stop(process)
     process.join()
     done = len(deterministic(folder)) if (folder / "checkpoint.pt").exists() else 0
     try:
-        require_resumed(server, folder, trained)
+        require_resumed(server, folder, trained, **of)
     except BaseException:
         count(what, f"lost after {done} episodes", defect=True)
         raise
@@ -127,6 +129,32 @@ def test_a_training_that_is_stopped_goes_on_to_the_bit(server, tmp_path, trained
 @pytest.mark.parametrize("number", range(KILLS))
 def test_a_kill_at_any_moment_loses_nothing(server, tmp_path, trained, number):
     require_survived(server, tmp_path, trained, number, "SIGKILL at a random moment", kill)
+
+
+@pytest.fixture(scope="module")
+def whole_runs(tmp_path_factory, server):
+    """Trainings of the shipped plants that nothing disturbs, each made when it is first asked for."""
+    made = {}
+
+    def run(plant, options):
+        key = plant, *options
+        if key not in made:
+            folder, begin = tmp_path_factory.mktemp("-".join(key)), time.perf_counter()
+            started(server, folder, options, plant=plant).join()
+            made[key] = folder, deterministic(folder), time.perf_counter() - begin
+        return made[key]
+
+    return run
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("number", range(KILLS_OF_A_PLANT))
+@pytest.mark.parametrize("options", [{}, {"asynchronous": True}], ids=["synchronous", "asynchronous"])
+@pytest.mark.parametrize("plant", SHIPPED)
+def test_a_kill_of_a_shipped_plants_training_loses_nothing(server, tmp_path, whole_runs, plant, options, number):
+    whole = whole_runs(plant, options)
+    what = f"SIGKILL of the {'asynchronous ' if options else ''}training of {plant}"
+    require_survived(server, tmp_path, whole, 2000 + number, what, kill, options=options, plant=plant)
 
 
 @pytest.mark.faults
