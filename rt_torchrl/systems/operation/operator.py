@@ -11,7 +11,7 @@ from rt_torchrl.systems.around_system import innermost
 from rt_torchrl.systems.collectors import failure, pass_over
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.operation.handover import BumplessPolicy
-from rt_torchrl.systems.operation.order import Order
+from rt_torchrl.systems.operation.order import Order, ready
 from rt_torchrl.systems.operation.window import Window
 from rt_torchrl.systems.pace import Pace
 from rt_torchrl.systems.sound_part import report_of
@@ -76,9 +76,14 @@ class Operator:
         """Number of the order that is followed; -1 before the first."""
         return -1 if self._order is None else self._order.version
 
-    def follow(self, order: Order) -> None:
-        """Let the policy of an order take over in the next interval."""
-        policy = self.actor.exploring(order.made(self.policies), order.episode)
+    def follow(self, order: Order, made: nn.Module | None = None) -> None:
+        """Let the policy of an order take over in the next interval.
+
+        Args:
+            order: the order.
+            made: its policy, ready to act; None makes it.
+        """
+        policy = self.actor.exploring(ready(order, self.policies) if made is None else made, order.episode)
         if self._order is not None and (self.continuous or self.interval % self.length):
             self.actor.hand_over(policy, strength=order.strength)
         else:

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+
 FIRST = "first"
 """Name of the policy or state feedback that acts before the trained policies do."""
 
@@ -51,6 +53,19 @@ class Order(NamedTuple):
         found = copy.deepcopy(policies[self.name])
         found.load_state_dict(self.weights)
         return found
+
+
+def ready(order: Order, policies: dict[str, nn.Module]) -> nn.Module:
+    """The policy of an order, ready to act: state feedback has made its first plan.
+
+    Args:
+        order: the order.
+        policies: a policy of each name, whose own weights stay as they are.
+    """
+    found = order.made(policies)
+    if isinstance(found, StateFeedback):
+        found.begin()
+    return found
 
 
 class OrderBook(dict[int, Order]):
