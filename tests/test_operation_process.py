@@ -65,7 +65,7 @@ def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_
     try:
         found.hand_over("one", policies["one"], strength=0.0, episode=0)
         assert found.rollout()["version"].eq(0).all()
-        with pytest.raises(EpisodeEndedError, match=r"in interval 4, at 0.4 s: OSError: the sensor's cable is cut") as raised:
+        with pytest.raises(EpisodeEndedError, match="0.4 s: OSError: the sensor.s cable is cut") as raised:
             found.rollout()
         assert raised.value.flown.shape == (1, 4) and found.rollout().shape == (1, 10)
     finally:

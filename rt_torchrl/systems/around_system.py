@@ -5,6 +5,9 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import OTHER_UNITS
+from rt_torchrl.plants.plant import Plant
+
 
 class AroundSystem(EnvBase):
     """An environment around the system ``env``, whose attributes it has where it has none of that name.
@@ -50,3 +53,21 @@ class AroundSystem(EnvBase):
 def innermost(env: EnvBase) -> EnvBase:
     """The system within everything that stands around it."""
     return innermost(env.env) if isinstance(env, AroundSystem) else env
+
+
+def require_interval(env: EnvBase, interval: float) -> None:
+    """Refuse a control interval that is not that of a simulation.
+
+    Args:
+        env: the system; of a machine nothing is known.
+        interval: control interval [s].
+
+    Raises:
+        ValueError: if the simulated plant has another one.
+    """
+    plant = getattr(innermost(env), "plant", None)
+    if isinstance(plant, Plant) and not abs(interval - plant.dt) <= 1e-9 * plant.dt:
+        raise ValueError(
+            f"interval={interval} s must be the control interval of plant {plant.name!r}, {plant.dt:g} s; check its "
+            f"unit: {OTHER_UNITS['s']}."
+        )

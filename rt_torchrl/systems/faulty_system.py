@@ -12,7 +12,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import check_options
-from rt_torchrl.systems.around_system import AroundSystem
+from rt_torchrl.systems.around_system import AroundSystem, require_interval
 
 CLOCK = "time"
 """Entry of the clock that a faulty system reports."""
@@ -89,7 +89,8 @@ class FaultySystem(AroundSystem):
         sleep: function that waits for some time [s].
 
     Raises:
-        ValueError: if a fault names an entry or a component that the environment does not have.
+        ValueError: if a fault names an entry or a component that the environment does not have, or the interval is not
+            that of a simulation.
     """
 
     def __init__(
@@ -100,6 +101,7 @@ class FaultySystem(AroundSystem):
         interval: float,
         sleep: Callable[[float], None] = time.sleep,
     ):
+        require_interval(env, interval)
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.injections, self._interval, self._sleep = env, tuple(injections), interval, sleep
         self._episode, self._own_clock = -1, CLOCK not in env.full_observation_spec

@@ -9,6 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
@@ -27,7 +28,8 @@ class OperatingLimits:
         config: the limits.
 
     Raises:
-        ValueError: if the plant has no such state or action, or the limits leave no action of its range.
+        ValueError: if the plant has no such state or action, a limit lies beyond the signal's own range, where it would
+            limit nothing, or the limits leave no action of its range.
     """
 
     def __init__(self, plant: Plant, config: OperatingLimitsConfig):
@@ -41,6 +43,11 @@ class OperatingLimits:
                     f"{action.low:g} to {action.high:g} {action.unit}."
                 )
         _known("rates", plant.actions, config.rates)
+        for action in plant.actions:
+            if action.name in config.rates:
+                whole = (action.high - action.low) / plant.dt  # a greater one limits nothing
+                rate = config.rates[action.name]
+                require_range(f"limits.rates {action.name}", rate, 0.0, whole, unit=f"{action.unit}/s", of="the plant")
         self.rates = [config.rates.get(action.name, math.inf) for action in plant.actions]
 
     def broken(self, flown: Trajectory) -> dict[str, Bool[Tensor, "*batch n"]]:
@@ -81,6 +88,11 @@ def _ends(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     _known(what, signals, given)
     free = (-math.inf, math.inf)
+    for signal in signals:
+        for end in filter(math.isfinite, given.get(signal.name, free)):  # one beyond the signal's range limits nothing
+            require_range(
+                f"limits.{what} {signal.name}", end, signal.low, signal.high, unit=signal.unit, of="the plant"
+            )
     low, high = (tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
     return low, high
 

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.action_limits import ActionLimits, components
-from rt_torchrl.systems.around_system import AroundSystem
+from rt_torchrl.systems.around_system import AroundSystem, require_interval
 from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
 
@@ -55,8 +55,9 @@ class SafetyLayer(AroundSystem):
         clock: wall clock [s].
 
     Raises:
-        ValueError: if there is more than one system or action entry, the action is not continuous, a number does not
-            fit the actions, or ``rest`` or a constant ``fallback`` lies outside their range.
+        ValueError: if there is more than one system or action entry, the action is not continuous, the interval is not
+            that of a simulation behind it, a number does not fit the actions, or ``rest`` or a constant ``fallback``
+            lies outside their range.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class SafetyLayer(AroundSystem):
                 f"env has the action entries {list(env.action_keys)} of {env.action_spec}; a safety layer guards one "
                 "continuous entry 'action'."
             )
+        require_interval(env, config.interval)
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config = env, config
         self._clock = clock
