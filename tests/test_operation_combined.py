@@ -48,7 +48,7 @@ def without_time(records):
     return [{**record, "seconds": 0} for record in records]
 
 
-@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("continuous", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_limits_are_held_predicted_and_counted_and_go_on_after_a_stop(tmp_path, continuous):
     options = {"limits": LIMITS, "operation": OperationConfig(continuous=continuous, learning=1.4)}
     run = trained(tmp_path / "whole", episodes=4, **options)
@@ -70,13 +70,13 @@ def require_true(record):
     torch.testing.assert_close(ends, record.states[1:], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("continuous", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("injection", "kind", "kept"),
     [
-        (faulty("nan", 8), "not finite", 28),
+        pytest.param(faulty("nan", 8), "not finite", 28, marks=pytest.mark.slow),
         (faulty("frozen", 8, 12), "frozen", 24),  # known at reading 11, and wrong from the first repetition on
-        (faulty("repeated", 8), "clock", 28),
+        pytest.param(faulty("repeated", 8), "clock", 28, marks=pytest.mark.slow),
         (faulty("raises", 15), "ended", 15),
         (faulty("ends_early", 15), "ended", 15),
     ],
