@@ -135,3 +135,27 @@ def test_a_reset_that_fails_is_tried_again(tmp_path):
         other.env.hand_over("model_free", other.policies["model_free"], strength=0.0, episode=0)
         for _ in range(3):
             other.env.rollout()
+
+
+@pytest.mark.slow
+def test_model_predictive_control_acts_while_the_twin_learns_and_goes_on_after_a_stop(tmp_path):
+    from test_predictive_training import FIT, PLANNER
+
+    twinning = dataclasses.replace(SMALL, planner=PLANNER, assimilation=FIT, arm="model_based")
+    whole = trained(tmp_path / "whole", twinning=twinning).train()["episodes"]
+    trained(tmp_path / "cut", twinning=twinning, episodes=2).train()
+    resumed = trained(tmp_path / "cut", twinning=twinning, resume=True).train()["episodes"]
+    times = ("seconds", "solve_median", "solve_max")
+    for one, other in zip(whole, resumed, strict=True):
+        assert one["late_solves"] == 0.0 < one["solve_median"]
+        assert {k: v for k, v in one.items() if k not in times} == {k: v for k, v in other.items() if k not in times}
+
+
+def test_model_predictive_control_that_asks_a_critic_is_refused(tmp_path):
+    from test_predictive_training import PLANNER
+
+    planner = dataclasses.replace(
+        PLANNER, receding_horizon=dataclasses.replace(PLANNER.receding_horizon, terminal="critic")
+    )
+    with pytest.raises(ValueError, match=r"receding_horizon.terminal='critic' does not go with asynchronous"):
+        trained(tmp_path, twinning=dataclasses.replace(SMALL, planner=planner))

@@ -103,14 +103,24 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_an_argument_in_a_wrong_unit_is_refused(case):
+def require_refused(case):
     make, said, remedy = WRONG[case]
     with pytest.raises(ValueError, match=r".") as raised:
         make()
     assert str(raised.value).startswith(said) or said in str(raised.value)
     assert remedy in str(raised.value)
-    count("arguments in a wrong unit", "refused")
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_an_argument_in_a_wrong_unit_is_refused(case):
+    require_refused(case)
+
+
+@pytest.mark.faults
+def test_arguments_in_wrong_units_are_refused_and_counted():
+    for case in WRONG:
+        require_refused(case)
+        count("arguments in a wrong unit", "refused")
 
 
 def test_what_is_right_is_taken():

@@ -121,7 +121,7 @@ class Operating:
         cost = torch.stack([flight.cost for flight in flights]).mean()
         report = together(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
         report.update(findings(windows=float(len(flights)), version=float(order.version)))
-        merged(report, as_findings(order.found or {}))
+        merged(report, as_findings(order.found or {})).update(findings(**(self.operation.acted or {})))
         counted = [self.trainer.clearance.counted(flight.record) for flight in flights]
         kinds = counted[0].keys()
         report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))

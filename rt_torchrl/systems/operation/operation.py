@@ -1,5 +1,6 @@
 """What the learner sees of a system in operation, whichever clock it keeps."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from tensordict import TensorDict
@@ -18,6 +19,8 @@ class Operation(Protocol):
     """The orders that later windows may have flown, or that the last one has."""
     report: SafetyReport | None
     """What the safety layer did in the window taken last; None if there is no layer."""
+    acted: Mapping[str, float] | None
+    """Numbers about what acted at the end of that window, if it has any."""
 
     @property
     def system(self) -> EnvBase:

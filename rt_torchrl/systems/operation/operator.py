@@ -16,6 +16,7 @@ from rt_torchrl.systems.operation.window import Window
 from rt_torchrl.systems.pace import Pace
 from rt_torchrl.systems.sound_part import report_of
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
 class Operator:
@@ -132,7 +133,7 @@ class Operator:
             early = row["next", "done"].any()
             return self._ended(k + 1, str(ended_early(row["next"], k + 1, self.actor.plant))) if early else None
         self.windows += 1
-        return Window(self._window, report=report_of(self.env))
+        return Window(self._window, report=report_of(self.env), acted=self._acted())
 
     def fly(self, orders: dict[int, list[Order]]) -> Window:
         """One window, at whose intervals the orders come, by number of the interval since the operation began."""
@@ -172,7 +173,12 @@ class Operator:
         entries = None if self._window is None or not count else self._window[:, :count].clone()
         self.windows += 1
         self.interval, self._begun = self.windows * self.length, False
-        return Window(entries, why, report_of(self.env) if count else None)
+        return Window(entries, why, report_of(self.env) if count else None, self._acted() if count else None)
+
+    def _acted(self) -> dict[str, float] | None:
+        """Numbers about state feedback that acts."""
+        policy = self.actor.policy
+        return policy.report() if isinstance(policy, StateFeedback) else None
 
     def _store(self, k: int, row: TensorDictBase) -> None:
         """Copy an interval into the window, which is allocated at once because a stack at its end takes long."""

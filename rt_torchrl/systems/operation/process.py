@@ -15,6 +15,7 @@ from rt_torchrl.systems.operation.event_log import EventLog
 from rt_torchrl.systems.operation.order import Order, OrderBook
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from multiprocessing.connection import Connection
 
     from rt_torchrl.systems.operation.window import Window
@@ -60,6 +61,7 @@ class ProcessOperation:
         self._state: dict[str, Any] | None = None
         self.orders = OrderBook()
         self.report: SafetyReport | None = None
+        self.acted: Mapping[str, float] | None = None
         self._connection: Connection | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
 
@@ -138,7 +140,7 @@ class ProcessOperation:
         if kind == "failed":
             raise RuntimeError(f"the acting process has failed: {found[0]}")
         window: Window = found[0]
-        self._state, self.report = found[1], window.report
+        self._state, self.report, self.acted = found[1], window.report, window.acted
         assert self._state is not None
         flown = window.segments(self._windows * self._length)
         self.orders.forget_before(flown[0][1] if flown else self._state["order"]["version"])

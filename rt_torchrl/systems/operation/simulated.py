@@ -1,7 +1,7 @@
 """Operation on a simulated clock: one process, in which the same run repeats to the bit."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDict
@@ -53,6 +53,7 @@ class SimulatedOperation:
         self._stops = stops(replayed or ())
         self.orders = OrderBook()
         self.report: SafetyReport | None = None
+        self.acted: Mapping[str, float] | None = None
         self._at: dict[int, float] = {}
         self.version, self._now = -1, 0
 
@@ -117,6 +118,7 @@ class SimulatedOperation:
         window = self.operator.fly(coming)
         self._at = {version: at for version, at in self._at.items() if version > self.operator.version}
         self._now, self.report = max(self._now, self.operator.interval), window.report
+        self.acted = window.acted
         flown = window.segments(first)
         self.orders.forget_before(flown[0][1] if flown else self.operator.version)
         self.log.note("taken", window=self.operator.windows - 1, flown=flown)

@@ -1,5 +1,6 @@
 """A window of operation, as the acting side passes it on to the learner."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from tensordict import TensorDict
@@ -15,11 +16,13 @@ class Window(NamedTuple):
         entries: its control intervals, of batch size ``1 k``; None if there are none.
         ended: why the system did not reach the end of the window; None if it did.
         report: what the safety layer did in it; None if there is no layer.
+        acted: numbers about what acted at its end, such as the times of the solves of model predictive control.
     """
 
     entries: TensorDict | None
     ended: str | None = None
     report: SafetyReport | None = None
+    acted: Mapping[str, float] | None = None
 
     def segments(self, first: int) -> list[tuple[int, int]]:
         """The versions that acted, each with the interval in which it began to.
