@@ -43,11 +43,14 @@ class OperatingLimits:
                     f"{action.low:g} to {action.high:g} {action.unit}."
                 )
         _known("rates", plant.actions, config.rates)
-        for action in plant.actions:
-            if action.name in config.rates:
-                whole = (action.high - action.low) / plant.dt  # a greater one limits nothing
-                rate = config.rates[action.name]
-                require_range(f"limits.rates {action.name}", rate, 0.0, whole, unit=f"{action.unit}/s", of="the plant")
+        _require_range("states", plant.readings, config.states)
+        _require_range("actions", plant.actions, config.actions)
+        # A greater rate than that of the whole range in an interval limits nothing.
+        for action in (one for one in plant.actions if one.name in config.rates):
+            whole, unit = (action.high - action.low) / plant.dt, f"{action.unit}/s"
+            require_range(
+                f"limits.rates {action.name}", config.rates[action.name], 0.0, whole, unit=unit, of="the plant"
+            )
         self.rates = [config.rates.get(action.name, math.inf) for action in plant.actions]
 
     def broken(self, flown: Trajectory) -> dict[str, Bool[Tensor, "*batch n"]]:
@@ -88,13 +91,16 @@ def _ends(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     _known(what, signals, given)
     free = (-math.inf, math.inf)
-    for signal in signals:
-        for end in filter(math.isfinite, given.get(signal.name, free)):  # one beyond the signal's range limits nothing
-            require_range(
-                f"limits.{what} {signal.name}", end, signal.low, signal.high, unit=signal.unit, of="the plant"
-            )
     low, high = (tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
     return low, high
+
+
+def _require_range(what: str, signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse ends beyond the range of a signal, which limit nothing."""
+    for signal in signals:
+        for end in filter(math.isfinite, given.get(signal.name, ())):
+            name = f"limits.{what} {signal.name}"
+            require_range(name, end, signal.low, signal.high, unit=signal.unit, of="the plant")
 
 
 def _known(what: str, signals: tuple[Signal, ...], given: Mapping[str, Any]) -> None:
