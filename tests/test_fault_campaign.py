@@ -32,6 +32,9 @@ from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEMS, FaultySystem, Injection
+from rt_torchrl.systems.operation.acting import Crew
+from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.systems.sound_part import GREATEST
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -443,13 +446,14 @@ def machine(plant, kind):
     return SafetyLayer(system, config, fallback=middle, clock=lambda: float(sum(slept)))
 
 
-def require_faults_survived(name, kind):
+def require_faults_survived(name, kind, *, asynchronous=False):
     plant = PLANTS[name]()
     generator = torch.Generator().manual_seed(0)
     layer = machine(plant, kind)
     policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = DigitalTwin(plant, plant.make_closure(generator))
-    found = ReinforcementTwinning(layer, twin, **policies, config=SMALL, generator=generator)
+    system = operated(layer, plant, policies) if asynchronous else layer
+    found = ReinforcementTwinning(system, twin, **policies, config=SMALL, generator=generator)
     reports = [found.episode() for _ in range(3)]
     injected = {k for episode, k, _ in layer.injected if episode == 1}
     assert injected
@@ -468,10 +472,17 @@ def require_faults_survived(name, kind):
     assert (states.abs() < 1e8).all() and reports[2]["real_cost"].isfinite()
     # Transitions of the second episode are those of the plant under what its actuators have done.
     require_true(plant, found, kind)
+    of = "actuator" if kind in OF_ACTUATORS else "system" if kind in OF_SYSTEMS else "sensor"
     count(
-        f"{'actuator' if kind in OF_ACTUATORS else 'system' if kind in OF_SYSTEMS else 'sensor'} faults: {kind}",
+        f"{'asynchronous, ' if asynchronous else ''}{of} faults: {kind}",
         "sound part kept, training went on",
     )
+
+
+def operated(layer, plant, policies):
+    """The system in operation, in which learning takes no time, so that its second window is the second episode."""
+    crew = Crew(lambda: layer, plant, policies, SMALL.exploration, OperationConfig(), seed=1)
+    return SimulatedOperation(crew.operator(layer), learning=0)
 
 
 def require_true(plant, found, kind):
@@ -492,9 +503,10 @@ def test_a_fault_of_the_oracle_plant_is_survived(kind):
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", [*OF_SENSORS, *OF_ACTUATORS, *OF_SYSTEMS])
 @pytest.mark.parametrize("name", PLANTS)
-def test_every_fault_is_survived_on_every_plant(name, kind):
+@pytest.mark.parametrize("asynchronous", [False, True], ids=["synchronous", "asynchronous"])
+def test_every_fault_is_survived_on_every_plant(name, kind, asynchronous):
     try:
-        require_faults_survived(name, kind)
+        require_faults_survived(name, kind, asynchronous=asynchronous)
     except BaseException:
         count(f"faults of the system: {kind}", "failed", defect=True)
         raise
