@@ -30,7 +30,7 @@ from rt_torchrl import (
     require_device,
 )
 from rt_torchrl.envs.wind_turbine.costs import EngineeringCost, PaperCost
-from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
+from rt_torchrl.envs.wind_turbine.disturbances import STORM, KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -85,8 +85,6 @@ NEURAL = dataclasses.replace(
 
 OBSERVED = {"paper": "paper", "bias": "paper", "scheduled": "scheduled", "mlp": "measured+wind"}
 """What each kind of policy observes by default."""
-STORM = 120.0
-"""Wind speed above all that has been measured at the height of a rotor [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,6 +117,48 @@ def require_number(name: str, value: Any, *, whole: bool = False, finite: bool =
     _check(name, value, int if whole else float, finite=finite)
 
 
+OTHER_UNITS = {
+    "-": "16 % is 0.16",
+    "s": "1 ms is 0.001 s, 1 h is 3600 s",
+    "m": "1 mm is 0.001 m",
+    "m³": "1 L is 0.001 m³",
+    "m/s": "1 km/h is 0.278 m/s",
+    "kg": "1 g is 0.001 kg",
+    "K": "0 °C is 273.15 K, 1 mK is 0.001 K",
+    "Pa": "1 kPa is 1000 Pa",
+    "W": "1 kW is 1000 W, 1 mW is 0.001 W",
+    "N m": "1 kN m is 1000 N m",
+    "N m/s": "1 kN m/s is 1000 N m/s",
+    "rad": "1 deg is 0.0175 rad",
+    "deg": "1 rad is 57.3 deg",
+    "rad/s": "1 rpm is 0.105 rad/s, 1 deg/s is 0.0175 rad/s",
+    "deg/s": "1 rad/s is 57.3 deg/s",
+}
+"""For a unit, what others are in it."""
+
+
+def require_range(name: str, value: float, least: float, greatest: float, *, unit: str, of: str) -> None:
+    """Refuse a number beyond what is physically possible, which in most cases is in another unit.
+
+    Args:
+        name: name of the argument, for the message.
+        value: value of the argument.
+        least: least possible value.
+        greatest: greatest possible value.
+        unit: unit of the argument.
+        of: what has the argument.
+
+    Raises:
+        ValueError: if the value lies outside, or is NaN.
+    """
+    require_number(name, value, finite=False)
+    if not least <= value <= greatest:
+        raise ValueError(
+            f"{name}={value:g} {unit} of {of} must lie in {least:g} to {greatest:g} {unit}; check its unit"
+            f"{f': {OTHER_UNITS[unit]}' if unit in OTHER_UNITS else ''}."
+        )
+
+
 def array_of(name: str, values: Any) -> np.ndarray:
     """The values as an array in double precision.
 

@@ -1,17 +1,43 @@
 """A training in a process of its own, which a test of faults stops."""
 
 import contextlib
+import functools
 import os
 import signal
 from pathlib import Path
 
-from small_runs import small_run
+from small_runs import SMALL, small_run
+
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.valves import PIValve
+from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
 
 EPISODES = 5
 QUICK = {"figures": False, "untrained": 0}
+SHIPPED = {
+    "wind_turbine": (lambda: WindTurbine(horizon=30.0), JonkmanController),
+    "flapping_wing": (lambda: FlappingWing(dt=0.002, horizon=0.12), TrimmedPD),
+    "cryogenic_tank": (lambda: CryogenicTank(horizon=1800.0), PIValve),
+    "pendulum": (lambda: Pendulum(horizon=3.0), None),
+}
+"""The shipped plants with short episodes, each with the controller that the training begins with."""
 
 
-def victim(folder, options, kill_at=None):
+def shipped_run(name, folder, **options):
+    """A training on a shipped plant that takes seconds."""
+    make_plant, controller = SHIPPED[name]
+    start = "random" if controller is None else "controller"
+    shared = {"episodes": EPISODES, "unseen": 2, "start": start, "threads": 1, "twinning": SMALL}
+    return Run(RunConfig(log_dir=folder, **shared | QUICK | options), make_plant(), first=controller)
+
+
+def victim(folder, options, kill_at=None, plant=None):
     """A training in a process of its own; with ``kill_at`` it kills itself in its so manieth renaming of a file."""
     if folder is None:
         return
@@ -26,4 +52,5 @@ def victim(folder, options, kill_at=None):
 
             Path.replace = mortal
         with contextlib.suppress(SystemExit, KeyboardInterrupt):
-            small_run(folder, episodes=EPISODES, **QUICK, **options).train()
+            run = small_run if plant is None else functools.partial(shipped_run, plant)
+            run(folder, **{"episodes": EPISODES} | QUICK | options).train()

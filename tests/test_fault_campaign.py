@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from fault_counts import count
-from fault_victim import EPISODES, QUICK, victim
+from fault_victim import EPISODES, QUICK, SHIPPED, victim
 from linear_quadratic import LinearQuadratic
 from small_runs import SMALL, small_run
 from tensordict.nn import TensorDictModule
@@ -32,6 +32,9 @@ from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.faulty_system import OF_ACTUATORS, OF_SENSORS, OF_SYSTEMS, FaultySystem, Injection
+from rt_torchrl.systems.operation.acting import Crew
+from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.systems.sound_part import GREATEST
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -40,6 +43,8 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 LATER = ("sklearn.svm", "scipy.interpolate", "torch.utils.tensorboard", "rt_torchrl.trajectories.engines.native")
 """What a training imports when it first needs it."""
 KILLS, KILLS_IN_WRITING, TERMINATIONS, DAMAGES = 40, 12, 20, 240
+KILLS_OF_A_PLANT = 2
+"""Kills of the training of each shipped plant, with and without acting while it learns."""
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +73,8 @@ def trained(tmp_path_factory, server):
     return folder, deterministic(folder), times[-1]
 
 
-def started(server, folder, options, kill_at=None):
-    process = server.Process(target=victim, args=(folder, options, kill_at))
+def started(server, folder, options, kill_at=None, plant=None):
+    process = server.Process(target=victim, args=(folder, options, kill_at, plant))
     process.start()
     return process
 
@@ -79,11 +84,11 @@ def deterministic(folder):
     return [{**record, "seconds": None} for record in load_tensors(folder / "checkpoint.pt")["episodes"]]
 
 
-def require_resumed(server, folder, trained):
+def require_resumed(server, folder, trained, options=None, plant=None):
     """The rest of the training: as if nothing had happened, to the bit, in its episodes and in its weights."""
     whole_folder, episodes, _ = trained
     begun = (folder / "config.json").exists()
-    process = started(server, folder, {"resume": begun})
+    process = started(server, folder, {"resume": begun} | (options or {}), plant=plant)
     process.join()
     assert process.exitcode == 0 and deterministic(folder) == episodes
     assert not list(folder.glob(".*.partial"))
@@ -93,16 +98,16 @@ def require_resumed(server, folder, trained):
             assert torch.equal(weight, other[role][name])
 
 
-def require_survived(server, folder, trained, number, what, stop):
+def require_survived(server, folder, trained, number, what, stop, **of):
     """A training that ``stop`` ends at a random moment loses at most the episode under way."""
     moment = random.Random(number).uniform(0.05, 1.0) * trained[2]
-    process = started(server, folder, {})
+    process = started(server, folder, of.get("options", {}), plant=of.get("plant"))
     time.sleep(moment)
     stop(process)
     process.join()
     done = len(deterministic(folder)) if (folder / "checkpoint.pt").exists() else 0
     try:
-        require_resumed(server, folder, trained)
+        require_resumed(server, folder, trained, **of)
     except BaseException:
         count(what, f"lost after {done} episodes", defect=True)
         raise
@@ -127,6 +132,32 @@ def test_a_training_that_is_stopped_goes_on_to_the_bit(server, tmp_path, trained
 @pytest.mark.parametrize("number", range(KILLS))
 def test_a_kill_at_any_moment_loses_nothing(server, tmp_path, trained, number):
     require_survived(server, tmp_path, trained, number, "SIGKILL at a random moment", kill)
+
+
+@pytest.fixture(scope="module")
+def whole_runs(tmp_path_factory, server):
+    """Trainings of the shipped plants that nothing disturbs, each made when it is first asked for."""
+    made = {}
+
+    def run(plant, options):
+        key = plant, *options
+        if key not in made:
+            folder, begin = tmp_path_factory.mktemp("-".join(key)), time.perf_counter()
+            started(server, folder, options, plant=plant).join()
+            made[key] = folder, deterministic(folder), time.perf_counter() - begin
+        return made[key]
+
+    return run
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("number", range(KILLS_OF_A_PLANT))
+@pytest.mark.parametrize("options", [{}, {"asynchronous": True}], ids=["synchronous", "asynchronous"])
+@pytest.mark.parametrize("plant", SHIPPED)
+def test_a_kill_of_a_shipped_plants_training_loses_nothing(server, tmp_path, whole_runs, plant, options, number):
+    whole = whole_runs(plant, options)
+    what = f"SIGKILL of the {'asynchronous ' if options else ''}training of {plant}"
+    require_survived(server, tmp_path, whole, 2000 + number, what, kill, options=options, plant=plant)
 
 
 @pytest.mark.faults
@@ -415,13 +446,14 @@ def machine(plant, kind):
     return SafetyLayer(system, config, fallback=middle, clock=lambda: float(sum(slept)))
 
 
-def require_faults_survived(name, kind):
+def require_faults_survived(name, kind, *, asynchronous=False):
     plant = PLANTS[name]()
     generator = torch.Generator().manual_seed(0)
     layer = machine(plant, kind)
     policies = {role: plant.make_policy(generator) for role in ("model_based", "model_free")}
     twin = DigitalTwin(plant, plant.make_closure(generator))
-    found = ReinforcementTwinning(layer, twin, **policies, config=SMALL, generator=generator)
+    system = operated(layer, plant, policies) if asynchronous else layer
+    found = ReinforcementTwinning(system, twin, **policies, config=SMALL, generator=generator)
     reports = [found.episode() for _ in range(3)]
     injected = {k for episode, k, _ in layer.injected if episode == 1}
     assert injected
@@ -440,10 +472,17 @@ def require_faults_survived(name, kind):
     assert (states.abs() < 1e8).all() and reports[2]["real_cost"].isfinite()
     # Transitions of the second episode are those of the plant under what its actuators have done.
     require_true(plant, found, kind)
+    of = "actuator" if kind in OF_ACTUATORS else "system" if kind in OF_SYSTEMS else "sensor"
     count(
-        f"{'actuator' if kind in OF_ACTUATORS else 'system' if kind in OF_SYSTEMS else 'sensor'} faults: {kind}",
+        f"{'asynchronous, ' if asynchronous else ''}{of} faults: {kind}",
         "sound part kept, training went on",
     )
+
+
+def operated(layer, plant, policies):
+    """The system in operation, in which learning takes no time, so that its second window is the second episode."""
+    crew = Crew(lambda: layer, plant, policies, SMALL.exploration, OperationConfig(), seed=1)
+    return SimulatedOperation(crew.operator(layer), learning=0)
 
 
 def require_true(plant, found, kind):
@@ -464,9 +503,10 @@ def test_a_fault_of_the_oracle_plant_is_survived(kind):
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", [*OF_SENSORS, *OF_ACTUATORS, *OF_SYSTEMS])
 @pytest.mark.parametrize("name", PLANTS)
-def test_every_fault_is_survived_on_every_plant(name, kind):
+@pytest.mark.parametrize("asynchronous", [False, True], ids=["synchronous", "asynchronous"])
+def test_every_fault_is_survived_on_every_plant(name, kind, asynchronous):
     try:
-        require_faults_survived(name, kind)
+        require_faults_survived(name, kind, asynchronous=asynchronous)
     except BaseException:
         count(f"faults of the system: {kind}", "failed", defect=True)
         raise

@@ -194,3 +194,12 @@ def test_a_run_without_a_controller_cannot_begin_with_one(tmp_path):
     with pytest.raises(ValueError, match=r"start='controller' needs the controller: give Run\(..., first=...\)"):
         Run(config, LinearQuadratic(horizon=2.0))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_was_killed_in_its_first_episode_begins_with_the_controller_again(tmp_path):
+    killed = run(tmp_path, start="controller")
+    killed._held.begin(killed.config)
+    killed._held.release()
+    again = run(tmp_path, start="controller", resume=True)
+    assert isinstance(again.algorithm.first, FirstController)
+    again._held.release()

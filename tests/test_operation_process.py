@@ -1,7 +1,5 @@
 """An operation in a process of its own, with true clocks, and whole runs of it."""
 
-import json
-
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -11,7 +9,9 @@ from test_operation import QUIET, Constant
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.config import OperationConfig
+from rt_torchrl.systems.operation.event_log import read_events
 from rt_torchrl.systems.operation.process import ProcessOperation
+from rt_torchrl.systems.sound_part import EpisodeEndedError
 
 PLANT = LinearQuadratic(horizon=1.0)
 
@@ -60,27 +60,29 @@ def test_a_policy_takes_over_in_the_other_process_without_a_bump():
 
 
 @pytest.mark.slow
-def test_an_error_of_the_real_system_reaches_the_learner():
+def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_on():
     found, policies = operation(breaking)
     try:
         found.hand_over("one", policies["one"], strength=0.0, episode=0)
         assert found.rollout()["version"].eq(0).all()
-        with pytest.raises(RuntimeError, match="the acting process has failed: OSError: the sensor's cable is cut"):
+        with pytest.raises(EpisodeEndedError, match="0.4 s: OSError: the sensor.s cable is cut") as raised:
             found.rollout()
+        assert raised.value.flown.shape == (1, 4) and found.rollout().shape == (1, 10)
     finally:
         found.close()
 
 
 @pytest.mark.slow
 def test_a_run_on_the_wall_clock_repeats_from_its_log_to_the_bit(tmp_path):
-    wall = OperationConfig(clock="wall", speed=20.0, core=-2)
-    run = small_run(tmp_path / "wall", asynchronous=True, operation=wall, threads=1)
-    first = run.train()
+    """Also where it was stopped and went on."""
+    wall = {"asynchronous": True, "operation": OperationConfig(clock="wall", speed=20.0, core=-2), "threads": 1}
+    small_run(tmp_path / "wall", episodes=2, **wall).train()
+    first = small_run(tmp_path / "wall", resume=True, **wall).train()
     replay = OperationConfig(replay=tmp_path / "wall" / "events.jsonl")
     again = small_run(tmp_path / "again", asynchronous=True, operation=replay, threads=1).train()
     kept = (tmp_path / name / "events.jsonl" for name in ("wall", "again"))
-    taken = [[line for line in path.read_text().splitlines() if "taken" in line] for path in kept]
-    assert taken[0] == taken[1] and json.loads(taken[0][0])["window"] == 0
+    one, other = ([event for event in read_events(path) if event["event"] == "taken"] for path in kept)
+    assert one == other and "resumed" in (tmp_path / "wall" / "events.jsonl").read_text()
     for one, other in zip(first["episodes"], again["episodes"], strict=True):
         own = {key for key in one if key == "seconds" or key.startswith("late")}
         assert {key: value for key, value in one.items() if key not in own} == {

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.envs.cryogenic_tank.vent import valve_conductance
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.cost import RunningCost, require_weights
 
 if TYPE_CHECKING:
@@ -67,11 +68,21 @@ class PressureCost:
         return self.end * ((state[..., 2] - plant.set_point) / plant.error_unit) ** 2
 
 
+SIZES = (
+    (1e-6, 20.0, "K"),
+    (1e-6, 10.0, "m³"),
+    (10.0, 1e6, "Pa"),
+)
+"""Errors of a tank of 60 m³ at 80 to 900 kPa: least and greatest one, and unit."""
+
+
 def require_sizes(sizes: tuple[float, float, float]) -> None:
     """Refuse errors of T_s [K], V_l [m³] and p [Pa] that weigh the same but have no size.
 
     Raises:
-        ValueError: if one is not positive or not finite.
+        ValueError: if one is not positive, or one that this tank cannot have.
     """
     if not all(0.0 < size < math.inf for size in sizes):
         raise ValueError(f"error_sizes={sizes} (K, m³, Pa) must be positive and finite.")
+    for size, (least, greatest, unit) in zip(sizes, SIZES, strict=True):
+        require_range("error_sizes", size, least, greatest, unit=unit, of="the tank")

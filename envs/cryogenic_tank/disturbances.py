@@ -8,7 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.disturbance import require_request
+
+LOWEST = 600.0
+"""Time that no orbit takes: one close to the ground of the Earth takes 5060 s [s]."""
 
 
 @runtime_checkable
@@ -65,6 +69,10 @@ class CyclicLoad:
                 raise ValueError(f"{name}={value} s of CyclicLoad must be positive and finite.")
         if not 0.0 <= self.variation <= 1.0:
             raise ValueError(f"variation={self.variation} of CyclicLoad must be in [0, 1], a fraction of the peak.")
+        for name in ("minimum", "peak", "noise"):
+            require_range(name, getattr(self, name), 0.0, 1e5, unit="W", of="CyclicLoad")
+        for name, least in (("period", LOWEST), ("width", 1.0)):
+            require_range(name, getattr(self, name), least, 1e7, unit="s", of="CyclicLoad")
 
     @property
     def mean(self) -> float:

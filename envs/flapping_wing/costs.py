@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.cost import RunningCost, require_weights
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ HOVER_AMPLITUDE = 77.2
 """Flapping amplitude A_0 that carries the weight in calm air [deg]."""
 STROKE_PLANE_RATE = 1000.0
 """Unit of the rate of the stroke plane [deg/s]."""
+SLOWEST = 60.0
+"""Rate with which the stroke plane takes a second for its whole range; a flight takes five [deg/s]."""
 
 
 def needs_memory(cost: RunningCost) -> bool:
@@ -85,7 +88,10 @@ def require_rate(rate: float | None) -> None:
     """Refuse a greatest rate of the stroke plane that is none.
 
     Raises:
-        ValueError: if the rate [deg/s] is not positive.
+        ValueError: if the rate [deg/s] is not positive, or below ``SLOWEST``.
     """
     if rate is not None and not (rate > 0.0 and math.isfinite(rate)):
         raise ValueError(f"stroke_plane_rate={rate} deg/s must be positive and finite; None means no limit.")
+    if rate is not None:
+        name, of = "stroke_plane_rate", "the drone"
+        require_range(name, rate, SLOWEST, math.inf, unit="deg/s", of=of)

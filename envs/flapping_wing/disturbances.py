@@ -8,7 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.disturbance import require_request
+
+GREATEST = 30.0
+"""Speed of a wind in which no drone flies [m/s]."""
 
 
 @runtime_checkable
@@ -66,6 +70,10 @@ class GaussianGust:
             raise ValueError(f"std={self.std} m/s of GaussianGust must be zero or above; zero is a steady wind.")
         if not (math.isfinite(self.time_scale) and self.time_scale > 0):
             raise ValueError(f"time_scale={self.time_scale} s of GaussianGust must be positive and finite.")
+        of = "GaussianGust"
+        require_range("mean", self.mean, -GREATEST, GREATEST, unit="m/s", of=of)
+        require_range("std", self.std, 0.0, GREATEST, unit="m/s", of=of)
+        require_range("time_scale", self.time_scale, 0.01, 3600.0, unit="s", of=of)
 
     def covariance(self, lag: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """κ(τ) [(m/s)²] at a time lag τ [s]."""

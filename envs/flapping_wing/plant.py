@@ -16,11 +16,15 @@ from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
 from rt_torchrl.envs.flapping_wing.suspects import suspects
 from rt_torchrl.envs.flapping_wing.wings import Wings
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.cost import RunningCost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.stability import require_stable_step
+
+MASSES = (1e-5, 0.05)
+"""Masses of which the lightest has a thousandth, and the heaviest ten times the weight that the wings carry [kg]."""
 
 
 class FlappingWing(Plant):
@@ -67,8 +71,8 @@ class FlappingWing(Plant):
             low-passed positions are two more states, the last ones, if one of these needs them.
 
     Raises:
-        ValueError: for a mass or rate that is not positive, a target that is not finite, an unknown measurement, or a
-            step that is unstable or does not resolve the wing beat.
+        ValueError: for a mass, rate or target that a drone of this kind cannot have, an unknown measurement, or a step
+            that is unstable or does not resolve the wing beat.
     """
 
     name = "flapping_wing"
@@ -111,10 +115,9 @@ class FlappingWing(Plant):
     ):
         polar = QuasiSteadyPolar.true() if closure is None else closure
         super().__init__(dt=dt, horizon=horizon, closure=polar, observe=observe)
-        if not all(math.isfinite(coordinate) for coordinate in target):
-            raise ValueError(f"target={target} m must be finite.")
-        if not (math.isfinite(mass) and mass > 0):
-            raise ValueError(f"mass={mass} kg of plant {self.name!r} must be positive and finite.")
+        for coordinate in target:
+            require_range("target", coordinate, -1e3, 1e3, unit="m", of="the drone")
+        require_range("mass", mass, *MASSES, unit="kg", of="the drone")
         self.wind = GaussianGust() if wind is None else wind
         self.cost = TrackingCost() if cost is None else cost
         require_rate(stroke_plane_rate)

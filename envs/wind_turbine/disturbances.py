@@ -11,10 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.disturbance import require_request
 
 CUT_IN_SPEED = 3.0
 """Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""
+STORM = 120.0
+"""Wind speed above all that has been measured at the height of a rotor [m/s]."""
 
 
 @runtime_checkable
@@ -75,6 +78,10 @@ class KaimalWind:
             raise ValueError(
                 f"intensity={self.intensity} of KaimalWind must be a fraction such as 0.16, zero or above."
             )
+        of = "KaimalWind"
+        require_range("mean", self.mean, 0.0, STORM, unit="m/s", of=of)
+        require_range("intensity", self.intensity, 0.0, 1.0, unit="-", of=of)
+        require_range("length_scale", self.length_scale, 1.0, 1e4, unit="m", of=of)
         if not self.floor < self.mean:
             raise ValueError(
                 f"floor={self.floor} m/s of KaimalWind must be below the mean wind {self.mean} m/s; "
@@ -156,6 +163,7 @@ class RecordedWind:
             raise ValueError("records of RecordedWind is empty; pass at least one, for example from read_wind(path).")
         if not self.floor < math.inf:
             raise ValueError(f"floor={self.floor} m/s of RecordedWind must be a speed, or -math.inf for none.")
+        require_range("floor", self.floor, -math.inf, STORM, unit="m/s", of="RecordedWind")
 
     @property
     def mean(self) -> float:

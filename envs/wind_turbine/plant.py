@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine import measurements as sensors
 from rt_torchrl.envs.wind_turbine import merit as judgement
+from rt_torchrl.envs.wind_turbine.actuators import require_rates
 from rt_torchrl.envs.wind_turbine.completion import completed, started
 from rt_torchrl.envs.wind_turbine.costs import PaperCost
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
@@ -116,8 +117,7 @@ class WindTurbine(Plant):
             self.controller_states = tuple(signal.name for signal in self.states[1:])
         if not inertia > 0:
             raise ValueError(f"inertia={inertia} kg m² must be positive.")
-        if rate_limits is not None and not min(rate_limits) > 0:
-            raise ValueError(f"rate_limits={rate_limits} (N m/s, deg/s) must be positive; None means ideal actuators.")
+        require_rates(self.actions, rate_limits)
         self.wind = KaimalWind() if wind is None else wind
         self.inertia, self.cost = inertia, PaperCost() if cost is None else cost
         self.best_power_coefficient, self.best_tip_speed_ratio, _ = table.maximum()

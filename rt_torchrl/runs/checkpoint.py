@@ -10,6 +10,8 @@ from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.runs.tensor_file import DamagedFileError, load_tensors, save_tensors
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 
+NAME = "checkpoint.pt"
+"""File of the newest checkpoint in a run folder."""
 FORMAT = 4
 NUMBERED = re.compile(r".+-(?P<episodes>[0-9]+)\.\w+")
 """Name of an earlier checkpoint."""

@@ -52,16 +52,21 @@ def operation_of(
         folder: run folder, for the log of the events.
 
     Raises:
-        ValueError: if episodes of the plant may end early; the wall clock is asked for and there is no function that
-            makes the real system, the device is not the CPU, or what acts cannot be sent to another process; or the
-            events to be replayed cannot be read.
+        ValueError: if episodes of the plant may end early; if model predictive control is to ask the critic, or the
+            events to be replayed cannot be read; on the wall clock, if there is no function that makes the real system,
+            the device is not the CPU, or what acts cannot be sent to another process.
     """
     if plant.end_cost is not None:
         raise ValueError(
             f"episodes of plant {plant.name!r} may end early, which windows of operation do not; leave out "
             "--asynchronous."
         )
-    options = config.operation
+    options, planner = config.operation, config.twinning.planner
+    if planner.method == "receding_horizon" and planner.receding_horizon.terminal == "critic":
+        raise ValueError(
+            "twinning.planner.receding_horizon.terminal='critic' does not go with asynchronous: the critic goes on "
+            "learning while the controller acts. Use terminal plant."
+        )
     crew = Crew(
         make_env or (lambda: env),
         plant,

@@ -110,7 +110,7 @@ class RunFolder:
     @property
     def checkpoint(self) -> Path:
         """Path of the newest checkpoint, whether or not it exists yet."""
-        return self.path / "checkpoint.pt"
+        return self.path / checkpoint.NAME
 
     def resumes(self) -> bool:
         """Whether to go on from a checkpoint; a run that has none yet starts from its beginning."""

@@ -16,6 +16,7 @@ from rt_torchrl.identification.sensor_log import READERS, Column, checked, read_
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, RunConfig
@@ -31,7 +32,9 @@ MakesStart = Callable[[Plant, nn.Module], Start | None]
 
 
 def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalController] | None) -> MakesStart:
-    """Read and check what ``config.start`` names. A resumed run has begun already, so that nothing is read for it.
+    """Read and check what ``config.start`` names.
+
+    A run that goes on from a checkpoint has begun already, so that nothing is read for it.
 
     Args:
         config: options of the run.
@@ -45,7 +48,8 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         ValueError: if there is no such source, or it does not fit the run.
     """
     name = config.start
-    if config.resume or name == "random":
+    begun = config.resume and config.log_dir is not None and checkpoint.exists(config.log_dir / checkpoint.NAME)
+    if begun or name == "random":
         return lambda physics, closure: None
     if name == "controller":
         if controller is None:

@@ -90,7 +90,7 @@ class EpisodeCollector:
         except DivergenceError:
             raise
         except Exception as error:  # whatever a machine, its driver or its connection may raise
-            raise EpisodeEndedError(f"the system failed in its reset: {_said(error)}", None) from error
+            raise EpisodeEndedError(failure(error, plant), None) from error
         for k in range(plant.n_steps):
             asked = self._actor(now)
             try:
@@ -98,8 +98,7 @@ class EpisodeCollector:
             except DivergenceError:
                 raise
             except Exception as error:
-                said = f"the system failed in interval {k}, at {k * plant.dt:g} s: {_said(error)}"
-                raise EpisodeEndedError(said, together(flown)) from error
+                raise EpisodeEndedError(failure(error, plant, k), together(flown)) from error
             flown.append(stepped.copy())
             if terminated(stepped["next"], plant):
                 break
@@ -119,8 +118,17 @@ def together(flown: list[TensorDictBase]) -> TensorDictBase | None:
     return torch.stack(flown, 1) if flown else None
 
 
-def _said(error: Exception) -> str:
-    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+def failure(error: Exception, plant: Plant, interval: int | None = None) -> str:
+    """What a machine, its driver or its connection has raised, in words.
+
+    Args:
+        error: what it has raised.
+        plant: plant that gives the control interval.
+        interval: number of the control interval in the episode; None for a reset.
+    """
+    where = "in its reset" if interval is None else f"in interval {interval}, at {interval * plant.dt:g} s"
+    said = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return f"the system failed {where}: {said}"
 
 
 class FlightCollector:

@@ -77,7 +77,7 @@ class PlantEnv(EnvBase):
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
         self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
-        self._goes_on = False
+        self._has_state = False
         declare_specs(self, plant)
 
     @property
@@ -91,16 +91,16 @@ class PlantEnv(EnvBase):
             self._sensors.manual_seed(seed + 1)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Everything that the next reset depends on."""
+        """Everything that the next reset depends on, and the state in which the system goes on without one."""
         generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
         found = generators | {"episodes": self._episodes}
-        return found | {"state": self._state} if self._goes_on else found
+        return found | {"state": self._state} if self._has_state else found
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self._generator.set_state(state["generator"])
         self._sensors.set_state(state["sensors"])
-        self._episodes, self._goes_on = state["episodes"], "state" in state
-        if self._goes_on:
+        self._episodes, self._has_state = state["episodes"], "state" in state
+        if self._has_state:
             self._state = state["state"].to(self.device)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
@@ -123,6 +123,7 @@ class PlantEnv(EnvBase):
         if self.plant.ended(state).any():
             raise ValueError(f"plant {self.plant.name!r} draws initial states in which the episode has ended.")
         self._goes_on = False
+        self._has_state = True
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():
             self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
@@ -149,7 +150,6 @@ class PlantEnv(EnvBase):
         batch = self.batch_size[0]
         self._exogenous = self.plant.draw_exogenous(batch, self._generator)
         self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)
-        self._goes_on = True
         return self._begun()
 
     def begin_episode(self) -> nn.Module:

@@ -12,7 +12,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import check_options
-from rt_torchrl.systems.around_system import AroundSystem
+from rt_torchrl.systems.around_system import AroundSystem, require_interval
 
 CLOCK = "time"
 """Entry of the clock that a faulty system reports."""
@@ -89,7 +89,8 @@ class FaultySystem(AroundSystem):
         sleep: function that waits for some time [s].
 
     Raises:
-        ValueError: if a fault names an entry or a component that the environment does not have.
+        ValueError: if a fault names an entry or a component that the environment does not have, or the interval is not
+            that of a simulation.
     """
 
     def __init__(
@@ -100,10 +101,14 @@ class FaultySystem(AroundSystem):
         interval: float,
         sleep: Callable[[float], None] = time.sleep,
     ):
+        require_interval(env, interval)
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.injections, self._interval, self._sleep = env, tuple(injections), interval, sleep
         self._episode, self._own_clock = -1, CLOCK not in env.full_observation_spec
-        self._begin()
+        self._count = self._since = 0
+        self._offset = 0.0
+        self._held: dict[Injection, Tensor] = {}
+        self._sent: Tensor | None = None
         self.action_spec, self.reward_spec = env.action_spec.clone(), env.reward_spec.clone()
         self.done_spec = env.full_done_spec.clone()
         observation = env.full_observation_spec.clone()
@@ -126,32 +131,36 @@ class FaultySystem(AroundSystem):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         asked = None if tensordict is None or "_reset" not in tensordict else tensordict.select("_reset")
         found = self.env.reset(asked, **kwargs).exclude("_reset")
-        self._begin()
+        self._count, self._since, self._offset, self._held, self._sent = 0, 0, 0.0, {}, None
         self._clocked(found)
         self._reading = found.clone()
         return found
 
-    def _begin(self) -> None:
-        self._count, self._offset = 0, 0.0
-        self._held: dict[Injection, Tensor] = {}
-        self._sent: Tensor | None = None
+    def _count_window(self) -> None:
+        self._count, self._held = 0, {}
+
+    def _gone_on(self, found: TensorDictBase) -> TensorDictBase:
+        self._clocked(found)
+        found[CLOCK] = found[CLOCK] + self._offset
+        self._reading = found.clone()
+        return found
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._episode += self._count == 0
         active = [one for one in self.injections if one.acts(self._episode, self._count)]
         self.injected += [(self._episode, self._count, one.kind) for one in active]
         if any(one.kind == "raises" for one in active):
-            self._count += 1
+            self._count, self._since = self._count + 1, self._since + 1
             raise ConnectionError("no answer (injected)")
         action = self._acted(tensordict["action"], active)
         found = self.env.step(tensordict.exclude("next").set("action", action))["next"].copy()
-        self._count += 1
+        self._count, self._since = self._count + 1, self._since + 1
         self._clocked(found)
         return self._read(found, active)
 
     def _clocked(self, found: TensorDictBase) -> None:
         if self._own_clock:
-            clock = torch.full((*self.batch_size, 1), self._count * self._interval, dtype=torch.float64)
+            clock = torch.full((*self.batch_size, 1), self._since * self._interval, dtype=torch.float64)
             found[CLOCK] = clock.to(found.device)
 
     def _acted(self, asked: Tensor, active: Sequence[Injection]) -> Tensor:

@@ -9,6 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from rt_torchrl.options import require_range
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
@@ -27,7 +28,8 @@ class OperatingLimits:
         config: the limits.
 
     Raises:
-        ValueError: if the plant has no such state or action, or the limits leave no action of its range.
+        ValueError: if the plant has no such state or action, a limit lies beyond the signal's own range, where it would
+            limit nothing, or the limits leave no action of its range.
     """
 
     def __init__(self, plant: Plant, config: OperatingLimitsConfig):
@@ -41,6 +43,14 @@ class OperatingLimits:
                     f"{action.low:g} to {action.high:g} {action.unit}."
                 )
         _known("rates", plant.actions, config.rates)
+        _require_range("states", plant.readings, config.states)
+        _require_range("actions", plant.actions, config.actions)
+        # A greater rate than that of the whole range in an interval limits nothing.
+        for action in (one for one in plant.actions if one.name in config.rates):
+            whole, unit = (action.high - action.low) / plant.dt, f"{action.unit}/s"
+            require_range(
+                f"limits.rates {action.name}", config.rates[action.name], 0.0, whole, unit=unit, of="the plant"
+            )
         self.rates = [config.rates.get(action.name, math.inf) for action in plant.actions]
 
     def broken(self, flown: Trajectory) -> dict[str, Bool[Tensor, "*batch n"]]:
@@ -83,6 +93,14 @@ def _ends(
     free = (-math.inf, math.inf)
     low, high = (tuple(given.get(signal.name, free)[end] for signal in signals) for end in (0, 1))
     return low, high
+
+
+def _require_range(what: str, signals: tuple[Signal, ...], given: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse ends beyond the range of a signal, which limit nothing."""
+    for signal in signals:
+        for end in filter(math.isfinite, given.get(signal.name, ())):
+            name = f"limits.{what} {signal.name}"
+            require_range(name, end, signal.low, signal.high, unit=signal.unit, of="the plant")
 
 
 def _known(what: str, signals: tuple[Signal, ...], given: Mapping[str, Any]) -> None:

@@ -12,6 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.systems.around_system import AroundSystem, innermost
 from rt_torchrl.systems.environment import declare_specs, ended_early
 from rt_torchrl.systems.reading import Actuation, Reading, in_units, require_numbers
 
@@ -183,7 +184,14 @@ class RealSystem(EnvBase):
         return getattr(self.env, "pace", None)
 
     def go_on(self) -> TensorDictBase:
-        """Begin the next window of operation without a reset: the present report is its first one, and t is 0 again."""
+        """Begin the next window of operation without a reset: the present report is its first one, and t is 0 again.
+
+        A simulation in the place of a machine is told of it, so that it does not end the episode.
+        """
+        if hasattr(innermost(self.env), "go_on"):
+            self._reported = self.env.go_on()
+        elif isinstance(self.env, AroundSystem):
+            self.env.begin_window()
         self._step_count = 0
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
         return self._entries(applied, ended=False)

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.action_limits import ActionLimits, components
-from rt_torchrl.systems.around_system import AroundSystem
+from rt_torchrl.systems.around_system import AroundSystem, require_interval
 from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
 
@@ -55,8 +55,9 @@ class SafetyLayer(AroundSystem):
         clock: wall clock [s].
 
     Raises:
-        ValueError: if there is more than one system or action entry, the action is not continuous, a number does not
-            fit the actions, or ``rest`` or a constant ``fallback`` lies outside their range.
+        ValueError: if there is more than one system or action entry, the action is not continuous, the interval is not
+            that of a simulation behind it, a number does not fit the actions, or ``rest`` or a constant ``fallback``
+            lies outside their range.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class SafetyLayer(AroundSystem):
                 f"env has the action entries {list(env.action_keys)} of {env.action_spec}; a safety layer guards one "
                 "continuous entry 'action'."
             )
+        require_interval(env, config.interval)
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config = env, config
         self._clock = clock
@@ -137,11 +139,24 @@ class SafetyLayer(AroundSystem):
         if faults:
             read = {key: found[key].flatten().tolist() for key in self._watched if key in found}
             raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
-        self._step_count, self._last, self._good = 0, self._rest, {}
+        self._step_count, self._passed, self._last, self._good = 0, 0, self._rest, {}
         self._remember(found)
         if "applied" not in found:
             found["applied"] = self.action_spec.zero() if self._rest is None else self._rest.clone()
-        found["tripped"], found["refused"] = self._flag(False), self._flag(False)
+        self._found = self._flag(False), self._flag(False)
+        found["tripped"], found["refused"] = self._found
+        found["truncated"] = found.get("truncated", self._flag(False))
+        return found
+
+    def _count_window(self) -> None:
+        self._passed, self._step_count = self._passed + self._step_count, 0
+
+    def _gone_on(self, found: TensorDictBase) -> TensorDictBase:
+        """The present reading once more; what the layer has found in it, its limits and its watchdog go on."""
+        found = self._remember(found.copy())
+        if "applied" not in found:
+            found["applied"] = self.action_spec.zero() if self._last is None else self._last.clone()
+        found["tripped"], found["refused"] = self._found[0].clone(), self._found[1].clone()
         found["truncated"] = found.get("truncated", self._flag(False))
         return found
 
@@ -150,7 +165,8 @@ class SafetyLayer(AroundSystem):
         if self._step_count == 0:
             # The report begins with the first step, because a reset need not be followed by a step.
             self.reports.append(SafetyReport())
-        t, end = (self.config.interval * k for k in (self._step_count, self._step_count + 1))
+        past = self._passed + self._step_count
+        t, end = (self.config.interval * k for k in (past, past + 1))
         asked = tensordict["action"]
         applied, reasons = self._chosen(t, tensordict)
         start = self._clock()
@@ -162,6 +178,7 @@ class SafetyLayer(AroundSystem):
             found["applied"] = applied.clone()
         found["tripped"] = self._flag(self.watchdog.tripped(end))
         found["refused"] = self._flag(not WRONG.isdisjoint(faults))
+        self._found = found["tripped"], found["refused"]
         if found["refused"].any():
             first = max(0, self._step_count - self.watchdog.samples.stale)
             self.report.wrong.update(range(first, self._step_count + 1))
@@ -170,7 +187,7 @@ class SafetyLayer(AroundSystem):
         if self.watchdog.exhausted(end):
             reasons["truncated"] = f"tripped for {self.watchdog.patience:g} s"
             found["truncated"], found["done"] = self._flag(True), self._flag(True)
-        self._note(t, reasons, asked, applied)
+        self._note(reasons, asked, applied)
         self._last, self._step_count = applied, self._step_count + 1
         return found
 
@@ -213,10 +230,11 @@ class SafetyLayer(AroundSystem):
             found[key] = self._good[key]
         return found
 
-    def _note(self, t: float, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
+    def _note(self, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
         if not reasons:
             return
         flat = (value.flatten().tolist() for value in (asked, applied))
+        t = self._step_count * self.config.interval
         event = SafetyEvent(len(self.reports) - 1, self._step_count, t, reasons, *flat)
         self.report.events.append(event)
         self.report.counts.update(reasons.keys())

@@ -87,6 +87,8 @@ def sound_part(episode: TensorDictBase, plant: Plant, report: SafetyReport | Non
     faults = _reported(report) + faults
     wrong = refused | overflow
     wrong[1:] |= refused[:-1]  # what is read at the end of an interval is the start of the next one
+    if "refused" in episode.keys():  # noqa: SIM118
+        wrong[:1] |= episode["refused"][:1].flatten().cpu()  # of the window before, where nothing was reset
     said = []
     if refused.any():
         at = refused.nonzero().flatten().tolist()

@@ -1,5 +1,6 @@
 """The report of an episode: scalars by name, the policy that acted, the event, and the reasons for refusals."""
 
+from collections.abc import Mapping
 from functools import partial
 
 import torch
@@ -18,6 +19,21 @@ def findings(*reasons: str, **values: float | Tensor) -> TensorDict:
     double = partial(torch.as_tensor, dtype=torch.float64, device="cpu")
     report = TensorDict({key: double(value).detach() for key, value in values.items()})
     return report.set_non_tensor("reason", "; ".join(reasons)) if reasons else report
+
+
+def plain(report: TensorDict) -> dict[str, float | str]:
+    """The entries of a report as numbers and texts."""
+    entries = {key: report[key] for key in report.keys()}  # noqa: SIM118  (a TensorDict iterates over its batch)
+    return {key: value if isinstance(value, str) else float(value) for key, value in entries.items()}
+
+
+def as_findings(entries: Mapping[str, float | str]) -> TensorDict:
+    """The report of which :func:`plain` has made these entries."""
+    texts = {key: value for key, value in entries.items() if isinstance(value, str)}
+    report = findings(**{key: value for key, value in entries.items() if not isinstance(value, str)})
+    for key, text in texts.items():
+        report.set_non_tensor(key, text)
+    return report
 
 
 def merged(report: TensorDict, other: TensorDict) -> TensorDict:

@@ -64,6 +64,11 @@ class Flight(NamedTuple):
         first = round(float(self.record.start) / dt)
         return sorted([(first, self.transitions), *self.others], key=lambda part: part[0])
 
+    @property
+    def sound_intervals(self) -> int:
+        """Number of control intervals that are learned from."""
+        return sum(map(len, (self.transitions, *(part for _, part in self.others))))
+
     def report(self) -> TensorDict:
         """The cost, the faults, and how often and why the episode was flown again."""
         found = findings(real_cost=self.cost, reward=-self.cost)
@@ -78,8 +83,17 @@ class Flight(NamedTuple):
         if self.ended:
             found.update(findings(ended_after=float(len(self.transitions))))
         if not self.whole:
-            found.update(findings(sound_intervals=float(sum(len(part) for _, part in self.parts(1.0)))))
+            found.update(findings(sound_intervals=float(self.sound_intervals)))
         return found
+
+
+def together(flights: Sequence[Flight]) -> TensorDict:
+    """The report of the flights of one episode of the algorithm, with the faults of all of them."""
+    refused, faults = ([each for flight in flights for each in getattr(flight, name)] for name in ("refused", "faults"))
+    report = flights[-1]._replace(refused=refused, faults=faults).report()
+    if not all(flight.whole for flight in flights):
+        report.update(findings(sound_intervals=float(sum(flight.sound_intervals for flight in flights))))
+    return report
 
 
 class RealFlights:
@@ -159,7 +173,8 @@ class RealFlights:
                 fault = Fault("ended", 0, 0.0, str(error))
                 return None, SoundPart([], [fault], str(error), whole=False), error
             episode = flown[0]
-        found = sound_part(episode, self.plant, report_of(self.env))
+        report = self.env.report if isinstance(self.env, Operation) else report_of(self.env)
+        found = sound_part(episode, self.plant, report)
         if ended is None:
             return episode, found, None
         n = len(episode)

@@ -10,8 +10,8 @@ from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.operation.order import FIRST, Order
 from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.findings import findings, merged
-from rt_torchrl.twinning.flight import Flight, RealFlights
+from rt_torchrl.twinning.findings import as_findings, findings, merged, plain
+from rt_torchrl.twinning.flight import Flight, RealFlights, together
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import TrackRecord
@@ -54,7 +54,6 @@ class Operating:
 
     def __init__(self, operation: Operation, trainer: Trainer):
         self.operation, self.trainer, self._exploration = operation, trainer, trainer.config.exploration
-        self._cleared = findings()
 
     def fly_first(self, teacher: nn.Module) -> Flight:
         """One window under what the training begins with, which then acts on until the first policy takes over."""
@@ -69,9 +68,9 @@ class Operating:
             episode: number of the learner's episode, from 0.
         """
         self.trainer.learning.adopt(self.trainer.policies[role])
-        policy, role, self._cleared = self.trainer.clearance.choose(role, self.trainer.judged)
+        policy, role, report = self.trainer.clearance.choose(role, self.trainer.judged)
         strength = self._exploration.strength(episode)
-        self.operation.hand_over(role, policy, strength=strength, episode=episode)
+        self.operation.hand_over(role, policy, strength=strength, episode=episode, found=plain(report))
 
     def take(self, live: Role, episode: int) -> TensorDict:
         """Take every window that has come in; wait until one is of a policy.
@@ -87,7 +86,7 @@ class Operating:
             self.hand_over(live, 0)
         flights, policy_flew = list[Flight](), False
         while not policy_flew or self.operation.waiting():
-            if flights and self.trainer.config.arm != "model_free":
+            if flights and flights[-1].whole and self.trainer.config.arm != "model_free":
                 self.trainer.virtual.learn(flights[-1].record)  # step 3 fits the last one
             flight = self._taken()
             self.trainer.keep(flight)
@@ -118,11 +117,14 @@ class Operating:
             self.trainer.learning.flown(self.trainer.policies[role], cost)
 
     def _report(self, flights: list[Flight]) -> TensorDict:
-        last, order = flights[-1], self._order_of(flights[-1])
+        order = self._order_of(flights[-1])
         cost = torch.stack([flight.cost for flight in flights]).mean()
-        report = last.report().update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
+        report = together(flights).update(findings(real_cost=cost, reward=-cost, exploration=order.strength))
         report.update(findings(windows=float(len(flights)), version=float(order.version)))
-        merged(merged(report, self._cleared), self.trainer.clearance.counted(last.record))
+        merged(report, as_findings(order.found or {})).update(findings(**(self.operation.acted or {})))
+        counted = [self.trainer.clearance.counted(flight.record) for flight in flights]
+        kinds = counted[0].keys()
+        report.update(findings(**{kind: sum(float(each[kind]) for each in counted) for kind in kinds}))
         late = torch.cat([flight.transitions["late"].flatten() for flight in flights])
         if late.any():
             period = 1e3 * late

@@ -19,10 +19,12 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operation.config import OperationConfig
-from rt_torchrl.systems.operation.cores import act_on
+from rt_torchrl.systems.operation.cores import act_on, behind_others
 from rt_torchrl.systems.operation.handover import BumplessPolicy
 from rt_torchrl.systems.operation.operator import Operator
+from rt_torchrl.systems.operation.order import ready
 from rt_torchrl.systems.pace import Pace
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 SWITCH = 2e-4
 """Time for which a thread keeps Python's lock while the control loop waits for it [s]."""
@@ -68,7 +70,8 @@ class Crew:
 def act(connection: Connection, parts: bytes, state: bytes | None, core: int | None, realtime: bool) -> None:
     """Operate the real system until the learner says stop or has gone; the main function of the acting process.
 
-    Two threads talk to the learner, so that the control loop never waits for it.
+    Two threads talk to the learner, so that the control loop never waits for it. The one that receives an order also
+    makes its policy and, of state feedback, the first plan: the machine code of a first one takes seconds.
 
     Args:
         connection: connection to the learner.
@@ -84,10 +87,10 @@ def act(connection: Connection, parts: bytes, state: bytes | None, core: int | N
     orders: SimpleQueue[Any] = SimpleQueue()
     windows: SimpleQueue[Any] = SimpleQueue()
     sender = threading.Thread(target=_send, args=(connection, windows), daemon=True)
-    threading.Thread(target=_receive, args=(connection, orders), daemon=True).start()
     sender.start()
     try:
         crew: Crew = pickle.loads(parts)
+        threading.Thread(target=_receive, args=(connection, orders, crew.policies, realtime), daemon=True).start()
         _operate(crew, None if state is None else pickle.loads(state), orders, windows)
     except BaseException as error:  # any error goes to the learner, because nobody sees this one
         windows.put(("failed", f"{type(error).__name__}: {error}", traceback.format_exc()))
@@ -100,18 +103,18 @@ def _operate(crew: Crew, state: dict[str, Any] | None, orders: SimpleQueue[Any],
     try:
         if state is not None:
             operator.load_state_dict(state)
-        order = orders.get()
+        order = _sound(orders.get())
         gc.collect()
         gc.freeze()  # a collection of all objects that the libraries have made would stop an action
         while order != STOP:
             if order is not None:
-                operator.follow(order)
+                operator.follow(*order)
             window = operator.step()
             if window is not None:
                 windows.put(("window", window, operator.state_dict()))
             order = _next(orders)
             while order is not None and order != STOP and not orders.empty():
-                operator.follow(order)
+                operator.follow(*order)
                 order = _next(orders)
     finally:
         gc.unfreeze()  # otherwise libraries report at the end of the process what nobody has freed
@@ -120,17 +123,32 @@ def _operate(crew: Crew, state: dict[str, Any] | None, orders: SimpleQueue[Any],
 
 def _next(orders: SimpleQueue[Any]) -> Any:
     try:
-        return orders.get_nowait()
+        return _sound(orders.get_nowait())
     except Empty:
         return None
 
 
-def _receive(connection: Connection, orders: SimpleQueue[Any]) -> None:
+def _sound(found: Any) -> Any:
+    """What the receiving thread has put into the queue, or raise its error."""
+    if isinstance(found, Exception):
+        raise found
+    return found
+
+
+def _receive(connection: Connection, orders: SimpleQueue[Any], policies: dict[str, nn.Module], realtime: bool) -> None:
     try:
         while True:
-            orders.put(pickle.loads(connection.recv_bytes()))
+            found = pickle.loads(connection.recv_bytes())
+            if found == STOP:
+                orders.put(STOP)
+                continue
+            # A policy is made in less than a millisecond, and state feedback with its first plan in seconds.
+            with behind_others(realtime=realtime and isinstance(policies[found.name], StateFeedback)):
+                orders.put((found, ready(found, policies)))
     except (EOFError, OSError):
         orders.put(STOP)  # a learner that has gone
+    except Exception as error:  # such as a model that diverges under every first plan
+        orders.put(error)
 
 
 def _send(connection: Connection, windows: SimpleQueue[Any]) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 LAST, ANY = -1, -2
@@ -75,3 +76,20 @@ def run_on(cores: set[int] | None) -> None:
     for thread in [int(task.name) for task in tasks.iterdir()] if tasks.is_dir() else [0]:
         with contextlib.suppress(ProcessLookupError):  # a thread that has ended since
             os.sched_setaffinity(thread, cores)
+
+
+@contextlib.contextmanager
+def behind_others(*, realtime: bool) -> Iterator[None]:
+    """Let this thread run behind those that run before all others, for as long as it does what takes long.
+
+    Args:
+        realtime: whether this process runs before all others.
+    """
+    if not realtime:
+        yield
+        return
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))

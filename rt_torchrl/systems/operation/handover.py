@@ -6,7 +6,6 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
 class BumplessPolicy(LivePolicy):
@@ -54,17 +53,19 @@ class BumplessPolicy(LivePolicy):
         super().begin(policy, strength=strength)
         self._former = self._offset = None
 
+    def begin_window(self) -> None:
+        """Begin a window of operation without a reset: the plant's clock begins anew, and all else goes on."""
+        self._intervals = 0
+
     def hand_over(self, policy: nn.Module, *, strength: float) -> None:
         """Let a policy take over in the next interval.
 
         Args:
-            policy: the new policy; a module of its own, because the old one is asked once more.
+            policy: the new policy, ready to act; a module of its own, because the old one is asked once more.
             strength: strength ξ of the exploration from now on.
         """
         self._former = self._former or self.policy
         self.policy, self.strength = policy, strength
-        if isinstance(policy, StateFeedback):
-            policy.begin()
 
     def commanded(
         self, policy: nn.Module, observation: Tensor, state: Tensor | None, exogenous: Tensor | None

@@ -1,5 +1,6 @@
 """What the learner sees of a system in operation, whichever clock it keeps."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from tensordict import TensorDict
@@ -7,6 +8,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.operation.order import OrderBook
+from rt_torchrl.systems.safety_report import SafetyReport
 
 
 @runtime_checkable
@@ -15,6 +17,10 @@ class Operation(Protocol):
 
     orders: OrderBook
     """The orders that later windows may have flown, or that the last one has."""
+    report: SafetyReport | None
+    """What the safety layer did in the window taken last; None if there is no layer."""
+    acted: Mapping[str, float] | None
+    """Numbers about what acted at the end of that window, if it has any."""
 
     @property
     def system(self) -> EnvBase:
@@ -32,7 +38,15 @@ class Operation(Protocol):
     def version(self) -> int:
         """Number of the latest order; -1 before the first."""
 
-    def hand_over(self, name: str, policy: nn.Module, *, strength: float, episode: int) -> None:
+    def hand_over(
+        self,
+        name: str,
+        policy: nn.Module,
+        *,
+        strength: float,
+        episode: int,
+        found: dict[str, float | str] | None = None,
+    ) -> None:
         """Hand a policy over, which takes over while the system operates.
 
         Args:
@@ -40,10 +54,15 @@ class Operation(Protocol):
             policy: the policy, as it is now.
             strength: strength ξ of the exploration.
             episode: number of the learner's episode.
+            found: what was found about the policy before, by name.
         """
 
     def rollout(self) -> TensorDict:
-        """The oldest window that has not been taken yet, of batch size ``1 n``; waits for it if necessary."""
+        """The oldest window that has not been taken yet, of batch size ``1 n``; waits for it if necessary.
+
+        Raises:
+            EpisodeEndedError: if the system failed in that window, or ended it; it holds the intervals before.
+        """
 
     def waiting(self) -> bool:
         """Whether a further window has come in already."""
@@ -56,15 +75,3 @@ class Operation(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of an operation that was built with the same arguments."""
-
-
-def segments_of(window: TensorDict, first: int) -> list[tuple[int, int]]:
-    """The versions that acted in a window, each with the interval in which it began to.
-
-    Args:
-        window: window of batch size ``1 n``.
-        first: number of its first interval since the operation began.
-    """
-    versions = window["version"].flatten().tolist()
-    starts = [k for k in range(len(versions)) if k == 0 or versions[k] != versions[k - 1]]
-    return [(first + k, versions[k]) for k in starts]

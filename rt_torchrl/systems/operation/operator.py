@@ -7,11 +7,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.collectors import pass_over
+from rt_torchrl.systems.around_system import innermost
+from rt_torchrl.systems.collectors import failure, pass_over
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.operation.handover import BumplessPolicy
-from rt_torchrl.systems.operation.order import Order
+from rt_torchrl.systems.operation.order import Order, ready
+from rt_torchrl.systems.operation.window import Window
 from rt_torchrl.systems.pace import Pace
+from rt_torchrl.systems.sound_part import report_of
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
 class Operator:
@@ -23,6 +28,9 @@ class Operator:
 
     A window holds the entries of an episode and, for each interval, ``version``, the number of the order that acted,
     and ``late``, by how much the interval began after it was due [s].
+
+    A window in which the system fails ends there, and the next one begins with a reset. A reset that fails is a window
+    without intervals; where there is a pace, it is tried again in each period, and reported once in a window's length.
 
     Args:
         env: the real system, of batch size 1.
@@ -45,15 +53,15 @@ class Operator:
         continuous: bool = False,
         pace: Pace | None = None,
     ):
-        if continuous and not hasattr(env, "go_on"):
+        if continuous and not hasattr(innermost(env), "go_on"):
             raise ValueError(
                 f"continuous operation needs a system that goes on without a reset, a PlantEnv or a RealSystem; "
-                f"{type(env).__name__} has no method go_on()."
+                f"{type(innermost(env)).__name__} has no method go_on()."
             )
         self.env, self.actor, self.policies = env, actor, policies
         self.continuous, self._own_pace = continuous, pace
         self.pace: Pace | None = getattr(env, "pace", None) if pace is None else pace
-        self.interval, self.windows = 0, 0
+        self.interval, self.windows, self._failed_resets = 0, 0, 0
         self._order: Order | None = None
         self._begun = False
         self._window: TensorDict | None = None
@@ -64,9 +72,19 @@ class Operator:
         """Number of control intervals of a window."""
         return int(self.actor.plant.n_steps)
 
-    def follow(self, order: Order) -> None:
-        """Let the policy of an order take over in the next interval."""
-        policy = self.actor.exploring(order.made(self.policies), order.episode)
+    @property
+    def version(self) -> int:
+        """Number of the order that is followed; -1 before the first."""
+        return -1 if self._order is None else self._order.version
+
+    def follow(self, order: Order, made: nn.Module | None = None) -> None:
+        """Let the policy of an order take over in the next interval.
+
+        Args:
+            order: the order.
+            made: its policy, ready to act; None makes it.
+        """
+        policy = self.actor.exploring(ready(order, self.policies) if made is None else made, order.episode)
         if self._order is not None and (self.continuous or self.interval % self.length):
             self.actor.hand_over(policy, strength=order.strength)
         else:
@@ -74,36 +92,50 @@ class Operator:
         self._order = order
 
     @torch.no_grad()
-    def step(self) -> TensorDict | None:
+    def step(self) -> Window | None:
         """Act for one control interval.
 
         Returns:
-            The window that ends with this interval, of batch size ``1 n``; None within a window.
+            The window that ends with this interval; None within a window.
 
         Raises:
-            ValueError: if there is no order yet, or the system ends a window before its end.
+            ValueError: if there is no order yet.
+            DivergenceError: if the system is a simulation that diverges.
         """
         if self._order is None:
             raise ValueError("nothing acts yet: give the operator its first order.")
         k = self.interval % self.length
         if k == 0:
-            self._begin()
-        assert self._row is not None
+            try:
+                self._begin()
+            except DivergenceError:
+                raise
+            except Exception as error:  # whatever a machine, its driver or its connection may raise
+                return self._not_begun(error)
         if self._own_pace is not None:
             self._own_pace.wait()
+        return self._interval(k)
+
+    def _interval(self, k: int) -> Window | None:
+        """Act in interval k of the window that has begun."""
+        assert self._row is not None
         row = self._row.set("action", self.actor(self._row["observation"], self._row["state"], self._row["exogenous"]))
-        row = self.env.step(row)
-        self._store(k, row)
+        try:
+            row = self.env.step(row)
+            self._store(k, row)
+        except DivergenceError:
+            raise
+        except Exception as error:
+            return self._ended(k, failure(error, self.actor.plant, k))
         self._row = self.env.step_mdp(row)
         self.interval += 1
         if k + 1 < self.length:
-            if row["next", "done"].any():
-                raise ended_early(row["next"], k + 1, self.actor.plant)
-            return None
+            early = row["next", "done"].any()
+            return self._ended(k + 1, str(ended_early(row["next"], k + 1, self.actor.plant))) if early else None
         self.windows += 1
-        return self._window
+        return Window(self._window, report=report_of(self.env), acted=self._acted())
 
-    def fly(self, orders: dict[int, list[Order]]) -> TensorDict:
+    def fly(self, orders: dict[int, list[Order]]) -> Window:
         """One window, at whose intervals the orders come, by number of the interval since the operation began."""
         while True:
             for order in orders.get(self.interval, ()):
@@ -117,13 +149,36 @@ class Operator:
         assert self._order is not None
         if self.continuous and self._begun:
             self._row = self.env.go_on()
+            self.actor.begin_window()
         else:
             pass_over(self.env)
             self._row = self.env.reset()
             self.actor.begin(self.actor.policy, strength=self._order.strength)
             if self._own_pace is not None:
                 self._own_pace.begin()
-        self._begun, self._window = True, None
+        self._begun, self._window, self._failed_resets = True, None, 0
+
+    def _not_begun(self, error: Exception) -> Window | None:
+        """The window that a failed reset leaves, if it is to be reported."""
+        if self.pace is not None:
+            self.pace.wait()
+        self._failed_resets += 1
+        if self.pace is not None and (self._failed_resets - 1) % self.length:
+            self._begun = False
+            return None
+        return self._ended(0, failure(error, self.actor.plant))
+
+    def _ended(self, count: int, why: str) -> Window:
+        """The window of which ``count`` intervals were acted in; the next one begins with a reset."""
+        entries = None if self._window is None or not count else self._window[:, :count].clone()
+        self.windows += 1
+        self.interval, self._begun = self.windows * self.length, False
+        return Window(entries, why, report_of(self.env) if count else None, self._acted() if count else None)
+
+    def _acted(self) -> dict[str, float] | None:
+        """Numbers about state feedback that acts."""
+        policy = self.actor.policy
+        return policy.report() if isinstance(policy, StateFeedback) else None
 
     def _store(self, k: int, row: TensorDictBase) -> None:
         """Copy an interval into the window, which is allocated at once because a stack at its end takes long."""
@@ -144,6 +199,7 @@ class Operator:
             "env": self.env.state_dict(),
             "generator": self.actor.generator.get_state(),
             "interval": self.interval,
+            "begun": self._begun,
             "order": None if self._order is None else self._order._asdict(),
             "carried": self.actor.carried() if self.continuous else {},
         }
@@ -151,8 +207,8 @@ class Operator:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of an operator that was built with the same arguments.
 
-        A system whose state cannot be put back, which is every one but a simulation, begins with a reset; without
-        ``continuous`` all do. State feedback begins with its first memory.
+        A system whose state cannot be put back, which is every one but a simulation without anything around it, begins
+        with a reset; without ``continuous`` all do. State feedback begins with its first memory.
         """
         self.env.load_state_dict(state["env"])
         self.actor.generator.set_state(state["generator"].cpu())
@@ -161,6 +217,6 @@ class Operator:
         if state["order"] is not None:
             self.follow(Order(**state["order"]))
             self.actor.begin(self.actor.policy, strength=state["order"]["strength"])
-        if self.continuous and isinstance(self.env, PlantEnv) and "state" in state["env"]:
+        if self.continuous and isinstance(self.env, PlantEnv) and state.get("begun", True) and "state" in state["env"]:
             self._begun = True
             self.actor.carry(state["carried"])

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+
 FIRST = "first"
 """Name of the policy or state feedback that acts before the trained policies do."""
 
@@ -19,6 +21,7 @@ class Order(NamedTuple):
         weights: its weights.
         strength: strength ξ of the exploration.
         episode: number of the learner's episode, which says whether weights are drawn anew.
+        found: what was found about the policy before, such as ``predicted_violations``, by name.
     """
 
     version: int
@@ -26,12 +29,20 @@ class Order(NamedTuple):
     weights: dict[str, Tensor]
     strength: float
     episode: int
+    found: dict[str, float | str] | None = None
 
     @classmethod
-    def of(cls, version: int, name: str, policy: nn.Module, *, strength: float, episode: int) -> "Order":
-        """The order of a policy as it is now; later changes of the policy do not reach it."""
+    def of(cls, version: int, name: str, policy: nn.Module, **given: Any) -> "Order":
+        """The order of a policy as it is now; later changes of the policy do not reach it.
+
+        Args:
+            version: number of the order.
+            name: name of the policy.
+            policy: the policy.
+            given: the other attributes.
+        """
         weights = {key: value.detach().clone() for key, value in policy.state_dict().items()}
-        return cls(version, name, weights, strength, episode)
+        return cls(version, name, weights, **given)
 
     def made(self, policies: dict[str, nn.Module]) -> nn.Module:
         """The policy with these weights, as a module of its own.
@@ -42,6 +53,19 @@ class Order(NamedTuple):
         found = copy.deepcopy(policies[self.name])
         found.load_state_dict(self.weights)
         return found
+
+
+def ready(order: Order, policies: dict[str, nn.Module]) -> nn.Module:
+    """The policy of an order, ready to act: state feedback has made its first plan.
+
+    Args:
+        order: the order.
+        policies: a policy of each name, whose own weights stay as they are.
+    """
+    found = order.made(policies)
+    if isinstance(found, StateFeedback):
+        found.begin()
+    return found
 
 
 class OrderBook(dict[int, Order]):

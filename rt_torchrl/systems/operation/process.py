@@ -12,11 +12,14 @@ from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.operation.acting import STOP, Crew, act
 from rt_torchrl.systems.operation.cores import chosen_core, learn_beside, require_realtime, run_on
 from rt_torchrl.systems.operation.event_log import EventLog
-from rt_torchrl.systems.operation.operation import segments_of
 from rt_torchrl.systems.operation.order import Order, OrderBook
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from multiprocessing.connection import Connection
+
+    from rt_torchrl.systems.operation.window import Window
+    from rt_torchrl.systems.safety_report import SafetyReport
 
 LOOK = 0.1
 """Time after which the learner looks again whether Ctrl-C was pressed while it waits for a window [s]."""
@@ -57,6 +60,8 @@ class ProcessOperation:
         self.version, self._windows = -1, 0
         self._state: dict[str, Any] | None = None
         self.orders = OrderBook()
+        self.report: SafetyReport | None = None
+        self.acted: Mapping[str, float] | None = None
         self._connection: Connection | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
 
@@ -74,10 +79,20 @@ class ProcessOperation:
     def begun(self) -> bool:
         return self.version >= 0
 
-    def hand_over(self, name: str, policy: nn.Module, *, strength: float, episode: int) -> None:
+    def hand_over(
+        self,
+        name: str,
+        policy: nn.Module,
+        *,
+        strength: float,
+        episode: int,
+        found: dict[str, float | str] | None = None,
+    ) -> None:
         self._begin()
         self.version += 1
-        self.orders[self.version] = Order.of(self.version, name, policy, strength=strength, episode=episode)
+        self.orders[self.version] = Order.of(
+            self.version, name, policy, strength=strength, episode=episode, found=found
+        )
         self._send(self.orders[self.version])
         self.log.note("handed over", version=self.version)
 
@@ -111,6 +126,7 @@ class ProcessOperation:
         """See :meth:`Operation.rollout`.
 
         Raises:
+            EpisodeEndedError: if the system failed in the window, or ended it.
             RuntimeError: if the acting process has failed; the message is its error.
         """
         self._begin()
@@ -123,13 +139,15 @@ class ProcessOperation:
             raise RuntimeError(self._failure()) from error
         if kind == "failed":
             raise RuntimeError(f"the acting process has failed: {found[0]}")
-        window, self._state = found
-        self.orders.forget_before(int(window["version"].min()))
+        window: Window = found[0]
+        self._state, self.report, self.acted = found[1], window.report, window.acted
+        assert self._state is not None
+        flown = window.segments(self._windows * self._length)
+        self.orders.forget_before(flown[0][1] if flown else self._state["order"]["version"])
         self.system.load_state_dict(self._state["env"])
-        first = self._windows * self._length
-        self.log.note("taken", window=self._windows, flown=segments_of(window, first))
+        self.log.note("taken", window=self._windows, flown=flown)
         self._windows += 1
-        return window
+        return window.whole()
 
     def _failure(self) -> str:
         """What an acting process that does not answer has said, as far as it has."""
@@ -174,5 +192,6 @@ class ProcessOperation:
         self._state = state["operator"] or None
         self.orders.load_state_dict(state["orders"])
         self.version, self._windows = state["version"], state["windows"]
+        self.log.resume(window=self._windows, version=self.version)
         if self._state is not None:
             self.system.load_state_dict(self._state["env"])

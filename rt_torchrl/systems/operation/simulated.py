@@ -1,17 +1,19 @@
 """Operation on a simulated clock: one process, in which the same run repeats to the bit."""
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.operation.event_log import EventLog, counts_taken, first_intervals
-from rt_torchrl.systems.operation.operation import segments_of
+from rt_torchrl.systems.operation.event_log import EventLog, counts_taken, first_intervals, stops
 from rt_torchrl.systems.operation.operator import Operator
 from rt_torchrl.systems.operation.order import Order, OrderBook
+
+if TYPE_CHECKING:
+    from rt_torchrl.systems.safety_report import SafetyReport
 
 
 class SimulatedOperation:
@@ -48,7 +50,10 @@ class SimulatedOperation:
         self.operator, self._learning, self.log = operator, learning, log or EventLog()
         self._starts = None if replayed is None else first_intervals(replayed)
         self._taken = None if replayed is None else counts_taken(replayed)
+        self._stops = stops(replayed or ())
         self.orders = OrderBook()
+        self.report: SafetyReport | None = None
+        self.acted: Mapping[str, float] | None = None
         self._at: dict[int, float] = {}
         self.version, self._now = -1, 0
 
@@ -61,12 +66,22 @@ class SimulatedOperation:
     def begun(self) -> bool:
         return self.version >= 0
 
-    def hand_over(self, name: str, policy: nn.Module, *, strength: float, episode: int) -> None:
+    def hand_over(
+        self,
+        name: str,
+        policy: nn.Module,
+        *,
+        strength: float,
+        episode: int,
+        found: dict[str, float | str] | None = None,
+    ) -> None:
         if self.begun:
             self._now += self._learning
         self.version += 1
         at = self._now if self._starts is None else self._starts.get(self.version, math.inf)
-        self.orders[self.version] = Order.of(self.version, name, policy, strength=strength, episode=episode)
+        self.orders[self.version] = Order.of(
+            self.version, name, policy, strength=strength, episode=episode, found=found
+        )
         self._at[self.version] = at
         self.log.note("handed over", version=self.version)
 
@@ -85,6 +100,7 @@ class SimulatedOperation:
         """See :meth:`Operation.rollout`.
 
         Raises:
+            EpisodeEndedError: if the system failed in the window, or ended it.
             ValueError: if the events that are replayed hold no further window.
         """
         if self._taken is not None and not self.waiting():
@@ -92,17 +108,21 @@ class SimulatedOperation:
                 f"replay holds no window {self.operator.windows} after version {self.version}; ask for as many "
                 "episodes as the run had, with its options."
             )
+        if self.operator.windows in self._stops:
+            self.operator.load_state_dict(self.operator.state_dict())  # what the stop has done to the operation
         first = self.operator.interval
         coming: dict[int, list[Order]] = {}
         for version, at in self._at.items():
             if at < first + self.operator.length:
                 coming.setdefault(max(int(at), first), []).append(self.orders[version])
         window = self.operator.fly(coming)
-        self._at = {version: at for version, at in self._at.items() if at >= self.operator.interval}
-        self.orders.forget_before(int(window["version"].min()))
-        self._now = max(self._now, self.operator.interval)
-        self.log.note("taken", window=self.operator.windows - 1, flown=segments_of(window, first))
-        return window
+        self._at = {version: at for version, at in self._at.items() if version > self.operator.version}
+        self._now, self.report = max(self._now, self.operator.interval), window.report
+        self.acted = window.acted
+        flown = window.segments(first)
+        self.orders.forget_before(flown[0][1] if flown else self.operator.version)
+        self.log.note("taken", window=self.operator.windows - 1, flown=flown)
+        return window.whole()
 
     def close(self) -> None:
         """Do nothing, because the system stands still between two windows."""
@@ -121,3 +141,4 @@ class SimulatedOperation:
         self.orders.load_state_dict(state["orders"])
         self._at = dict(state["at"])
         self.version, self._now = state["version"], state["now"]
+        self.log.resume(window=self.operator.windows, version=self.version)

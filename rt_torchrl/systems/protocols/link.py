@@ -3,6 +3,11 @@
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
+from rt_torchrl.options import require_range
+
+LONGEST = 60.0
+"""Longest time of an answer for which any control loop waits [s]."""
+
 
 class LinkLostError(OSError):
     """The plant does not answer: the connection is lost, or an answer did not come in time."""
@@ -42,3 +47,14 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Close the connection, if there is one."""
+
+
+def require_timeout(timeout: float) -> None:
+    """Refuse a longest time of an answer [s] that is not positive, or for which no control loop waits.
+
+    Raises:
+        ValueError: if it is one of these.
+    """
+    if not timeout > 0.0:
+        raise ValueError(f"timeout={timeout} s of the link must be positive.")
+    require_range("timeout", timeout, 0.0, LONGEST, unit="s", of="the link")

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError
+from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, require_timeout
 
 WIDTH = 4
 """Number of registers of a number in double precision."""
@@ -82,8 +82,7 @@ class ModbusLink:
         timeout: float,
         device: int = 1,
     ):
-        if not timeout > 0.0:
-            raise ValueError(f"timeout={timeout} s of the link must be positive.")
+        require_timeout(timeout)
         self._package, self._device, self.address = pymodbus(), device, f"{host}:{port}"
         self._read, self._written = dict(read), dict(written)
         self._first, self._count = block("read", read)

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Coroutine, Mapping, Sequence
 from typing import Any, TypeVar
 
-from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError
+from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, require_timeout
 
 Result = TypeVar("Result")
 CONNECT = 4.0
@@ -51,8 +51,7 @@ class OpcUaLink:
     """
 
     def __init__(self, url: str, read: Mapping[str, str], written: Mapping[str, str], *, timeout: float):
-        if not timeout > 0.0:
-            raise ValueError(f"timeout={timeout} s of the link must be positive.")
+        require_timeout(timeout)
         self._package, self.url, self.timeout = asyncua(), url, timeout
         self._read, self._written = dict(read), dict(written)
         self._client: Any = None
