@@ -199,7 +199,7 @@ class CommandCost:
             costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
         by_weights = np.zeros((0, group.lanes))
         arrays = (self._costate, self._weights, self._by_drive, by_weights)
-        programs.sweep(True)(x, states, self._nothing, *arrays, n)
+        programs.sweeps[True](x, states, self._nothing, *arrays, n)
         by_blocks = np.add.reduceat(self._by_drive[:, -n_a:], self._first_block, 0)
         gradient[group.first : group.last] = by_blocks[:, :, : group.live].transpose(2, 0, 1)
 

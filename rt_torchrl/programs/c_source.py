@@ -133,15 +133,6 @@ class CWriter:
         self._depth -= 1
         self._emit("}")
 
-    def variable(self, start: str) -> str:
-        return self._new("double", f" = {start}")
-
-    def get(self, variable: str) -> str:
-        return variable
-
-    def put(self, variable: str, operand: str) -> None:
-        self._emit(f"{variable} = {operand};")
-
 
 def literal(number: float) -> str:
     """A number in C, which is read back to the bit."""

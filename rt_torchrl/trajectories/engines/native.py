@@ -11,6 +11,7 @@ which computes each interval again from its start. The lanes of the processor's 
 lanes are divided among the threads of torch.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -127,32 +128,34 @@ class _Task:
         """The drive of a group in a piece, ``n n_x lanes``."""
         return group.gather(*(signal[piece] for signal in self.drive))
 
+    def sweep(
+        self, group: Group, piece: slice, marched: Sequence[np.ndarray], found: Sequence[np.ndarray | None]
+    ) -> None:
+        """Go back over a piece of a group.
+
+        Args:
+            group: the group.
+            piece: the piece.
+            marched: drive and states of the piece, and ∂J/∂s at the ends of its intervals.
+            found: the co-state, ``n_s lanes``, which becomes that of the start; gradients by the weights, ``n_w
+                lanes``, which are added to; gradients by the drive of all groups, ``n batch n_x``, or None to leave
+                them.
+        """
+        x, (costate, by_weights, by_drive) = marched[0], found
+        along = np.empty(x.shape if by_drive is not None else 0)
+        sweep = self.programs.sweeps[by_drive is not None]
+        sweep(*marched, costate, self.row, along, by_weights, len(x))
+        if by_drive is not None:
+            group.scatter(along, by_drive[piece])
+
+    def way_back(self) -> tuple[np.ndarray, np.ndarray]:
+        """Co-state and gradients by the weights of a group, all zero."""
+        return np.zeros((self.n_s, self.lanes)), np.zeros((self.n_w, self.lanes))
+
     def of_drive(self, by_drive: Tensor, t: Tensor) -> list[Tensor]:
         """Gradients by t, z and a, in their own shapes, of those by the drive, ``n batch n_x``."""
         by_t, *rest = by_drive.split([signal.shape[-1] for signal in self.drive], -1)
         return [by_t.squeeze(-1).sum_to_size(t.shape), *rest]
-
-
-class _Adjoint:
-    """The way back of a group.
-
-    Args:
-        task: the trajectories.
-        group: the group.
-        by_drive: gradients by the drive of all groups, ``n batch n_x``, of which it writes its own; None to leave them.
-    """
-
-    def __init__(self, task: _Task, group: Group, by_drive: np.ndarray | None):
-        self._task, self._group, self._by_drive = task, group, by_drive
-        self._sweep = task.programs.sweep(by_drive is not None)
-        self.costate, self.by_weights = np.zeros((task.n_s, task.lanes)), np.zeros((task.n_w, task.lanes))
-
-    def sweep(self, piece: slice, x: np.ndarray, states: np.ndarray, source: np.ndarray) -> None:
-        """Go back over a piece, with its drive and its states as :meth:`_Task.march` gives them."""
-        by_drive = np.empty(x.shape if self._by_drive is not None else 0)
-        self._sweep(x, states, source, self.costate, self._task.row, by_drive, self.by_weights, len(x))
-        if self._by_drive is not None:
-            self._group.scatter(by_drive, self._by_drive[piece])
 
 
 class _EndStates(torch.autograd.Function):
@@ -185,13 +188,14 @@ class _EndStates(torch.autograd.Function):
         by_drive = np.empty((*starts.shape[:2], task.n_x)) if any(ctx.needs_input_grad[2:5]) else None
 
         def work(group: Group) -> None:
-            adjoint = _Adjoint(task, group, by_drive)
+            costate, weighted = task.way_back()
             for piece in reversed(task.pieces):
                 source = group.gather(sources[piece])
                 source[:, :, group.live :] = 0.0
-                adjoint.sweep(piece, task.driving(group, piece), group.gather(starts[piece]), source)
-            group.scatter(adjoint.costate[None], by_state)
-            by_weights[group.first] = adjoint.by_weights.sum(-1)
+                marched = task.driving(group, piece), group.gather(starts[piece]), source
+                task.sweep(group, piece, marched, (costate, weighted, by_drive))
+            group.scatter(costate[None], by_state)
+            by_weights[group.first] = weighted.sum(-1)
 
         for_each_group(starts.shape[1], task.lanes, work)
         along = [None] * 3 if by_drive is None else task.of_drive(torch.from_numpy(by_drive), t)
@@ -217,15 +221,15 @@ class _Costs(torch.autograd.Function):
             costs[group.first : group.last] = starts.pop()[-1, : group.live]
             if not wanted:
                 return
-            adjoint = _Adjoint(task, group, by_drive)
-            adjoint.costate[-1] = 1.0
+            costate, weighted = task.way_back()
+            costate[-1] = 1.0
             for piece in reversed(task.pieces):
                 start = starts.pop()
                 if piece.stop < task.n:  # those of the last piece are still there
                     x, states = task.march(group, piece, start)
-                adjoint.sweep(piece, x, states, nothing)
-            group.scatter(adjoint.costate[None], by_state)
-            group.scatter(adjoint.by_weights[None], by_weights)
+                task.sweep(group, piece, (x, states, nothing), (costate, weighted, by_drive))
+            group.scatter(costate[None], by_state)
+            group.scatter(weighted[None], by_weights)
 
         for_each_group(batch, task.lanes, work)
         ctx.task, ctx.t, ctx.found = task, leaves[1], [by_state[0], by_weights[0], by_drive]

@@ -1,6 +1,7 @@
 """Machine code of the recurrence of an interval and of its reverse sweep, traced and compared with torch."""
 
 import ctypes
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -92,75 +93,54 @@ class Sweep:
     def __init__(self, interval: nn.Module, point: Point, lanes: Lanes, *, driven: bool):
         tracer = new_tracer()
         state, drive, weights = _traced_inputs(tracer, interval, point)
-        learned = {name: weights[name] for name, w in interval.named_parameters() if w.requires_grad}
+        learned = [weights[name] for name, w in interval.named_parameters() if w.requires_grad]
         costate = torch.ones_like(state)
         tracer.input(costate, "l")
-        leaves = [state, *(drive if driven else ()), *learned.values()]
-        with torch.enable_grad():
-            for leaf in leaves:
-                leaf.requires_grad_()
-            with Escapes(tracer), tracer:
-                end = with_weights(interval, weights, state, drive)
-                found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
-        zero = tracer.program.constant(0.0)
-        pairs = zip(found or [None] * len(leaves), leaves, strict=True)
-        by_state, *others = ([zero] * leaf.numel() if g is None else tracer.outputs(g) for g, leaf in pairs)
-        by_drive, by_weights = (sum(part, []) for part in (others[: 3 * driven], others[3 * driven :]))
-        self.lanes, self.driven, self.names = lanes, driven, list(learned)
+        parts = [state], [*drive] if driven else [], learned
+        leaves = [leaf.requires_grad_() for part in parts for leaf in part]
+        with torch.enable_grad(), Escapes(tracer), tracer:
+            end = with_weights(interval, weights, state, drive)
+            found = [torch.zeros_like(leaf) for leaf in leaves]
+            if end.requires_grad:
+                found = torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
+        values = map(tracer.outputs, found)
+        outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
+        self.lanes, self.driven = lanes, driven
         self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
-        self.sizes["w"] = sum(w.numel() for w in learned.values())
-        text = sweep_text(tracer.program, by_state, by_weights, by_drive, self.sizes, lanes)
-        self._code = ObjectCode(text, "sweep", SWEEP)
+        self._code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, lanes), "sweep", SWEEP)
         self._compare(interval, point)
 
-    def __call__(
-        self,
-        x: np.ndarray,
-        states: np.ndarray,
-        source: np.ndarray,
-        costate: np.ndarray,
-        weights: np.ndarray,
-        by_drive: np.ndarray,
-        by_weights: np.ndarray,
-        n: int,
-    ) -> None:
+    def __call__(self, x: np.ndarray, states: np.ndarray, source: np.ndarray, *others: np.ndarray | int) -> None:
         """Replace the co-state of the end (``n_s lanes``) by that of the start, and give the gradients.
 
         Args:
             x: drive, ``n n_x lanes``.
             states: states at the starts of the intervals, ``n n_s lanes``.
             source: ∂J/∂s at the end of every interval, ``n n_s lanes``, or one row that serves all.
-            costate: the co-state.
-            weights: all weights of the interval.
-            by_drive: gradients by the drive, ``n n_x lanes``; untouched unless ``driven``.
-            by_weights: gradients by the learned weights, ``n_w lanes``, which are added to.
-            n: number of intervals.
+            others: the co-state; all weights of the interval; the gradients by the drive, ``n n_x lanes``, which stay
+                untouched unless ``driven``; the gradients by the learned weights, ``n_w lanes``, which are added to;
+                the number n of intervals.
         """
-        stride = int(len(source) > 1)
-        self._code(x, states, source, stride, costate, weights, by_drive, by_weights, n)
+        self._code(x, states, source, int(len(source) > 1), *others)
 
     def _compare(self, interval: nn.Module, point: Point) -> None:
-        n_lanes, names = self.lanes.number, self.names
-        costate = 1.0 + 0.1 * np.arange(self.sizes["s"] * n_lanes, dtype=float).reshape(-1, n_lanes)
-        source, (x, states) = np.zeros((1, self.sizes["s"], n_lanes)), point.in_lanes()
-        found = costate.copy(), np.zeros((1, self.sizes["x"], n_lanes)), np.zeros((self.sizes["w"], n_lanes))
-        self(x, states, source, found[0], Weights(interval).row(), *found[1:], 1)
+        weights, (x, states) = Weights(interval), point.in_lanes()
+        costate = 1.0 + 0.1 * np.arange(states[0].size, dtype=float).reshape(states[0].shape)
+        by_state, by_drive = costate.copy(), np.zeros_like(x)
+        by_weights = np.zeros((sum(weights.sizes), self.lanes.number))
+        self(x, states, np.zeros_like(states), by_state, weights.row(), by_drive, by_weights, 1)
         state, *drive = (x.clone().requires_grad_() for x in (point.state, *point.drive))
-        weights = dict(interval.named_parameters())
-        leaves = [state, *drive, *(weights[name] for name in names)]
         with torch.enable_grad():
-            end, by_end = interval(state, Drive(*drive)), torch.from_numpy(costate.T)
+            end, by_end, leaves = interval(state, Drive(*drive)), torch.from_numpy(costate.T), [state, *drive]
+            leaves += weights.learned
             wanted = torch.autograd.grad(end, leaves, by_end, allow_unused=True, materialize_grads=True)
-        by_state, by_drive = wanted[0].numpy(), torch.cat([wanted[1].unsqueeze(-1), *wanted[2:4]], -1).numpy()
-        require_equal("the co-state", found[0].T, by_state, by_state)
-        if self.driven:
-            require_equal("the gradient by the drive", found[1][0].T, by_drive, by_drive)
-        parts = np.split(found[2].sum(-1), np.cumsum([w.numel() for w in wanted[4:]])[:-1]) if names else []
-        flat = [exactly.flatten().numpy() for exactly in wanted]
-        greatest = max(float(np.abs(values[np.isfinite(values)]).max(initial=0.0)) for values in flat)
-        for name, part, exactly in zip(names, parts, flat[4:], strict=True):
-            floor = np.full_like(exactly, ROUNDING / AGREEMENT * greatest)
-            require_equal(f"the gradient by {name}", part, exactly, floor)
+        exact = [wanted[0], torch.cat([wanted[1].unsqueeze(-1), *wanted[2:4]], -1), *wanted[4:]]
+        found = [by_state.T, by_drive[0].T if self.driven else exact[1], *weights.split(by_weights.sum(-1))]
+        names = ["state", "drive", *(name for name, w in interval.named_parameters() if w.requires_grad)]
+        finite = (x[x.isfinite()].abs() for x in exact)
+        floor = ROUNDING / AGREEMENT * max(x.max().item() if x.numel() else 0.0 for x in finite)
+        for name, part, exactly in zip(names, found, exact, strict=True):
+            require_equal(f"the gradient by {name}", np.asarray(part), exactly.numpy(), np.full(exactly.shape, floor))
 
 
 def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
