@@ -150,7 +150,7 @@ class CommandCost:
     def _place(self, programs: Programs) -> None:
         """Lay out the arrays of the window, one set for each group of lanes."""
         lanes, batch = programs.lanes.number, len(self._state)
-        n, n_s, n_x = self.n, self._state.shape[1], programs.march.sizes["x"]
+        n, n_s, n_x = self.n, self._state.shape[1], programs.sizes["x"]
         groups = [Group(first, min(first + lanes, batch), lanes) for first in range(0, batch, lanes)]
         if getattr(self, "_shape", None) != (n, batch):
             self._shape = n, batch
@@ -199,7 +199,7 @@ class CommandCost:
             costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
         by_weights = np.zeros((0, group.lanes))
         arrays = (self._costate, self._weights, self._by_drive, by_weights)
-        programs.sweeps[True](x, states, self._nothing, *arrays, n)
+        programs.sweeps[True](x, states, self._nothing, 0, *arrays, n)
         by_blocks = np.add.reduceat(self._by_drive[:, -n_a:], self._first_block, 0)
         gradient[group.first : group.last] = by_blocks[:, :, : group.live].transpose(2, 0, 1)
 

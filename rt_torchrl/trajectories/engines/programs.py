@@ -10,40 +10,15 @@ from torch import Tensor, nn
 
 from rt_torchrl.programs.fingerprint import Fingerprint, fingerprint
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
+from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.traced_interval import March, Point, Sweep
+from rt_torchrl.trajectories.engines.traced_interval import Point, Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 
 KEPT = 256
 """Number of kinds of intervals whose programs are kept."""
 NUDGE = 1e-3
 """Relative change of the signals at which machine code is compared with torch, so that no two of them are equal."""
-
-
-class Programs:
-    """The machine code of one kind of interval.
-
-    Args:
-        interval: the map Φ.
-        point: a point at which it is traced, and compared with torch.
-        lanes: lanes of the processor.
-    """
-
-    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
-        self.point, self.lanes = point, lanes
-        self.march = March(interval, point, lanes)
-        self.sweeps: dict[bool, Sweep] = {}
-        """The reverse sweeps that have been prepared, with and without the gradients by the drive."""
-
-    def prepare_sweep(self, interval: nn.Module, driven: bool) -> None:
-        """Make the reverse sweep of an interval of this kind, unless it is there.
-
-        Raises:
-            UntraceableError: if it cannot become a program.
-        """
-        if driven not in self.sweeps:
-            self.sweeps[driven] = Sweep(interval, self.point, self.lanes, driven=driven)
 
 
 _known: "WeakKeyDictionary[nn.Module, tuple[Fingerprint, Weights]]" = WeakKeyDictionary()
