@@ -6,10 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rt_torchrl.programs.tracer import Rule, Tracer
-
-Arguments = tuple[Any, ...]
-Options = dict[str, Any]
+from rt_torchrl.programs.tracer import Arguments, Options, Rule, Tracer, in_shape
 
 
 def _copy_by(name: str) -> Rule:
@@ -73,11 +70,10 @@ def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -
 def _added(tracer: Tracer, target: Tensor, places: Tensor, values: Tensor) -> Tensor:
     """The cells of a tensor with values added at places, of which several may be the same."""
     found = tracer.cells(target).flatten().tolist()
-    for place, value in zip(
-        places.flatten().tolist(), values[tuple(map(slice, places.shape))].flatten().tolist(), strict=True
-    ):
+    given = values[tuple(map(slice, places.shape))]
+    for place, value in zip(places.flatten().tolist(), given.flatten().tolist(), strict=True):
         found[place] = tracer.program.apply("add", found[place], value)
-    return torch.tensor(found, dtype=torch.int64).view(target.shape)
+    return in_shape(found, target.shape)
 
 
 def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:

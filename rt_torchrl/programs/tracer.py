@@ -24,7 +24,9 @@ FILLS = frozenset(
     "scalar_tensor arange eye linspace empty_strided new_empty_strided zero".split()
 )
 
-Rule = Callable[["Tracer", tuple[Any, ...], dict[str, Any], Any], Any]
+Arguments = tuple[Any, ...]
+Options = dict[str, Any]
+Rule = Callable[["Tracer", Arguments, Options, Any], Any]
 
 
 class Tracer(TorchDispatchMode):
@@ -56,15 +58,18 @@ class Tracer(TorchDispatchMode):
             return torch.tensor(self.program.constant(x))
         key = _storage_of(x)
         if key not in self._cells:  # a tensor from outside is a constant
-            if x.is_complex():
-                raise self.refuse("complex numbers")
             if x.requires_grad and x.is_leaf and x.numel():
                 raise self.refuse("a tensor that requires a gradient but is no parameter of the modules")
             size = x.untyped_storage().nbytes() // x.element_size()
-            values = torch.as_strided(x.detach(), (size,), (1,), 0).tolist()
-            self._cells[key] = torch.tensor([self.program.constant(v) for v in values], dtype=torch.int64)
+            self._cells[key] = self._constants(torch.as_strided(x.detach(), (size,), (1,), 0))
             self._alive.append(x)
         return torch.as_strided(self._cells[key], x.shape, x.stride(), x.storage_offset())
+
+    def _constants(self, x: Tensor) -> Tensor:
+        """The cells of known numbers."""
+        if x.is_complex():
+            raise self.refuse("complex numbers")
+        return in_shape([self.program.constant(v) for v in x.flatten().tolist()], x.shape)
 
     def assign(self, x: Tensor, cells: Tensor) -> None:
         """Let a new tensor hold values of the program."""
@@ -77,14 +82,12 @@ class Tracer(TorchDispatchMode):
     def input(self, x: Tensor, name: str) -> None:
         """Let a tensor be the next part of an input, which varies over lanes and steps."""
         places = range(self._sizes[name], self._sizes[name] + x.numel())
-        found = [self.program.new("input", attributes=(name, i)) for i in places]
         self._sizes[name] = places.stop
-        self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
+        self.assign(x, in_shape([self.program.new("input", attributes=(name, i)) for i in places], x.shape))
 
     def weight(self, x: Tensor) -> None:
         """Let a tensor be the next part of the weights, which are the same for all lanes and steps."""
-        attributes = self._sizes["weights"], x.numel()
-        array = self.program.new("weights", attributes=attributes, kind="array")
+        array = self.program.new("weights", attributes=(self._sizes["weights"], x.numel()), kind="array")
         self._sizes["weights"] += x.numel()
         self.assign(x, self.elements(array, x.numel()).view(x.shape))
 
@@ -107,9 +110,7 @@ class Tracer(TorchDispatchMode):
 
     # Operators
 
-    def __torch_dispatch__(
-        self, func: Any, types: Iterable[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: Arguments = (), kwargs: Options | None = None) -> Any:
         kwargs = kwargs or {}
         if not isinstance(func, OpOverload):
             raise self.refuse(f"torch operator {func} has no translation")
@@ -118,8 +119,11 @@ class Tracer(TorchDispatchMode):
             self.places.note()
             packet = func._schema.name.split("::")[1]
             name = packet if packet.startswith("_") else packet.rstrip("_")
-            if packet in DECISIONS or torch.Tag.nondeterministic_seeded in func.tags:
-                return self._decided(func, packet, args, kwargs)
+            if torch.Tag.nondeterministic_seeded in func.tags:
+                raise self.refuse(f"{packet} draws random numbers")
+            if packet in DECISIONS:
+                self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
+                return func(*args, **kwargs)
             known = name in ELEMENTWISE or name in FILLS or name in self._rules or name in SIMPLER
             if not known and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
@@ -151,29 +155,19 @@ class Tracer(TorchDispatchMode):
         cells = self.cells(x)
         return not cells.numel() or self.program.number(int(cells.flatten()[0])) is not None is not self.numbers(cells)
 
-    def _folded(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _folded(self, func: Any, args: Arguments, kwargs: Options) -> Any:
         """What an operator makes of known numbers: known numbers, whatever the operator is."""
         out = func(*args, **kwargs)
         for x in tensors_in([out]):
-            if x.is_complex():
-                raise self.refuse("complex numbers")
-            found = [self.program.constant(v) for v in x.detach().flatten().tolist()]
-            self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
+            self.assign(x, self._constants(x.detach()))
         return out
-
-    def _decided(self, func: Any, packet: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """What Python takes from tensors, which must hold known numbers."""
-        if packet not in DECISIONS:
-            raise self.refuse(f"{packet} draws random numbers")
-        self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
-        return func(*args, **kwargs)
 
     def require_known(self, what: str, args: Iterable[Any]) -> None:
         """Refuse tensors whose numbers are not known when the program is made."""
         if any(self.numbers(self.cells(x)) is None for x in tensors_in(args)):
             raise self.refuse(what)
 
-    def _executed(self, func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _executed(self, func: Any, name: str, args: Arguments, kwargs: Options) -> Any:
         """What an operator returns, with the cells of what it computes."""
         out = func(*args, **kwargs)
         outs = list(tensors_in([out]))
@@ -199,19 +193,17 @@ class Tracer(TorchDispatchMode):
         except Exception as error:
             raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
 
-    def _computed(self, func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> Any:
+    def _computed(self, func: Any, name: str, args: Arguments, kwargs: Options, out: Any) -> Any:
         """The cells of what an operator computes."""
         if name in FILLS:
-            values = torch.zeros(()) if name == "zero" else out
-            found = [self.program.constant(v) for v in values.flatten().tolist()]
-            return torch.tensor(found, dtype=torch.int64).view(values.shape)
+            return self._constants(torch.zeros(()) if name == "zero" else out)
         if name in self._rules:
             return self._rules[name](self, args, kwargs, out)
         if name in ELEMENTWISE:
             return self._elementwise(name, args, kwargs, out)
         raise self.refuse(f"torch operator {func} has no translation")
 
-    def _elementwise(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Tensor) -> Tensor:
+    def _elementwise(self, name: str, args: Arguments, kwargs: Options, out: Tensor) -> Tensor:
         if out.is_floating_point() and out.dtype != torch.float64:
             raise self.refuse(f"{name} computes in {out.dtype}; trajectories need torch.float64")
         unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "rounding_mode", "dtype"))]
@@ -233,10 +225,8 @@ class Tracer(TorchDispatchMode):
         long = math.prod(shape) > STRAIGHT and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
         if not long or all(p.number(i) is not None for i in values):
             rows = zip(*(o.flatten().tolist() for o in spread), strict=True)
-            found = [ELEMENTWISE[name](p, *row) for row in rows]
-            return torch.tensor(found, dtype=torch.int64).view(shape)
-        shortcut = self._shortcut(name, spread)
-        if shortcut is not None:
+            return in_shape([ELEMENTWISE[name](p, *row) for row in rows], shape)
+        if (shortcut := self._shortcut(name, spread)) is not None:
             return shortcut
         dims = tuple(n for n in shape if n != 1)
         accesses = [self.access(o.reshape(dims)) for o in spread]
@@ -245,14 +235,16 @@ class Tracer(TorchDispatchMode):
         return self.elements(array, math.prod(shape)).view(shape)
 
     def _shortcut(self, name: str, operands: list[Tensor]) -> Tensor | None:
-        """The result of an operator on a long row that needs no loop, such as 1·x; None if it needs one."""
-        numbers = [self.uniform_number(o) for o in operands]
-        if name == "mul" and self.program.differentiating and 0.0 in numbers:
-            return operands[numbers.index(0.0)]
-        for plain, neutral in (("mul", 1.0), ("add", 0.0 if self.program.differentiating else None)):
-            if name == plain and neutral is not None and neutral in numbers:
-                return operands[1 - numbers.index(neutral)]
-        return operands[0] if (name, numbers[-1]) in (("sub", 0.0), ("div", 1.0)) else None
+        """The result on a long row that needs no loop, such as 0·x or x + 0; None if it needs one."""
+        firsts = [int(o.flatten()[0]) for o in operands]
+        known = [self.uniform_number(o) is not None for o in operands]
+        found = ELEMENTWISE[name](self.program, *firsts)  # what the rules of scalars make of it, they make of each
+        same = (
+            o
+            for o, first, plain in zip(operands, firsts, known, strict=True)
+            if found == first and (plain or any(known))
+        )
+        return next(same, None)
 
     def uniform_number(self, cells: Tensor) -> float | None:
         """The number that all cells are known to hold; None if they hold different or unknown ones."""
@@ -270,10 +262,7 @@ class Tracer(TorchDispatchMode):
             if walk is not None:
                 return found[0].operands[0], walk
         numbers = self.numbers(cells)
-        if numbers is not None:
-            array = self.table(numbers)
-        else:
-            array = p.new("row", *(p.as_number(i) for i in flat), kind="array")
+        array = self.table(numbers) if numbers else p.new("row", *map(p.as_number, flat), kind="array")
         return array, Access(0, torch.empty(cells.shape).stride())
 
     def table(self, numbers: list[float]) -> int:
@@ -288,6 +277,11 @@ def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
             yield value
         elif isinstance(value, (list, tuple)):
             yield from tensors_in(value)
+
+
+def in_shape(values: list[int], shape: Iterable[int]) -> Tensor:
+    """Values of a program as cells."""
+    return torch.tensor(values, dtype=torch.int64).view(tuple(shape))
 
 
 def _storage_of(x: Tensor) -> int:

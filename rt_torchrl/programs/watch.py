@@ -1,11 +1,14 @@
 """Watches: whether anything that a fingerprint was made of has changed since, told in a fraction of its time."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from itertools import chain
 from typing import Any
 
 import numpy as np
 from torch import Tensor, nn
+
+Reading = tuple[Callable[[Any], object], object]
+"""A function with what it reads."""
 
 
 class Watch:
@@ -22,11 +25,11 @@ class Watch:
         self.complete = True
         """False if there is an object that cannot be compared, which then always counts as changed."""
         self._own = type(root), vars(root)
-        self._empty: list[Collection[object]] = []
-        self._filled: list[Collection[object]] = []
+        self._empty: list[Any] = []
+        self._filled: list[Any] = []
         self._attributes: dict[tuple[int, str], object] = {}
         self._globals: dict[tuple[int, str], dict[str, Any]] = {}
-        self._values: list[tuple[Callable[[Any], object], object]] = []
+        self._values: list[Reading] = []
 
     def note_collection(self, held: Any) -> None:
         """Note a collection: what it holds must be the same objects; a new one needs a note of its own."""

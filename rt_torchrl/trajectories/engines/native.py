@@ -201,12 +201,11 @@ class _EndStates(torch.autograd.Function):
         starts = np.concatenate([task.initial_state[None], ends[:-1]])
         gradients = _Gradients(task, driven=any(ctx.needs_input_grad[2:5]))
 
-        def work(group: Group) -> None:
-            gathered = (map(group.gather, (starts[piece], sources[piece])) for piece in reversed(task.pieces))
-            pieces = ((p, task.driving(group, p), *arrays) for p, arrays in zip(task.pieces[::-1], gathered, strict=True))
-            gradients.sweep(group, pieces, last=0.0)
+        def way_back(group: Group) -> Iterator[Piece]:
+            for piece in reversed(task.pieces):
+                yield piece, task.driving(group, piece), group.gather(starts[piece]), group.gather(sources[piece])
 
-        for_each_group(starts.shape[1], task.lanes, work)
+        for_each_group(starts.shape[1], task.lanes, lambda group: gradients.sweep(group, way_back(group), last=0.0))
         return None, *gradients.weighed()
 
 
