@@ -44,9 +44,8 @@ class CSource:
             last: statements at its end.
         """
         values = [value for _, value in outputs]
-        needed = [program.operations[i].attributes for i in program.needed(values) if _is_input(program, i)]
-        writer = CWriter(self._tables)
-        names = {key: f"{key[0]}_{key[1]}" for key in needed}
+        needed, writer = [program.operations[i] for i in program.needed(values)], CWriter(self._tables)
+        names = {o.attributes: f"{o.attributes[0]}_{o.attributes[1]}" for o in needed if o.name == "input"}
         writer.lines += [f"const double {name} = {inputs[key]};" for key, name in names.items()]
         found = Lowering(program, writer, names, "weights").write(values)
         writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, found, strict=True)]
@@ -139,10 +138,6 @@ def literal(number: float) -> str:
     if not math.isfinite(number):
         return "NAN" if math.isnan(number) else "INFINITY" if number > 0 else "(-INFINITY)"
     return f"({number!r})" if math.copysign(1.0, number) < 0 else repr(number)
-
-
-def _is_input(program: Program, value: int) -> bool:
-    return program.operations[value].name == "input"
 
 
 def _wrapped(numbers: Sequence[float]) -> str:

@@ -10,8 +10,13 @@ import torch
 from torch import Tensor
 
 
+def _mean(x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
+    total = x.sum(dim, keepdim)
+    return total / (x.numel() // max(1, total.numel()))
+
+
 def _variance(x: Tensor, dim: Any = None, correction: int | float | None = None, *, keepdim: bool = False) -> Tensor:
-    deviation = x - x.mean(dim, keepdim=True)
+    deviation = x - _mean(x, dim, keepdim=True)
     total = (deviation * deviation).sum(dim, keepdim)
     return total / max(0.0, x.numel() / max(1, total.numel()) - (1.0 if correction is None else correction))
 
@@ -39,6 +44,7 @@ def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Ca
 
 
 SIMPLER: dict[str, Callable[..., Any]] = {
+    "mean": _mean,
     "var": _variance,
     "bucketize": _bucketize,
     "searchsorted": lambda knots, x, side="", **how: _bucketize(x, knots, **{"right": side == "right", **how}),

@@ -21,8 +21,13 @@ VALUES = frozenset({str, int, float, complex, bool, type(None), bytes, torch.Siz
 """Types of objects that their text describes."""
 GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 """Objects that change whenever they are used, and that no program depends on."""
-BY_ADDRESS = (types.BuiltinFunctionType, types.ModuleType, *GENERATORS)
+BY_ADDRESS = (types.BuiltinFunctionType, types.CodeType, types.ModuleType, *GENERATORS)
 """Types of objects that a fingerprint knows by their address."""
+ATTRIBUTES = {
+    types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__", "__dict__"),
+    types.CellType: ("cell_contents",),
+}
+"""Attributes that are all there is to objects of a type, apart from the globals that functions read."""
 CONSTANT = (types.MethodType, np.dtype, np.generic)
 """Types of objects that pickle reads in a way of their own, and that cannot change."""
 USUAL = ("__reduce_ex__", "__reduce__", "__getstate__")
@@ -97,9 +102,13 @@ class _Reader:
         if isinstance(obj, Tensor):
             self.watch.note_tensor(obj, constant=not isinstance(obj, nn.Parameter))
             found = [kind.__name__, tuple(obj.shape), str(obj.dtype), obj.requires_grad]
-            return found if isinstance(obj, nn.Parameter) else [*found, _digest(_bytes(obj))]
+            if not isinstance(obj, nn.Parameter):
+                found.append(_digest(obj.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()))
+            return found
         if kind is np.ndarray and not obj.dtype.hasobject:
-            self.watch.note_array(obj)
+            self.watch.note_attributes(obj, "dtype")
+            self.watch.note_values(obj, np.shape)
+            self.watch.note_numbers(obj)
             return [obj.shape, str(obj.dtype), _digest(obj)]
         if kind in (dict, OrderedDict, list, set):
             self.watch.note_collection(obj)
@@ -107,7 +116,14 @@ class _Reader:
             return [kind.__name__, *map(self._mention, chain(obj, obj.values()))]
         if kind in (list, set, frozenset) or (isinstance(obj, tuple) and not hasattr(obj, "__dict__")):
             return [self._mention(kind), *map(self._mention, obj)]
-        return self._of_function(obj) if isinstance(obj, types.FunctionType) else self._of_instance(obj)
+        if kind is types.CellType and obj == types.CellType():  # a variable that has no value yet, and may get one
+            self.watch.complete = False
+            return []
+        if kind in ATTRIBUTES:
+            self._functions += [obj] if kind is types.FunctionType else []
+            self.watch.note_attributes(obj, *ATTRIBUTES[kind])
+            return [kind.__name__, *(self._mention(getattr(obj, name)) for name in ATTRIBUTES[kind])]
+        return self._of_instance(obj)
 
     def _of_class(self, kind: type) -> list[object]:
         """A class by its address, and what it says itself."""
@@ -118,14 +134,6 @@ class _Reader:
         self._functions += map(function_of, vars(kind).values())
         mentioned = map(self._mention, kind.__mro__[1:])
         return [*self._address(kind), *map(self._address, vars(kind).values()), *mentioned]
-
-    def _of_function(self, f: types.FunctionType) -> list[object]:
-        self.watch.note_attributes(f, "__code__", "__defaults__", "__kwdefaults__", "__closure__")
-        self._functions.append(f)
-        for cell in f.__closure__ or ():
-            self.watch.note_attributes(cell, "cell_contents")
-        held = [*map(_content, f.__closure__ or ()), f.__defaults__, f.__kwdefaults__, vars(f)]
-        return [*self._address(f.__code__), *map(self._mention, held)]
 
     def _of_instance(self, obj: Any) -> list[object]:
         """An object by the parts that pickle takes; by its address if pickle refuses it."""
@@ -149,17 +157,5 @@ class _Reader:
         return [*map(self._mention, parts)]
 
 
-def _bytes(x: Tensor) -> np.ndarray:
-    found: np.ndarray = x.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
-    return found
-
-
 def _digest(numbers: np.ndarray) -> bytes:
     return hashlib.sha256(numbers.tobytes()).digest()
-
-
-def _content(cell: types.CellType) -> object:
-    try:
-        return cell.cell_contents
-    except ValueError:  # the variable has no value yet
-        return None

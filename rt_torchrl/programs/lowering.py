@@ -1,7 +1,7 @@
 """Lowering: a program becomes arithmetic, loads, stores and loops, which a writer puts into a language."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import groupby
 from typing import Protocol, runtime_checkable
@@ -13,6 +13,8 @@ BLOCKS = (8, 6, 5, 4, 3, 2, 1)
 """Numbers of columns of a product of matrices that are summed at once, so that a row is read once for all of them."""
 SHORT = 16
 """Number of elements from which a run of gradients is added by a loop."""
+
+Accesses = Sequence[Access | None]
 
 
 @runtime_checkable
@@ -92,43 +94,25 @@ class Lowering:
         elif name == "table":
             self._arrays[value] = (self.writer.table([float.fromhex(x) for x in attributes]), 0, True)
         else:
-            shapes: dict[str, Callable[..., int]] = {
-                "row": lambda *_: len(operands),
-                "map": lambda name, dims, accesses: math.prod(dims),
-                "product": lambda m, k, n, accesses: m * n,
-            }
-            array = self.writer.local(shapes[name](*attributes))
+            array = self.writer.local(math.prod(attributes[0]))
             self._arrays[value] = (array, 0, False)
             getattr(self, f"_{name}")(array, operands, *attributes)
 
-    def _row(self, array: str, operands: Sequence[int]) -> None:
+    def _row(self, array: str, operands: Sequence[int], dims: Sequence[int]) -> None:
         for i, a in enumerate(operands):
             self.writer.store(array, self.writer.index(i, ()), self.operand(a))
 
-    def _map(
-        self, array: str, operands: Sequence[int], name: str, dims: Sequence[int], accesses: Sequence[Access | None]
-    ) -> None:
-        strides = [math.prod(dims[d + 1 :]) for d in range(len(dims))]
-        if all(access is None or list(access.strides) == strides for access in accesses):
-            dims, strides = [math.prod(dims)], [1]  # all operands are walked through in order: one loop will do
-            accesses = [access and Access(access.base, (1,)) for access in accesses]
-
+    def _map(self, array: str, operands: Sequence[int], dims: Sequence[int], name: str, accesses: Accesses) -> None:
+        strides, body = [math.prod(dims[d + 1 :]) for d in range(len(dims))], Program()
         with self._loops(dims) as indices:
-            found = [self._read(a, access, indices) for a, access in zip(operands, accesses, strict=True)]
-            at = self.writer.index(0, list(zip(strides, indices, strict=True)))
-            self.writer.store(array, at, self._elementwise(name, found))
+            read = {("x", k): self._read(*pair, indices) for k, pair in enumerate(zip(operands, accesses, strict=True))}
+            found = ELEMENTWISE[name](body, *(body.new("input", attributes=key) for key in read))
+            (result,) = Lowering(body, self.writer, read, "").write([found])
+            self.writer.store(array, self.writer.index(0, [*zip(strides, indices, strict=True)]), result)
 
-    def _elementwise(self, name: str, operands: Sequence[str]) -> str:
-        """An elementwise operator on operands within a loop: a program of its own."""
-        body = Program()
-        inputs = [body.new("input", attributes=("x", k)) for k in range(len(operands))]
-        lowering = Lowering(body, self.writer, {("x", k): operand for k, operand in enumerate(operands)}, "")
-        return lowering.write([ELEMENTWISE[name](body, *inputs)])[0]
-
-    def _product(
-        self, array: str, operands: Sequence[int], m: int, k: int, n: int, accesses: Sequence[Access | None]
-    ) -> None:
-        writer, block = self.writer, next(b for b in BLOCKS if n % b == 0)
+    def _product(self, array: str, operands: Sequence[int], dims: Sequence[int], k: int, accesses: Accesses) -> None:
+        (m, n), writer = dims, self.writer
+        block = next(b for b in BLOCKS if n % b == 0)
         a, b, start = zip(operands, accesses, strict=True)
         totals = writer.local(block)
         with self._loops([m, n // block]) as (i, j):

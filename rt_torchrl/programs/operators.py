@@ -57,11 +57,6 @@ def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
     return in_shape(found, out.shape)
 
 
-def _mean(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    count = tracer.cells(float(args[0].numel() // max(1, out.numel())))
-    return tracer.pointwise("div", [_sum(tracer, args, options, out), count], out.shape)
-
-
 def _fold(name: str) -> Rule:
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
         rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
@@ -94,13 +89,9 @@ def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = 
     if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
         return first
     accesses = [tracer.access(x) for x in (a, b, first)]
-    shape = (m, k, n, tuple(x for _, x in accesses))
-    array = p.new("product", *(i for i, _ in accesses), attributes=shape, kind="array")
+    attributes = (m, n), k, tuple(x for _, x in accesses)
+    array = p.new("product", *(i for i, _ in accesses), attributes=attributes, kind="array")
     return tracer.elements(array, m * n).view(m, n)
-
-
-def _mm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return matrix_product(tracer, tracer.cells(args[0]), tracer.cells(args[1]))
 
 
 def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
@@ -147,11 +138,10 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
     "_to_copy": _convert,
     "sum": _sum,
-    "mean": _mean,
     "amax": _fold("maximum"),
     "amin": _fold("minimum"),
     "prod": _fold("mul"),
-    "mm": _mm,
+    "mm": lambda tracer, args, options, out: matrix_product(tracer, *map(tracer.cells, args)),
     "addmm": _addmm,
     "index": _index,
 }

@@ -1,6 +1,7 @@
 """Outer names: the globals that the code of classes and functions reads, which traced programs depend on."""
 
 import inspect
+import sys
 import types
 from collections.abc import Iterable
 from functools import lru_cache
@@ -10,8 +11,8 @@ import numpy as np
 from torch import Tensor
 
 DATA = (bool, int, float, complex, str, Tensor, np.ndarray, np.generic)
-FOREIGN = frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype builtins typing abc math".split())
-"""Packages whose globals do not change."""
+FOREIGN = sys.stdlib_module_names | frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype".split())
+"""Packages whose globals do not change, those of Python among them."""
 
 Name = tuple[dict[str, Any], str]
 

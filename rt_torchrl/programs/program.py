@@ -109,8 +109,7 @@ class Program:
         if a == b:
             return a
         if self.kinds[a] == "truth":
-            inverse = self.logic("not", condition)
-            return self.logic("or", self.logic("and", condition, a), self.logic("and", inverse, b))
+            return self.as_truth(self.select(condition, self.as_number(a), self.as_number(b)))
         return self.new("select", condition, a, b)
 
     def logic(self, how: str, *operands: int) -> int:

@@ -2,13 +2,14 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from rt_torchrl.programs.decompositions import SIMPLER, known_to_torch
 from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
@@ -170,7 +171,7 @@ class Tracer(TorchDispatchMode):
     def _executed(self, func: Any, name: str, args: Arguments, kwargs: Options) -> Any:
         """What an operator returns, with the cells of what it computes."""
         out = func(*args, **kwargs)
-        outs = list(tensors_in([out]))
+        outs = tensors_in([out])
         if any(o.is_complex() for o in outs):
             raise self.refuse("complex numbers")
         written = args[0] if func._schema.is_mutable else out
@@ -230,7 +231,7 @@ class Tracer(TorchDispatchMode):
             return shortcut
         dims = tuple(n for n in shape if n != 1)
         accesses = [self.access(o.reshape(dims)) for o in spread]
-        attributes = name, dims, tuple(x for _, x in accesses)
+        attributes = dims, name, tuple(x for _, x in accesses)
         array = p.new("map", *(a for a, _ in accesses), attributes=attributes, kind="array")
         return self.elements(array, math.prod(shape)).view(shape)
 
@@ -239,12 +240,10 @@ class Tracer(TorchDispatchMode):
         firsts = [int(o.flatten()[0]) for o in operands]
         known = [self.uniform_number(o) is not None for o in operands]
         found = ELEMENTWISE[name](self.program, *firsts)  # what the rules of scalars make of it, they make of each
-        same = (
-            o
-            for o, first, plain in zip(operands, firsts, known, strict=True)
-            if found == first and (plain or any(known))
-        )
-        return next(same, None)
+        for cells, first, plain in zip(operands, firsts, known, strict=True):
+            if found == first and (plain or any(known)):
+                return cells
+        return None
 
     def uniform_number(self, cells: Tensor) -> float | None:
         """The number that all cells are known to hold; None if they hold different or unknown ones."""
@@ -261,8 +260,9 @@ class Tracer(TorchDispatchMode):
             walk = Access.over(torch.tensor([o.attributes[0] for o in found]).view(cells.shape))
             if walk is not None:
                 return found[0].operands[0], walk
-        numbers = self.numbers(cells)
-        array = self.table(numbers) if numbers else p.new("row", *map(p.as_number, flat), kind="array")
+        if numbers := self.numbers(cells):
+            return self.table(numbers), Access(0, torch.empty(cells.shape).stride())
+        array = p.new("row", *map(p.as_number, flat), attributes=(tuple(cells.shape),), kind="array")
         return array, Access(0, torch.empty(cells.shape).stride())
 
     def table(self, numbers: list[float]) -> int:
@@ -270,13 +270,9 @@ class Tracer(TorchDispatchMode):
         return self.program.new("table", attributes=tuple(x.hex() for x in numbers), kind="array")
 
 
-def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
+def tensors_in(values: Iterable[Any]) -> list[Tensor]:
     """The tensors among arguments, also within lists."""
-    for value in values:
-        if isinstance(value, Tensor):
-            yield value
-        elif isinstance(value, (list, tuple)):
-            yield from tensors_in(value)
+    return [value for value in tree_leaves(values) if isinstance(value, Tensor)]
 
 
 def in_shape(values: list[int], shape: Iterable[int]) -> Tensor:

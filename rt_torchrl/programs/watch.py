@@ -46,32 +46,33 @@ class Watch:
         """Note a global variable, which must be the same object."""
         self._globals[id(held), name] = held
 
+    def note_values(self, x: object, *reads: Callable[[Any], object]) -> None:
+        """Note functions of an object, whose values must be equal."""
+        self._values += [(read, x) for read in reads]
+
+    def note_numbers(self, x: np.ndarray) -> None:
+        """Note an array, whose numbers must be the same."""
+        same = bytearray(x.tobytes()).__eq__  # which takes no copy, but needs numbers side by side
+        self.note_values(x, same if same(x) is True else np.ndarray.tobytes)
+
     def note_tensor(self, x: Tensor, *, constant: bool) -> None:
-        """Note a tensor: its memory, and if it is constant its numbers, must be the same."""
+        """Note a tensor, whose memory must be the same, and its numbers if it is constant."""
         try:
             numbers = x.detach().numpy()
         except (RuntimeError, TypeError):  # on another device, or in a layout of its own
             self.complete = False
             return
         self.note_attributes(x, "dtype", "requires_grad")
-        self._values += [(read, x) for read in (Tensor.data_ptr, Tensor.size, Tensor.stride)]
+        self.note_values(x, Tensor.data_ptr, Tensor.size, Tensor.stride)
         if constant:
-            self._values.append((np.ndarray.tobytes, numbers))
-
-    def note_array(self, x: np.ndarray) -> None:
-        """Note an array, whose numbers must be the same."""
-        self.note_attributes(x, "dtype")
-        self._values += [(np.shape, x), (np.ndarray.tobytes, x)]
+            self.note_numbers(numbers)
 
     def begin(self) -> None:
         """Remember everything as it is now."""
         noted = (getattr, self._attributes), (dict.get, self._globals)
         self._reads = [(read, [*held.values()], [name for _, name in held]) for read, held in noted]
-        try:
-            self._objects = self._identities()  # which keeps their addresses for them
-            self._then = self._objects.tobytes(), self._contents()
-        except ValueError:  # a variable of a function has no value yet
-            self.complete = False
+        self._objects = self._identities()  # which keeps their addresses for them
+        self._then = self._objects.tobytes(), self._contents()
 
     def holds(self, root: nn.Module) -> bool:
         """Whether everything is as it was."""
