@@ -30,8 +30,6 @@ ATTRIBUTES = {
 """Attributes that are all there is to objects of a type, apart from the globals that functions read."""
 CONSTANT = (types.MethodType, np.dtype, np.generic)
 """Types of objects that pickle reads in a way of their own, and that cannot change."""
-USUAL = ("__reduce_ex__", "__reduce__", "__getstate__")
-"""Methods by which pickle reads an object."""
 
 
 class Fingerprint(NamedTuple):
@@ -92,24 +90,31 @@ class _Reader:
         return [type(obj).__name__, id(obj)]
 
     def _read(self, obj: Any) -> list[object]:
-        kind = type(obj)
-        if kind in VALUES:
+        """What tells an object from others."""
+        if type(obj) in VALUES:
             return [repr(obj)]
         if isinstance(obj, BY_ADDRESS):
             return self._address(obj)
         if isinstance(obj, type):
             return self._of_class(obj)
         if isinstance(obj, Tensor):
-            self.watch.note_tensor(obj, constant=not isinstance(obj, nn.Parameter))
-            found = [kind.__name__, tuple(obj.shape), str(obj.dtype), obj.requires_grad]
-            if not isinstance(obj, nn.Parameter):
-                found.append(_digest(obj.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()))
-            return found
-        if kind is np.ndarray and not obj.dtype.hasobject:
+            return self._of_tensor(obj)
+        if type(obj) is np.ndarray and not obj.dtype.hasobject:
             self.watch.note_attributes(obj, "dtype")
             self.watch.note_values(obj, np.shape)
             self.watch.note_numbers(obj)
             return [obj.shape, str(obj.dtype), _digest(obj)]
+        return self._of_parts(obj)
+
+    def _of_tensor(self, x: Tensor) -> list[object]:
+        found = [type(x).__name__, tuple(x.shape), str(x.dtype), x.requires_grad]
+        self.watch.note_tensor(x, constant=not isinstance(x, nn.Parameter))
+        if not isinstance(x, nn.Parameter):
+            found.append(_digest(x.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()))
+        return found
+
+    def _of_parts(self, obj: Any) -> list[object]:
+        kind = type(obj)
         if kind in (dict, OrderedDict, list, set):
             self.watch.note_collection(obj)
         if kind in (dict, OrderedDict):
@@ -142,19 +147,21 @@ class _Reader:
             self.watch.note_attributes(obj, "__class__", "__dict__")
         if isinstance(obj, nn.Module):
             return [*map(self._mention, (kind, held))]
-        usual = all(getattr(kind, name, None) is getattr(object, name, None) for name in USUAL)
-        self.watch.complete &= usual or isinstance(obj, CONSTANT)
-        reduce = copyreg.dispatch_table.get(kind)
         try:
-            reduced = reduce(obj) if reduce else obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+            reduced = copyreg.dispatch_table.get(kind, _reduced)(obj)
         except Exception:  # an object may refuse with any error
             return self._address(obj)
         if isinstance(reduced, str):  # the name of a global, which may not be there, as in a function
             return self._address(obj)
-        parts = [list(part) if isinstance(part, Iterator) else part for part in reduced]
-        if usual and (reduce or len(parts[1]) > 1 or parts[2] is not (held or None) or reduced[3:] != (None, None)):
-            self.watch.complete = False  # it has slots, arguments or elements, which are not compared
+        made, given, state, *elements = (*reduced, None, None)[:5]
+        plain = made is copyreg.__newobj__ and given == (kind,) and state is (held or None) and elements == [None, None]
+        self.watch.complete &= plain or isinstance(obj, CONSTANT)
+        parts = (list(part) if isinstance(part, Iterator) else part for part in reduced)
         return [*map(self._mention, parts)]
+
+
+def _reduced(obj: Any) -> Any:
+    return obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
 
 
 def _digest(numbers: np.ndarray) -> bytes:

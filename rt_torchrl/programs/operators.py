@@ -88,10 +88,7 @@ def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = 
         return in_shape(found, (m, n))
     if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
         return first
-    accesses = [tracer.access(x) for x in (a, b, first)]
-    attributes = (m, n), k, tuple(x for _, x in accesses)
-    array = p.new("product", *(i for i, _ in accesses), attributes=attributes, kind="array")
-    return tracer.elements(array, m * n).view(m, n)
+    return tracer.loop("product", (a, b, first), (m, n), k)
 
 
 def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -166,26 +167,8 @@ class Program:
             return self.new("pow", a, b)
         if y == 0.0:
             return one
-        found = self.apply("sqrt", a) if abs(y) == 0.5 else self._integer_power(a, int(abs(y)))
+        found = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
         return found if y > 0 else self.apply("div", one, found)
-
-    def _integer_power(self, a: int, exponent: int) -> int:
-        if exponent == 1:
-            return a
-        half = self._integer_power(a, exponent // 2)
-        square = self.apply("mul", half, half)
-        return self.apply("mul", square, a) if exponent % 2 else square
-
-    def _extreme(self, how: str, a: int, b: int) -> int:
-        """Minimum or maximum; NaN if one of the two is NaN."""
-        if self.number(b) is not None:
-            a, b = b, a
-        if self.number(a) != self.number(a):
-            return a
-        first = self.apply(how, a, b)
-        if self.number(a) is None:  # where b is NaN the comparison fails and b is chosen
-            first = self.logic("or", first, self.apply("ne", a, a))
-        return self.select(first, a, b)
 
 
 SIMPLER: dict[str, Callable[..., int]] = {
@@ -194,7 +177,5 @@ SIMPLER: dict[str, Callable[..., int]] = {
     "mul": Program._mul,
     "div": Program._div,
     "pow": Program._pow,
-    "minimum": lambda p, a, b: p._extreme("lt", a, b),
-    "maximum": lambda p, a, b: p._extreme("gt", a, b),
 }
 """Functions of numbers that may become simpler ones."""

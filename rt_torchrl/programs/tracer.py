@@ -230,10 +230,14 @@ class Tracer(TorchDispatchMode):
         if (shortcut := self._shortcut(name, spread)) is not None:
             return shortcut
         dims = tuple(n for n in shape if n != 1)
-        accesses = [self.access(o.reshape(dims)) for o in spread]
-        attributes = dims, name, tuple(x for _, x in accesses)
-        array = p.new("map", *(a for a, _ in accesses), attributes=attributes, kind="array")
-        return self.elements(array, math.prod(shape)).view(shape)
+        return self.loop("map", [o.reshape(dims) for o in spread], dims, name).view(shape)
+
+    def loop(self, kind: str, operands: Iterable[Tensor], dims: tuple[int, ...], what: Any) -> Tensor:
+        """The cells of an array that a loop computes, see :class:`Program`."""
+        accesses = [self.access(o) for o in operands]
+        attributes = dims, what, tuple(x for _, x in accesses)
+        array = self.program.new(kind, *(a for a, _ in accesses), attributes=attributes, kind="array")
+        return self.elements(array, math.prod(dims)).view(dims)
 
     def _shortcut(self, name: str, operands: list[Tensor]) -> Tensor | None:
         """The result on a long row that needs no loop, such as 0·x or x + 0; None if it needs one."""
