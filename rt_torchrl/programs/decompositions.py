@@ -21,6 +21,12 @@ def _variance(x: Tensor, dim: Any = None, correction: int | float | None = None,
     return total / max(0.0, x.numel() / max(1, total.numel()) - (1.0 if correction is None else correction))
 
 
+def _scatter_add(x: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
+    places = [*torch.meshgrid(*map(torch.arange, index.shape), indexing="ij")]
+    places[dim] = index
+    return x.index_put(places, source[tuple(map(slice, index.shape))], accumulate=True)
+
+
 def _bucketize(x: Any, knots: Tensor, *, out_int32: bool = False, right: bool = False) -> Tensor:
     above = (torch.gt if right else torch.ge)(knots, torch.as_tensor(x).unsqueeze(-1))
     return (~above).sum(-1)  # NaN is above nothing
@@ -46,6 +52,7 @@ def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Ca
 SIMPLER: dict[str, Callable[..., Any]] = {
     "mean": _mean,
     "var": _variance,
+    "scatter_add": _scatter_add,
     "bucketize": _bucketize,
     "searchsorted": lambda knots, x, side="", **how: _bucketize(x, knots, **{"right": side == "right", **how}),
     "cumsum": _cumulative(torch.add),

@@ -22,8 +22,6 @@ def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
         convert: Callable[[int], int] = p.as_truth
     elif out.is_floating_point() and out.dtype != torch.float64:
         raise tracer.refuse(f"a conversion to {out.dtype}; trajectories need torch.float64")
-    elif out.is_complex():
-        raise tracer.refuse("complex numbers")
     elif args[0].is_floating_point() and not out.is_floating_point():
         convert = partial(p.apply, "trunc")
     else:
@@ -133,6 +131,7 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
 RULES: dict[str, Rule] = {
     **COPIES,
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
+    "zero": lambda tracer, args, options, out: tracer.cells(0.0),
     "_to_copy": _convert,
     "sum": _sum,
     "amax": _fold("maximum"),

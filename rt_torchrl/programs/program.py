@@ -58,7 +58,7 @@ class Program:
         self.differentiating = False
         """While co-states are traced, 0·x is zero: a value that the result does not depend on has no derivative. In
         the trajectory itself 0·x stays, because x may be infinite or NaN."""
-        self._numbers: dict[int, float] = {}
+        self.numbers: dict[int, float] = {}
         self._known: dict[Operation, int] = {}
 
     def new(self, name: str, *operands: int, attributes: tuple[Any, ...] = (), kind: Kind = "number") -> int:
@@ -74,12 +74,12 @@ class Program:
         """A number or a truth value that is known."""
         kind: Kind = "truth" if isinstance(value, bool) else "number"
         found = self.new("constant", attributes=(kind, float(value).hex()), kind=kind)
-        self._numbers[found] = float(value)
+        self.numbers[found] = float(value)
         return found
 
     def number(self, value: int) -> float | None:
         """The number that a value is known to have; None if it is computed later."""
-        return self._numbers.get(value)
+        return self.numbers.get(value)
 
     def needed(self, outputs: Iterable[int]) -> list[int]:
         """The values that the outputs depend on, in the order of their computation."""

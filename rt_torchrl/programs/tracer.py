@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ DECISIONS = frozenset({"_local_scalar_dense", "is_nonzero", "equal", "nonzero"})
 """Operators by which Python takes a number or a branch from a tensor."""
 FILLS = frozenset(
     "zeros ones full empty zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty "
-    "scalar_tensor arange eye linspace empty_strided new_empty_strided zero".split()
+    "scalar_tensor arange eye linspace empty_strided new_empty_strided".split()
 )
 
 Arguments = tuple[Any, ...]
@@ -46,7 +47,8 @@ class Tracer(TorchDispatchMode):
         super().__init__()
         self.program = Program()
         self.places = Places()
-        self._rules = rules
+        elementwise = {name: partial(Tracer._elementwise, name=name) for name in ELEMENTWISE}
+        self._rules: dict[str, Rule] = {**dict.fromkeys(FILLS, Tracer._filled), **elementwise, **rules}
         self._cells: dict[int, Tensor] = {}
         self._sizes = Counter[str]()  # of the inputs by their names, and of the weights
         self._alive: list[Tensor] = []  # a storage that is freed could give its address to another one
@@ -102,8 +104,8 @@ class Tracer(TorchDispatchMode):
 
     def numbers(self, cells: Tensor) -> list[float] | None:
         """The numbers that all cells are known to hold; None if one of them is computed later."""
-        found = [self.program.number(i) for i in cells.flatten().tolist()]
-        return None if None in found else [x for x in found if x is not None]
+        values, known = cells.flatten().tolist(), self.program.numbers
+        return [known[i] for i in values] if all(i in known for i in values) else None
 
     def refuse(self, what: str) -> UntraceableError:
         """The error of code that cannot become a program, with the line of the caller's code."""
@@ -125,7 +127,7 @@ class Tracer(TorchDispatchMode):
             if packet in DECISIONS:
                 self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
                 return func(*args, **kwargs)
-            known = name in ELEMENTWISE or name in FILLS or name in self._rules or name in SIMPLER
+            known = name in self._rules or name in SIMPLER
             if not known and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
                     return func.decompose(*args, **kwargs)
@@ -150,11 +152,9 @@ class Tracer(TorchDispatchMode):
     def _foldable(self, args: tuple[Any, ...]) -> bool:
         """Whether all tensors among arguments hold known numbers, which are those of torch."""
         exact = not self.program.differentiating  # 0·x may be NaN for torch
-        return all((exact or not x.is_floating_point()) and self._known(x) for x in tensors_in(args))
-
-    def _known(self, x: Tensor) -> bool:
-        cells = self.cells(x)
-        return not cells.numel() or self.program.number(int(cells.flatten()[0])) is not None is not self.numbers(cells)
+        return all(
+            (exact or not x.is_floating_point()) and self.numbers(self.cells(x)) is not None for x in tensors_in(args)
+        )
 
     def _folded(self, func: Any, args: Arguments, kwargs: Options) -> Any:
         """What an operator makes of known numbers: known numbers, whatever the operator is."""
@@ -175,7 +175,9 @@ class Tracer(TorchDispatchMode):
         if any(o.is_complex() for o in outs):
             raise self.refuse("complex numbers")
         written = args[0] if func._schema.is_mutable else out
-        found = self._translated(func, self._computed, func, name, args, kwargs, written)
+        if name not in self._rules:
+            raise self.refuse(f"torch operator {func} has no translation")
+        found = self._translated(func, self._rules[name], self, args, kwargs, written)
         if func._schema.is_mutable:
             if not func._schema.arguments[0].is_write or len(outs) != 1:
                 raise self.refuse(f"{func} writes into its argument out")
@@ -194,17 +196,10 @@ class Tracer(TorchDispatchMode):
         except Exception as error:
             raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
 
-    def _computed(self, func: Any, name: str, args: Arguments, kwargs: Options, out: Any) -> Any:
-        """The cells of what an operator computes."""
-        if name in FILLS:
-            return self._constants(torch.zeros(()) if name == "zero" else out)
-        if name in self._rules:
-            return self._rules[name](self, args, kwargs, out)
-        if name in ELEMENTWISE:
-            return self._elementwise(name, args, kwargs, out)
-        raise self.refuse(f"torch operator {func} has no translation")
+    def _filled(self, args: Arguments, kwargs: Options, out: Tensor) -> Tensor:
+        return self._constants(out)
 
-    def _elementwise(self, name: str, args: Arguments, kwargs: Options, out: Tensor) -> Tensor:
+    def _elementwise(self, args: Arguments, kwargs: Options, out: Tensor, name: str) -> Tensor:
         if out.is_floating_point() and out.dtype != torch.float64:
             raise self.refuse(f"{name} computes in {out.dtype}; trajectories need torch.float64")
         unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "rounding_mode", "dtype"))]
