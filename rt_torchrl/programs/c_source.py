@@ -11,6 +11,8 @@ from rt_torchrl.programs.operations import FORMS
 from rt_torchrl.programs.program import Program
 
 WIDTH = 110
+Inputs = Mapping[tuple[str, int], str]
+Outputs = Sequence[tuple[str, int]]
 
 
 class CSource:
@@ -25,15 +27,7 @@ class CSource:
         self._tables: dict[str, str] = {}
         self._weights = weights
 
-    def add(
-        self,
-        head: str,
-        program: Program,
-        inputs: Mapping[tuple[str, int], str],
-        outputs: Sequence[tuple[str, int]],
-        *,
-        last: Sequence[str] = (),
-    ) -> None:
+    def add(self, head: str, program: Program, inputs: Inputs, outputs: Outputs, *, last: Sequence[str] = ()) -> None:
         """Add a function that reads all its inputs before it writes an output, so that both may be one array.
 
         Args:

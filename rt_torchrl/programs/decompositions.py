@@ -70,13 +70,9 @@ SIMPLER: dict[str, Callable[..., Any]] = {
 """Operators that are common enough to do without the tables of torch."""
 
 
-def known_to_torch(func: Any) -> Callable[..., Any] | None:
-    """The way in which torch computes an operator by simpler ones; None if it knows none."""
-    return _tables().get(func)
-
-
 @cache
-def _tables() -> dict[Any, Callable[..., Any]]:
+def tables_of_torch() -> dict[Any, Callable[..., Any]]:
+    """The ways in which torch computes operators by simpler ones."""
     # These tables take a third of a second to import, and most code needs none of them.
     from torch._decomp import core_aten_decompositions, decomposition_table
 

@@ -1,9 +1,7 @@
 """Outer names: the globals that the code of classes and functions reads, which traced programs depend on."""
 
 import inspect
-import sys
 import types
-from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any
 
@@ -11,8 +9,8 @@ import numpy as np
 from torch import Tensor
 
 DATA = (bool, int, float, complex, str, Tensor, np.ndarray, np.generic)
-FOREIGN = sys.stdlib_module_names | frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype".split())
-"""Packages whose globals do not change, those of Python among them."""
+FOREIGN = frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype builtins typing abc math".split())
+"""Packages whose globals do not change."""
 
 Name = tuple[dict[str, Any], str]
 
@@ -27,16 +25,12 @@ def read_by(*functions: object) -> list[Name]:
             continue
         seen.add(f)
         names = _names(f.__code__)
-        for held in [f.__globals__, *_modules(f.__globals__, names)]:
+        modules = (x for x in map(f.__globals__.get, names) if isinstance(x, types.ModuleType))
+        for held in [f.__globals__, *(vars(module) for module in modules if not foreign(module.__name__))]:
             here = [name for name in names if name in held and not isinstance(held[name], types.ModuleType)]
             found |= {(id(held), name): (held, name) for name in here}
             stack += [function_of(held[name]) for name in here]
     return list(found.values())
-
-
-def _modules(held: dict[str, Any], names: Iterable[str]) -> list[dict[str, Any]]:
-    modules = [held[name] for name in names if isinstance(held.get(name), types.ModuleType)]
-    return [vars(module) for module in modules if not foreign(module.__name__)]
 
 
 @lru_cache(maxsize=2**14)

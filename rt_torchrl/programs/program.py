@@ -37,11 +37,13 @@ class Access(NamedTuple):
     def over(cls, places: Tensor) -> "Access | None":
         """The way to walk through places on an even grid; None if they are on no such grid."""
         base = int(places.flatten()[0])
-        firsts = [int(places.movedim(d, 0)[1].flatten()[0]) if n > 1 else base for d, n in enumerate(places.shape)]
-        grid, strides = torch.tensor(base), tuple(first - base for first in firsts)
-        for d, (n, stride) in enumerate(zip(places.shape, strides, strict=True)):
-            grid = grid + (torch.arange(n) * stride).view([-1 if e == d else 1 for e in range(places.ndim)])
-        return cls(base, strides) if torch.equal(grid.expand(places.shape), places) else None
+        neighbours = [int(places.movedim(d, 0)[1].flatten()[0]) if n > 1 else base for d, n in enumerate(places.shape)]
+        strides = tuple(neighbour - base for neighbour in neighbours)
+        last = base + sum((n - 1) * stride for n, stride in zip(places.shape, strides, strict=True))
+        if min(strides, default=0) < 0:
+            return None
+        grid = torch.arange(last + 1).as_strided(places.shape, strides, base)
+        return cls(base, strides) if torch.equal(grid, places) else None
 
 
 class Program:

@@ -12,7 +12,7 @@ from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from rt_torchrl.programs.decompositions import SIMPLER, known_to_torch
+from rt_torchrl.programs.decompositions import SIMPLER, tables_of_torch
 from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
 from rt_torchrl.programs.places import Places
 from rt_torchrl.programs.program import Access, Program, UntraceableError
@@ -144,7 +144,7 @@ class Tracer(TorchDispatchMode):
                 with self:
                     found = self._translated(func, SIMPLER[name], *args, **kwargs)
                     return args[0].copy_(found) if in_place else found
-            if not known and not in_place and (decomposition := known_to_torch(func)):
+            if not known and not in_place and (decomposition := tables_of_torch().get(func)):
                 with self:
                     return decomposition(*args, **kwargs)
             return self._executed(func, name, args, kwargs)
