@@ -23,7 +23,8 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.groups import Group
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.programs import Programs, programs_of
+from rt_torchrl.trajectories.engines.programs import programs_of
+from rt_torchrl.trajectories.engines.traced_interval import Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 from rt_torchrl.trajectories.rollout import require_double
 

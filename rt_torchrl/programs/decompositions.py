@@ -22,7 +22,7 @@ def _variance(x: Tensor, dim: Any = None, correction: int | float | None = None,
 
 
 def _scatter_add(x: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
-    places = [*torch.meshgrid(*map(torch.arange, index.shape), indexing="ij")]
+    places: list[Tensor | None] = [*torch.meshgrid(*map(torch.arange, index.shape), indexing="ij")]
     places[dim] = index
     return x.index_put(places, source[tuple(map(slice, index.shape))], accumulate=True)
 

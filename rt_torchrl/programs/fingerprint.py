@@ -30,6 +30,8 @@ ATTRIBUTES = {
 """Attributes that are all there is to objects of a type, apart from the globals that functions read."""
 CONSTANT = (types.MethodType, np.dtype, np.generic)
 """Types of objects that pickle reads in a way of their own, and that cannot change."""
+PLAIN = object().__reduce_ex__(pickle.HIGHEST_PROTOCOL)[0]
+"""The function by which pickle makes objects that are nothing but their attributes."""
 
 
 class Fingerprint(NamedTuple):
@@ -63,7 +65,7 @@ class _Reader:
 
     def __init__(self, root: nn.Module):
         self.watch, self.alive = Watch(root), list[object]()
-        self._root, self._met, self._numbers = root, [root], {id(root): 0}  # an object is read once
+        self._root, self._met, self._numbers = root, list[Any]([root]), {id(root): 0}  # an object is read once
         self._functions: list[object] = []  # of classes and modules, which read globals
 
     def text(self) -> list[list[object]]:
@@ -154,7 +156,7 @@ class _Reader:
         if isinstance(reduced, str):  # the name of a global, which may not be there, as in a function
             return self._address(obj)
         made, given, state, *elements = (*reduced, None, None)[:5]
-        plain = made is copyreg.__newobj__ and given == (kind,) and state is (held or None) and elements == [None, None]
+        plain = made is PLAIN and given == (kind,) and state is (held or None) and elements == [None, None]
         self.watch.complete &= plain or isinstance(obj, CONSTANT)
         parts = (list(part) if isinstance(part, Iterator) else part for part in reduced)
         return [*map(self._mention, parts)]

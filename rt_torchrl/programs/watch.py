@@ -69,7 +69,8 @@ class Watch:
 
     def begin(self) -> None:
         """Remember everything as it is now."""
-        noted = (getattr, self._attributes), (dict.get, self._globals)
+        noted: list[tuple[Callable[..., object], dict[tuple[int, str], Any]]] = [(getattr, self._attributes)]
+        noted.append((dict.get, self._globals))
         self._reads = [(read, [*held.values()], [name for _, name in held]) for read, held in noted]
         self._objects = self._identities()  # which keeps their addresses for them
         self._then = self._objects.tobytes(), self._contents()
@@ -86,7 +87,8 @@ class Watch:
             return False
 
     def _identities(self) -> np.ndarray:
-        return np.fromiter(chain(chain.from_iterable(self._filled), *(map(*read) for read in self._reads)), object)
+        reads = (map(read, held, names) for read, held, names in self._reads)
+        return np.fromiter(chain(chain.from_iterable(self._filled), *reads), object)
 
     def _contents(self) -> list[object]:
         return [*map(len, self._filled), *(read(x) for read, x in self._values)]

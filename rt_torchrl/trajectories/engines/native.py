@@ -24,7 +24,8 @@ from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.groups import Group, for_each_group
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
-from rt_torchrl.trajectories.engines.programs import Programs, programs_of
+from rt_torchrl.trajectories.engines.programs import programs_of
+from rt_torchrl.trajectories.engines.traced_interval import Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 
 MEMORY = 2.0**30
@@ -70,7 +71,7 @@ class Native(GradientEngine):
     def own_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """The same by machine code; None, with a warning that says why, if the interval cannot become a program."""
         task = self._task(interval, initial_state, drive)
-        ends: Tensor | None = task and _EndStates.apply(task, *task.leaves)
+        ends: Tensor | None = None if task is None else _EndStates.apply(task, *task.leaves)
         return ends
 
     def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
@@ -81,7 +82,8 @@ class Native(GradientEngine):
         if self._costed is None or self._costed.interval is not interval:
             self._costed = CostInterval(interval)
         task = self._task(self._costed, nn.functional.pad(initial_state, (0, 1)), drive)
-        costs: Tensor | None = task and _Costs.apply(task, torch.is_grad_enabled(), *task.leaves)
+        enabled = torch.is_grad_enabled()
+        costs: Tensor | None = None if task is None else _Costs.apply(task, enabled, *task.leaves)
         return costs
 
     def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":

@@ -112,7 +112,7 @@ class Programs:
         leaves = [x.clone().requires_grad_() for x in (self.point.state, *self.point.drive)]
         with torch.enable_grad():
             end = interval(leaves[0], Drive(*leaves[1:]))
-            state, t, *rest = _gradients(end, leaves + weights.learned, torch.from_numpy(costate.T))
+            state, t, *rest = _gradients(end, [*leaves, *weights.learned], torch.from_numpy(costate.T))
         exact = [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
         found = [by_state.T, by_drive[0].T if driven else exact[1], *weights.split(by_weights.sum(-1))]
         floor = ROUNDING / AGREEMENT * max(x[x.isfinite()].abs().amax().item() for x in exact if x.isfinite().any())
