@@ -104,6 +104,9 @@ class Lowering:
 
     def _map(self, array: str, operands: Sequence[int], dims: Sequence[int], name: str, accesses: Accesses) -> None:
         strides, body = [math.prod(dims[d + 1 :]) for d in range(len(dims))], Program()
+        if all(access is None or list(access.strides) == strides for access in accesses):
+            dims, strides = [math.prod(dims)], [1]  # all operands are walked through in order: one loop will do
+            accesses = [access and Access(access.base, (1,)) for access in accesses]
         with self._loops(dims) as indices:
             read = {("x", k): self._read(*pair, indices) for k, pair in enumerate(zip(operands, accesses, strict=True))}
             found = ELEMENTWISE[name](body, *(body.new("input", attributes=key) for key in read))
