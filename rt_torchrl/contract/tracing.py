@@ -12,7 +12,8 @@ from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines.compilation import raised_limits
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise
-from rt_torchrl.trajectories.engines.programs import Programs, point_of
+from rt_torchrl.trajectories.engines.programs import point_of
+from rt_torchrl.trajectories.engines.traced_interval import Programs
 
 REMEDY = (
     "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "

@@ -23,7 +23,8 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.groups import Group
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.programs import Programs, programs_of
+from rt_torchrl.trajectories.engines.programs import programs_of
+from rt_torchrl.trajectories.engines.traced_interval import Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 from rt_torchrl.trajectories.rollout import require_double
 
@@ -155,7 +156,7 @@ class CommandCost:
     def _place(self, programs: Programs) -> None:
         """Lay out the arrays of the window, one set for each group of lanes."""
         lanes, batch = programs.lanes.number, len(self._state)
-        n, n_s, n_x = self.n, self._state.shape[1], programs.march.sizes["x"]
+        n, n_s, n_x = self.n, self._state.shape[1], programs.sizes["x"]
         groups = [Group(first, min(first + lanes, batch), lanes) for first in range(0, batch, lanes)]
         if getattr(self, "_shape", None) != (n, batch):
             self._shape = n, batch
@@ -204,7 +205,7 @@ class CommandCost:
             costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
         by_weights = np.zeros((0, group.lanes))
         arrays = (self._costate, self._weights, self._by_drive, by_weights)
-        programs.sweep(True)(x, states, self._nothing, *arrays, n)
+        programs.sweeps[True](x, states, self._nothing, 0, *arrays, n)
         by_blocks = np.add.reduceat(self._by_drive[:, -n_a:], self._first_block, 0)
         gradient[group.first : group.last] = by_blocks[:, :, : group.live].transpose(2, 0, 1)
 

@@ -11,6 +11,8 @@ from rt_torchrl.programs.operations import FORMS
 from rt_torchrl.programs.program import Program
 
 WIDTH = 110
+Inputs = Mapping[tuple[str, int], str]
+Outputs = Sequence[tuple[str, int]]
 
 
 class CSource:
@@ -25,15 +27,7 @@ class CSource:
         self._tables: dict[str, str] = {}
         self._weights = weights
 
-    def add(
-        self,
-        head: str,
-        program: Program,
-        inputs: Mapping[tuple[str, int], str],
-        outputs: Sequence[tuple[str, int]],
-        *,
-        last: Sequence[str] = (),
-    ) -> None:
+    def add(self, head: str, program: Program, inputs: Inputs, outputs: Outputs, *, last: Sequence[str] = ()) -> None:
         """Add a function that reads all its inputs before it writes an output, so that both may be one array.
 
         Args:
@@ -44,9 +38,8 @@ class CSource:
             last: statements at its end.
         """
         values = [value for _, value in outputs]
-        needed = [program.operations[i].attributes for i in program.needed(values) if _is_input(program, i)]
-        writer = CWriter(self._tables)
-        names = {key: f"{key[0]}_{key[1]}" for key in needed}
+        needed, writer = [program.operations[i] for i in program.needed(values)], CWriter(self._tables)
+        names = {o.attributes: f"{o.attributes[0]}_{o.attributes[1]}" for o in needed if o.name == "input"}
         writer.lines += [f"const double {name} = {inputs[key]};" for key, name in names.items()]
         found = Lowering(program, writer, names, "weights").write(values)
         writer.lines += [f"{place} = {x};" for (place, _), x in zip(outputs, found, strict=True)]
@@ -133,25 +126,12 @@ class CWriter:
         self._depth -= 1
         self._emit("}")
 
-    def variable(self, start: str) -> str:
-        return self._new("double", f" = {start}")
-
-    def get(self, variable: str) -> str:
-        return variable
-
-    def put(self, variable: str, operand: str) -> None:
-        self._emit(f"{variable} = {operand};")
-
 
 def literal(number: float) -> str:
     """A number in C, which is read back to the bit."""
     if not math.isfinite(number):
         return "NAN" if math.isnan(number) else "INFINITY" if number > 0 else "(-INFINITY)"
     return f"({number!r})" if math.copysign(1.0, number) < 0 else repr(number)
-
-
-def _is_input(program: Program, value: int) -> bool:
-    return program.operations[value].name == "input"
 
 
 def _wrapped(numbers: Sequence[float]) -> str:

@@ -6,10 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rt_torchrl.programs.tracer import Rule, Tracer
-
-Arguments = tuple[Any, ...]
-Options = dict[str, Any]
+from rt_torchrl.programs.tracer import Arguments, Options, Rule, Tracer, in_shape
 
 
 def _copy_by(name: str) -> Rule:
@@ -51,33 +48,15 @@ def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
     return found.movedim(-1, dim)
 
 
-def _scatter_add(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    tracer.require_known("scatter_add by an index that varies", args[2:3])
-    places = torch.arange(args[0].numel()).view(args[0].shape)
-    window = places[tuple(slice(n) if d != args[1] % places.ndim else slice(None) for d, n in enumerate(args[2].shape))]
-    return _added(tracer, args[0], window.gather(args[1], args[2]), tracer.cells(args[3]))
-
-
 def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     tracer.require_known("an assignment to places that vary", args[1])
     target, indices, values = args[:3]
     places = torch.ops.aten.index.Tensor(torch.arange(target.numel()).view(target.shape), indices)
-    source = tracer.cells(values).expand(places.shape)
-    if (*args[3:], options.get("accumulate", False))[0]:
-        return _added(tracer, target, places, source)
-    cells = tracer.cells(target).clone(memory_format=torch.contiguous_format)
-    cells.view(-1)[places.flatten()] = source.flatten()
-    return cells
-
-
-def _added(tracer: Tracer, target: Tensor, places: Tensor, values: Tensor) -> Tensor:
-    """The cells of a tensor with values added at places, of which several may be the same."""
-    found = tracer.cells(target).flatten().tolist()
-    for place, value in zip(
-        places.flatten().tolist(), values[tuple(map(slice, places.shape))].flatten().tolist(), strict=True
-    ):
-        found[place] = tracer.program.apply("add", found[place], value)
-    return torch.tensor(found, dtype=torch.int64).view(target.shape)
+    source, found = tracer.cells(values).expand(places.shape), tracer.cells(target).flatten().tolist()
+    added = (*args[3:], options.get("accumulate", False))[0]
+    for place, value in zip(places.flatten().tolist(), source.flatten().tolist(), strict=True):
+        found[place] = tracer.program.apply("add", found[place], value) if added else value
+    return in_shape(found, target.shape)
 
 
 def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
@@ -94,7 +73,6 @@ COPIES: dict[str, Rule] = {
     **{name: _copy_by(name) for name in (*PLAIN, *INDEXED)},
     **dict.fromkeys(("copy", "fill"), _overwrite),
     "scatter": _scatter,
-    "scatter_add": _scatter_add,
     **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),
     "constant_pad_nd": _pad,
 }

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from rt_torchrl.programs.operations import ARITHMETIC, COMPARISONS, FUNCTIONS, ROUNDED
+from rt_torchrl.programs.operations import ARITHMETIC, COMPARISONS, EXTREMES, FUNCTIONS, ROUNDED
 from rt_torchrl.programs.program import Program
 
 Scalar = Callable[..., int]
@@ -51,7 +51,7 @@ OF_ONE: dict[str, Scalar] = {
     "sigmoid": _sigmoid,
 }
 OF_TWO: dict[str, Scalar] = {
-    **{name: _to(name) for name in (*ARITHMETIC, *COMPARISONS, "minimum", "maximum")},
+    **{name: _to(name) for name in (*ARITHMETIC, *COMPARISONS, *EXTREMES)},
     **{name: _to(name) for name, count in FUNCTIONS.items() if count == 2},
     **{f"{how}_{name}": _logic(name) for how in ("logical", "bitwise") for name in ("and", "or", "xor")},
     "fmin": _number_of("lt"),

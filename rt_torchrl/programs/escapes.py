@@ -1,12 +1,11 @@
 """Escapes: methods by which numbers leave torch, where a tracer cannot follow them."""
 
-from collections.abc import Callable, Iterable
 from typing import Any
 
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from rt_torchrl.programs.tracer import Tracer
+from rt_torchrl.programs.tracer import Arguments, Options, Tracer
 
 ESCAPES = {
     getattr(Tensor, name): name
@@ -25,13 +24,7 @@ class Escapes(TorchFunctionMode):
         super().__init__()
         self._tracer = tracer
 
-    def __torch_function__(
-        self,
-        func: Callable[..., Any],
-        types: Iterable[type],
-        args: tuple[Any, ...] = (),
-        kwargs: dict[str, Any] | None = None,
-    ) -> Any:
+    def __torch_function__(self, func: Any, types: Any, args: Arguments = (), kwargs: Options | None = None) -> Any:
         if func in ESCAPES:
             self._tracer.require_known(f".{ESCAPES[func]}() takes a number from a tensor that varies", args)
         return func(*args, **(kwargs or {}))

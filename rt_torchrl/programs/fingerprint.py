@@ -2,20 +2,36 @@
 
 import copyreg
 import hashlib
-import io
 import pickle
+import random
 import types
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterator
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.programs.outer_names import DATA, Name, function_of, own_classes, read_by
-from rt_torchrl.programs.watch import BY_ADDRESS, DICTIONARIES, Watch
+from rt_torchrl.programs.outer_names import DATA, foreign, function_of, read_by
+from rt_torchrl.programs.watch import Watch
 
-PLAIN = frozenset({str, int, float, bool, type(None), tuple, list, dict, OrderedDict, bytes, torch.Size})
+VALUES = frozenset({str, int, float, complex, bool, type(None), bytes, torch.Size, torch.dtype, torch.device})
+"""Types of objects that their text describes."""
+GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
+"""Objects that change whenever they are used, and that no program depends on."""
+BY_ADDRESS = (types.BuiltinFunctionType, types.CodeType, types.ModuleType, *GENERATORS)
+"""Types of objects that a fingerprint knows by their address."""
+ATTRIBUTES = {
+    types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__", "__dict__"),
+    types.CellType: ("cell_contents",),
+}
+"""Attributes that are all there is to objects of a type, apart from the globals that functions read."""
+CONSTANT = (types.MethodType, np.dtype, np.generic)
+"""Types of objects that pickle reads in a way of their own, and that cannot change."""
+PLAIN = object().__reduce_ex__(pickle.HIGHEST_PROTOCOL)[0]
+"""The function by which pickle makes objects that are nothing but their attributes."""
 
 
 class Fingerprint(NamedTuple):
@@ -38,85 +54,117 @@ def fingerprint(module: nn.Module) -> Fingerprint:
     Constants and buffers become a part of a program, and so do the global variables that the code of the module reads.
     A module with another constant has another fingerprint, so that it is traced anew.
     """
-    text, watch = io.BytesIO(), Watch(module)
-    pickler = _Pickler(text, watch)
-    pickler.dump(module)
-    pickler.dump_classes()
-    watch.begin()
-    return Fingerprint(hashlib.sha256(text.getvalue()).digest(), tuple(pickler.alive), watch)
+    reader = _Reader(module)
+    text = repr(reader.text()).encode(errors="surrogatepass")
+    reader.watch.begin()
+    return Fingerprint(hashlib.sha256(text).digest(), tuple(reader.alive), reader.watch)
 
 
-class _Pickler(pickle.Pickler):
-    """Pickles a module with short names for what is large, shared or cannot be pickled."""
+class _Reader:
+    """Reads a module and everything that it holds, as pickle does, and notes it in a watch."""
 
-    def __init__(self, file: io.BytesIO, watch: Watch):
-        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self.alive: list[object] = []
-        self._watch = watch
-        self._parameters: dict[int, int] = {}
-        self._classes: dict[type, None] = {}
+    def __init__(self, root: nn.Module):
+        self.watch, self.alive = Watch(root), list[object]()
+        self._root, self._met, self._numbers = root, list[Any]([root]), {id(root): 0}  # an object is read once
+        self._functions: list[object] = []  # of classes and modules, which read globals
 
-    def dump_classes(self) -> None:
-        """Pickle what the methods of all classes read."""
-        kinds = dict.fromkeys(base for each in self._classes for base in own_classes(each))
-        attributes = [attribute for kind in kinds for attribute in vars(kind).values()]
-        for kind in kinds:
-            self._watch.note_class(kind)
-        self.dump([*map(self._by_address, attributes), *self._values(read_by(*map(function_of, attributes)))])
-
-    def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, type):
-            self._classes[obj] = None
-            return self._by_address(obj)
-        self._watch.note(obj)
-        if type(obj) in PLAIN:
-            return None
-        if isinstance(obj, BY_ADDRESS):
-            return self._by_address(obj)
-        if isinstance(obj, nn.Parameter):  # one that is shared is one input of a program
-            number = self._parameters.setdefault(id(obj), len(self._parameters))
-            return "parameter", number, tuple(obj.shape), str(obj.dtype), obj.requires_grad
-        if isinstance(obj, Tensor):
-            content = obj.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
-            return "tensor", tuple(obj.shape), str(obj.dtype), obj.requires_grad, hashlib.sha256(content).digest()
-        return None
-
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, nn.Module):  # most of its dictionaries are for hooks, and empty
-            self._classes[type(obj)] = None
-            held = {k: v for k, v in vars(obj).items() if type(v) not in DICTIONARIES or v}
-            return _Known, self._by_address(type(obj)), held
-        if isinstance(obj, types.FunctionType):
-            own = [_content(cell) for cell in obj.__closure__ or ()], obj.__defaults__, obj.__kwdefaults__
-            return _Known, self._by_address(obj.__code__), [*own, vars(obj), *self._values(read_by(obj))]
-        try:
-            reduce = copyreg.dispatch_table.get(type(obj))
-            reduced = reduce(obj) if reduce else obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
-        except Exception:  # an object may refuse with any error
-            return _Known, self._by_address(obj)
-        # A text names a global, which may not be there, as in a function.
-        return (_Known, self._by_address(obj)) if isinstance(reduced, str) else reduced
-
-    def _values(self, names: Iterable[Name]) -> list[object]:
-        """The present values of outer names: data by their content, anything else by its address."""
-        found: list[object] = []
-        for held, name in names:
-            self._watch.note_name(held, name)
+    def text(self) -> list[list[object]]:
+        """What tells the module from others."""
+        found = [self._read(obj) for obj in self._met]  # which grows meanwhile
+        count = len(found)
+        for held, name in read_by(*self._functions):
+            self.watch.note_global(held, name)
             x = held.get(name)
-            found.append(x if isinstance(x, DATA) else self._by_address(x)[1])
+            found.append([self._mention(x)] if isinstance(x, DATA) else self._address(x))
+        return [*found, *map(self._read, islice(self._met, count, None))]
+
+    def _mention(self, obj: object) -> object:
+        """A value by its text, and any other object by its number, under which it is read later."""
+        if type(obj) in VALUES:
+            return repr(obj)
+        if id(obj) not in self._numbers:
+            self._numbers[id(obj)] = len(self._met)
+            self._met.append(obj)
+        return self._numbers[id(obj)]
+
+    def _address(self, obj: object) -> list[object]:
+        self.alive.append(obj)
+        return [type(obj).__name__, id(obj)]
+
+    def _read(self, obj: Any) -> list[object]:
+        """What tells an object from others."""
+        if type(obj) in VALUES:
+            return [repr(obj)]
+        if isinstance(obj, BY_ADDRESS):
+            return self._address(obj)
+        if isinstance(obj, type):
+            return self._of_class(obj)
+        if isinstance(obj, Tensor):
+            return self._of_tensor(obj)
+        if type(obj) is np.ndarray and not obj.dtype.hasobject:
+            self.watch.note_attributes(obj, "dtype")
+            self.watch.note_values(obj, np.shape)
+            self.watch.note_numbers(obj)
+            return [obj.shape, str(obj.dtype), _digest(obj)]
+        return self._of_parts(obj)
+
+    def _of_tensor(self, x: Tensor) -> list[object]:
+        found = [type(x).__name__, tuple(x.shape), str(x.dtype), x.requires_grad]
+        self.watch.note_tensor(x, constant=not isinstance(x, nn.Parameter))
+        if not isinstance(x, nn.Parameter):
+            found.append(_digest(x.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()))
         return found
 
-    def _by_address(self, obj: object) -> tuple[str, int]:
-        self.alive.append(obj)
-        return type(obj).__name__, id(obj)
+    def _of_parts(self, obj: Any) -> list[object]:
+        kind = type(obj)
+        if kind in (dict, OrderedDict, list, set):
+            self.watch.note_collection(obj)
+        if kind in (dict, OrderedDict):
+            return [kind.__name__, *map(self._mention, chain(obj, obj.values()))]
+        if kind in (list, set, frozenset) or (isinstance(obj, tuple) and not hasattr(obj, "__dict__")):
+            return [self._mention(kind), *map(self._mention, obj)]
+        if kind is types.CellType and obj == types.CellType():  # a variable that has no value yet, and may get one
+            self.watch.complete = False
+            return []
+        if kind in ATTRIBUTES:
+            self._functions += [obj] if kind is types.FunctionType else []
+            self.watch.note_attributes(obj, *ATTRIBUTES[kind])
+            return [kind.__name__, *(self._mention(getattr(obj, name)) for name in ATTRIBUTES[kind])]
+        return self._of_instance(obj)
+
+    def _of_class(self, kind: type) -> list[object]:
+        """A class by its address, and what it says itself."""
+        if foreign(kind.__module__):
+            return self._address(kind)
+        self.watch.note_attributes(kind, "__mro__")
+        self.watch.note_collection(vars(kind).values())
+        self._functions += map(function_of, vars(kind).values())
+        mentioned = map(self._mention, kind.__mro__[1:])
+        return [*self._address(kind), *map(self._address, vars(kind).values()), *mentioned]
+
+    def _of_instance(self, obj: Any) -> list[object]:
+        """An object by the parts that pickle takes; by its address if pickle refuses it."""
+        kind, held = type(obj), getattr(obj, "__dict__", None)
+        if obj is not self._root and held is not None:
+            self.watch.note_attributes(obj, "__class__", "__dict__")
+        if isinstance(obj, nn.Module):
+            return [*map(self._mention, (kind, held))]
+        try:
+            reduced = copyreg.dispatch_table.get(kind, _reduced)(obj)
+        except Exception:  # an object may refuse with any error
+            return self._address(obj)
+        if isinstance(reduced, str):  # the name of a global, which may not be there, as in a function
+            return self._address(obj)
+        made, given, state, *elements = (*reduced, None, None)[:5]
+        plain = made is PLAIN and given == (kind,) and state is (held or None) and elements == [None, None]
+        self.watch.complete &= plain or isinstance(obj, CONSTANT)
+        parts = (list(part) if isinstance(part, Iterator) else part for part in reduced)
+        return [*map(self._mention, parts)]
 
 
-def _content(cell: types.CellType) -> object:
-    try:
-        return cell.cell_contents
-    except ValueError:  # the variable has no value yet
-        return None
+def _reduced(obj: Any) -> Any:
+    return obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
 
 
-class _Known(tuple[str, int]):
-    """Stands for an object that is known by its address."""
+def _digest(numbers: np.ndarray) -> bytes:
+    return hashlib.sha256(numbers.tobytes()).digest()

@@ -1,8 +1,9 @@
 """Lowering: a program becomes arithmetic, loads, stores and loops, which a writer puts into a language."""
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from itertools import groupby
 from typing import Protocol, runtime_checkable
 
 from rt_torchrl.programs.elementwise import ELEMENTWISE
@@ -12,6 +13,8 @@ BLOCKS = (8, 6, 5, 4, 3, 2, 1)
 """Numbers of columns of a product of matrices that are summed at once, so that a row is read once for all of them."""
 SHORT = 16
 """Number of elements from which a run of gradients is added by a loop."""
+
+Accesses = Sequence[Access | None]
 
 
 @runtime_checkable
@@ -30,9 +33,6 @@ class Writer(Protocol):
     def store(self, array: str, index: str, operand: str) -> None: ...
     def look_up(self, table: str, place: str, offset: int) -> str: ...
     def loop(self, count: int) -> AbstractContextManager[str]: ...
-    def variable(self, start: str) -> str: ...
-    def get(self, variable: str) -> str: ...
-    def put(self, variable: str, operand: str) -> None: ...
 
 
 class Lowering:
@@ -94,64 +94,41 @@ class Lowering:
         elif name == "table":
             self._arrays[value] = (self.writer.table([float.fromhex(x) for x in attributes]), 0, True)
         else:
-            shapes: dict[str, Callable[..., int]] = {
-                "row": lambda *_: len(operands),
-                "map": lambda name, dims, accesses: math.prod(dims),
-                "product": lambda m, k, n, accesses: m * n,
-            }
-            array = self.writer.local(shapes[name](*attributes))
+            array = self.writer.local(math.prod(attributes[0]))
             self._arrays[value] = (array, 0, False)
             getattr(self, f"_{name}")(array, operands, *attributes)
 
-    def _row(self, array: str, operands: Sequence[int]) -> None:
+    def _row(self, array: str, operands: Sequence[int], dims: Sequence[int]) -> None:
         for i, a in enumerate(operands):
             self.writer.store(array, self.writer.index(i, ()), self.operand(a))
 
-    def _map(
-        self, array: str, operands: Sequence[int], name: str, dims: Sequence[int], accesses: Sequence[Access | None]
-    ) -> None:
-        strides = [math.prod(dims[d + 1 :]) for d in range(len(dims))]
+    def _map(self, array: str, operands: Sequence[int], dims: Sequence[int], name: str, accesses: Accesses) -> None:
+        strides, body = [math.prod(dims[d + 1 :]) for d in range(len(dims))], Program()
         if all(access is None or list(access.strides) == strides for access in accesses):
             dims, strides = [math.prod(dims)], [1]  # all operands are walked through in order: one loop will do
             accesses = [access and Access(access.base, (1,)) for access in accesses]
+        with self._loops(dims) as indices:
+            read = {("x", k): self._read(*pair, indices) for k, pair in enumerate(zip(operands, accesses, strict=True))}
+            found = ELEMENTWISE[name](body, *(body.new("input", attributes=key) for key in read))
+            (result,) = Lowering(body, self.writer, read, "").write([found])
+            self.writer.store(array, self.writer.index(0, [*zip(strides, indices, strict=True)]), result)
 
-        def inner(indices: list[str]) -> None:
-            found = [self._read(a, access, indices) for a, access in zip(operands, accesses, strict=True)]
-            at = self.writer.index(0, list(zip(strides, indices, strict=True)))
-            self.writer.store(array, at, self._elementwise(name, found))
-
-        self._loops(dims, inner)
-
-    def _elementwise(self, name: str, operands: Sequence[str]) -> str:
-        """An elementwise operator on operands within a loop: a program of its own."""
-        body = Program()
-        inputs = [body.new("input", attributes=("x", k)) for k in range(len(operands))]
-        lowering = Lowering(body, self.writer, {("x", k): operand for k, operand in enumerate(operands)}, "")
-        return lowering.write([ELEMENTWISE[name](body, *inputs)])[0]
-
-    def _product(
-        self, array: str, operands: Sequence[int], m: int, k: int, n: int, accesses: Sequence[Access | None]
-    ) -> None:
-        writer, block = self.writer, next(b for b in BLOCKS if n % b == 0)
+    def _product(self, array: str, operands: Sequence[int], dims: Sequence[int], k: int, accesses: Accesses) -> None:
+        (m, n), writer = dims, self.writer
+        block = next(b for b in BLOCKS if n % b == 0)
         a, b, start = zip(operands, accesses, strict=True)
-
-        def inner(indices: list[str]) -> None:
-            i, j = indices
+        totals = writer.local(block)
+        with self._loops([m, n // block]) as (i, j):
             columns = [writer.index(c, [(block, j)]) for c in range(block)]
-            totals = [writer.variable(self._read(*start, [i, column])) for column in columns]
-
-            def step(inner_indices: list[str]) -> None:
-                (at,) = inner_indices
+            for c, column in enumerate(columns):
+                writer.store(totals, str(c), self._read(*start, [i, column]))
+            with writer.loop(k) as at:
                 x = self._read(*a, [i, at])
-                for total, column in zip(totals, columns, strict=True):
-                    y = self._read(*b, [at, column])
-                    writer.put(total, writer.compute("add", writer.get(total), writer.compute("mul", x, y)))
-
-            self._loops([k], step)
-            for total, column in zip(totals, columns, strict=True):
-                writer.store(array, writer.index(0, [(n, i), (1, column)]), writer.get(total))
-
-        self._loops([m, n // block], inner)
+                for c, column in enumerate(columns):
+                    product = writer.compute("mul", x, self._read(*b, [at, column]))
+                    writer.store(totals, str(c), writer.compute("add", writer.load(totals, str(c)), product))
+            for c, column in enumerate(columns):
+                writer.store(array, writer.index(0, [(n, i), (1, column)]), writer.load(totals, str(c)))
 
     def _read(self, value: int, access: Access | None, indices: Sequence[str]) -> str:
         if access is None:
@@ -159,39 +136,33 @@ class Lowering:
         terms = [(stride, i) for stride, i in zip(access.strides, indices, strict=True) if stride]
         return self._load(value, access.base, terms)
 
-    def _loops(self, counts: Sequence[int], inner: Callable[[list[str]], None]) -> None:
-        """Nested loops around ``inner``, which takes their indices."""
-
-        def nest(indices: list[str]) -> None:
-            if len(indices) == len(counts):
-                inner(indices)
-                return
-            with self.writer.loop(counts[len(indices)]) as index:
-                nest([*indices, index])
-
-        nest([])
+    @contextmanager
+    def _loops(self, counts: Sequence[int]) -> Iterator[list[str]]:
+        """Nested loops, with their indices."""
+        with ExitStack() as loops:
+            yield [loops.enter_context(self.writer.loop(count)) for count in counts]
 
     # Outputs
 
     def add_to(self, array: str, outputs: Sequence[int]) -> None:
         """Add outputs to the elements of an array that holds lanes; runs of elements of one array by a loop."""
-        first = 0
-        while first < len(outputs):
-            operation, last = self.program.operations[outputs[first]], first
-            while operation.name == "element" and last + 1 < len(outputs):
-                follows = (operation.attributes[0] + last + 1 - first,)
-                if self.program.operations[outputs[last + 1]] != operation._replace(attributes=follows):
-                    break
-                last += 1
-            if last - first + 1 >= SHORT:
-                run = Access(operation.attributes[0], (1,))
-                with self.writer.loop(last - first + 1) as i:
-                    self._add(array, self.writer.index(first, [(1, i)]), self._read(operation.operands[0], run, [i]))
+        operations = [self.program.operations[value] for value in outputs]
+
+        def run_of(j: int) -> tuple[object, ...]:
+            name, operands, attributes = operations[j]
+            return (operands, attributes[0] - j) if name == "element" else (j,)
+
+        for _, run in groupby(range(len(outputs)), run_of):
+            first, *rest = run
+            if len(rest) >= SHORT:
+                walk = Access(operations[first].attributes[0], (1,))
+                with self.writer.loop(1 + len(rest)) as i:
+                    found = self._read(operations[first].operands[0], walk, [i])
+                    self._add(array, self.writer.index(first, [(1, i)]), found)
             else:
-                for j in range(first, last + 1):
+                for j in (first, *rest):
                     if self.program.number(outputs[j]) != 0.0:
                         self._add(array, self.writer.index(j, ()), self.operand(outputs[j]))
-            first = last + 1
 
     def _add(self, array: str, index: str, operand: str) -> None:
         self.writer.store(array, index, self.writer.compute("add", self.writer.load(array, index), operand))

@@ -14,6 +14,8 @@ PURE = "memory(none) nounwind willreturn speculatable"
 WIDTH = "align 8"  # torch aligns rows to doubles
 STACK = 2**17
 """Bytes of arrays that lie on the stack, which is 512 KiB in the threads of some systems; others are allocated."""
+SMALL = 8
+"""Size of arrays that always lie on the stack, from where LLVM takes them into registers."""
 
 
 class LaneWriter:
@@ -78,7 +80,7 @@ class LaneWriter:
 
     def local(self, size: int) -> str:
         name, size_in_bytes = self.fresh(), 8 * size * self.lanes.number
-        if self._stack + size_in_bytes <= STACK:
+        if size <= SMALL or self._stack + size_in_bytes <= STACK:
             self._stack += size_in_bytes
             self.entry.append(f"{name} = alloca [{size} x {self.vector}], align 64")
         else:
@@ -125,7 +127,7 @@ class LaneWriter:
     # Loops
 
     @contextmanager
-    def loop(self, count: int) -> Iterator[str]:
+    def loop(self, count: int | str) -> Iterator[str]:
         slot, label = self.fresh(), self.fresh()[1:]
         self.entry.append(f"{slot} = alloca i64")
         self.body += [f"store i64 0, ptr {slot}", f"br label %{label}.in", f"{label}.in:"]
@@ -135,18 +137,6 @@ class LaneWriter:
         self.body.append(f"store i64 {following}, ptr {slot}")
         again = self.emit(f"icmp slt i64 {following}, {count}")
         self.body += [f"br i1 {again}, label %{label}.in, label %{label}.out", f"{label}.out:"]
-
-    def variable(self, start: str) -> str:
-        slot = self.fresh()
-        self.entry.append(f"{slot} = alloca {self.vector}, align 64")
-        self.put(slot, start)
-        return slot
-
-    def get(self, variable: str) -> str:
-        return self.emit(f"load {self.vector}, ptr {variable}")
-
-    def put(self, variable: str, operand: str) -> None:
-        self.body.append(f"store {self.vector} {operand}, ptr {variable}")
 
     # Functions
 
@@ -159,27 +149,11 @@ class LaneWriter:
         for j, operand in enumerate(operands):
             self.store(array, self.index(j, [(len(operands), row)]), operand)
 
-    def function(self, name: str, parameters: str, *, backwards: bool = False) -> str:
-        """The text of a function that repeats the body for every step k of n, the last one first if ``backwards``."""
-        lines = [
-            *self.entry,
-            "%last = sub nsw i64 %n, 1",
-            "br label %top",
-            "top:",
-            "%i = phi i64 [ 0, %entry ], [ %next, %bottom ]",
-            "%k = sub nsw i64 %last, %i" if backwards else "%k = add nsw i64 %i, 0",
-            *self.body,
-            "br label %bottom",
-            "bottom:",
-            "%next = add nsw i64 %i, 1",
-            "%more = icmp slt i64 %next, %n",
-            "br i1 %more, label %top, label %done",
-            "done:",
-            *self.exit,
-            "ret void",
-        ]
-        text, globals_ = "\n".join(lines), "\n".join(self.globals.values())
-        return f"{globals_}\ndefine void @{name}({parameters}, i64 %n) {{\nentry:\n{text}\n}}\n"
+    def function(self, name: str, parameters: str) -> str:
+        """The text of a function that computes the body."""
+        head = f"define void @{name}({parameters}, i64 %n) {{"
+        lines = [*self.globals.values(), head, "entry:", *self.entry, *self.body, *self.exit, "ret void", "}\n"]
+        return "\n".join(lines)
 
 
 def _bits(number: float) -> str:
@@ -193,35 +167,33 @@ def march_text(program: Program, ends: Sequence[int], sizes: dict[str, int], lan
     Arrays hold lanes: ``x`` is ``n n_x lanes``, ``s`` is ``n+1 n_s lanes``; ``w`` holds the weights.
     """
     writer = LaneWriter(lanes, "march")
-    inputs = {(name, j): x for name in "xs" for j, x in enumerate(writer.row(f"%{name}", sizes[name], "%k"))}
-    found = Lowering(program, writer, inputs, "%w").write(ends)
-    writer.store_row("%s", found, writer.emit("add nsw i64 %k, 1"))
+    with writer.loop("%n") as k:
+        inputs = {(name, j): x for name in "xs" for j, x in enumerate(writer.row(f"%{name}", sizes[name], k))}
+        found = Lowering(program, writer, inputs, "%w").write(ends)
+        writer.store_row("%s", found, writer.emit(f"add nsw i64 {k}, 1"))
     return writer.function("march", "ptr noalias %x, ptr noalias %s, ptr noalias %w")
 
 
-def sweep_text(
-    program: Program,
-    costates: Sequence[int],
-    gradients: Sequence[int],
-    driven: Sequence[int],
-    sizes: dict[str, int],
-    lanes: Lanes,
-) -> str:
+def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[str, int], lanes: Lanes) -> str:
     """A function ``sweep(x, s, source, stride, l, w, gx, gw, n)``, which goes back from interval n − 1 to 0.
 
     It adds the row k·stride of ``source`` (∂J/∂s_{k+1}) to the co-state ``l``, replaces this by the co-state at the
     start of the interval, writes the gradients by the interval's own inputs into ``gx`` and adds those by the weights
-    to ``gw``.
+    to ``gw``. The outputs are these three, in this order.
     """
     writer = LaneWriter(lanes, "sweep")
-    inputs = {(name, j): x for name in "xs" for j, x in enumerate(writer.row(f"%{name}", sizes[name], "%k"))}
-    held, at = writer.row("%l", sizes["s"], "0"), writer.emit("mul nsw i64 %k, %stride")
-    source = writer.row("%source", sizes["s"], at)
-    inputs |= {("l", j): writer.compute("add", *pair) for j, pair in enumerate(zip(held, source, strict=True))}
-    lowering = Lowering(program, writer, inputs, "%w")
-    found = lowering.write([*costates, *driven, *gradients])
-    writer.store_row("%l", found[: len(costates)], "0")
-    writer.store_row("%gx", found[len(costates) :][: len(driven)], "%k")
-    lowering.add_to("%gw", gradients)
+    last = writer.emit("sub nsw i64 %n, 1")
+    with writer.loop("%n") as i:
+        k = writer.emit(f"sub nsw i64 {last}, {i}")
+        inputs = {(name, j): x for name in "xs" for j, x in enumerate(writer.row(f"%{name}", sizes[name], k))}
+        source = writer.row("%source", sizes["s"], writer.emit(f"mul nsw i64 {k}, %stride"))
+        for j, pair in enumerate(zip(writer.row("%l", sizes["s"], "0"), source, strict=True)):
+            inputs["l", j] = writer.compute("add", *pair)
+        lowering = Lowering(program, writer, inputs, "%w")
+        costates, driven, gradients = outputs
+        lowering.write([*costates, *driven, *gradients])
+        writer.store_row("%l", [*map(lowering.operand, costates)], "0")
+        writer.store_row("%gx", [*map(lowering.operand, driven)], k)
+        lowering.add_to("%gw", gradients)
     arrays = ", ".join(f"ptr noalias %{name}" for name in ("x", "s", "source", "l", "w", "gx", "gw"))
-    return writer.function("sweep", arrays.replace("%source", "%source, i64 %stride"), backwards=True)
+    return writer.function("sweep", arrays.replace("%source", "%source, i64 %stride"))

@@ -23,6 +23,8 @@ COMPARISONS = {
 """Comparisons in LLVM and in C, of which NaN makes all false but the last one."""
 ROUNDED = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc", "round": "rint", "abs": "fabs"}
 """Functions that are instructions of most processors, by their names in LLVM and C; halves are rounded to even."""
+EXTREMES = {"minimum": "{0} < {1} || {0} != {0} ? {0} : {1}", "maximum": "{0} > {1} || {0} != {0} ? {0} : {1}"}
+"""Extremes, which are NaN if one of the two is NaN."""
 FORMS = {
     **{name: Form(f"f{name} contract {{number}} {{0}}, {{1}}", f"{{0}} {c} {{1}}") for name, c in ARITHMETIC.items()},
     **{name: Form(f"fcmp {how} {{number}} {{0}}, {{1}}", f"{{0}} {c} {{1}}") for name, (how, c) in COMPARISONS.items()},
@@ -33,6 +35,10 @@ FORMS = {
     **{
         name: Form(f"call {{number}} @llvm.{known}.v{{lanes}}f64({{number}} {{0}})", f"{known}({{0}})")
         for name, known in ROUNDED.items()
+    },
+    **{
+        name: Form(f"call nsz {{number}} @llvm.{name}.v{{lanes}}f64({{number}} {{0}}, {{number}} {{1}})", c)
+        for name, c in EXTREMES.items()
     },
     "neg": Form("fneg {number} {0}", "-{0}"),
     "not": Form("xor {truth} {0}, splat (i1 true)", "!{0}"),

@@ -3,14 +3,12 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from itertools import accumulate
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from rt_torchrl.programs.copies import COPIES, Arguments, Options
-from rt_torchrl.programs.tracer import STRAIGHT, Rule, Tracer
+from rt_torchrl.programs.copies import COPIES
+from rt_torchrl.programs.tracer import STRAIGHT, Arguments, Options, Rule, Tracer, in_shape
 
 STRAIGHT_PRODUCT = 200
 """Greatest number of multiplications of a product of matrices that becomes straight-line code."""
@@ -24,13 +22,11 @@ def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
         convert: Callable[[int], int] = p.as_truth
     elif out.is_floating_point() and out.dtype != torch.float64:
         raise tracer.refuse(f"a conversion to {out.dtype}; trajectories need torch.float64")
-    elif out.is_complex():
-        raise tracer.refuse("complex numbers")
     elif args[0].is_floating_point() and not out.is_floating_point():
         convert = partial(p.apply, "trunc")
     else:
         convert = p.as_number
-    return torch.tensor([convert(i) for i in source.flatten().tolist()], dtype=torch.int64).view(source.shape)
+    return in_shape([convert(i) for i in source.flatten().tolist()], source.shape)
 
 
 # Elementwise operators with arguments of their own
@@ -56,51 +52,14 @@ def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tens
         ones = torch.full((n, 1), p.constant(1.0))
         return matrix_product(tracer, rows, ones).view(out.shape)
     found = [reduce(partial(p.apply, "add"), row) for row in rows.tolist()] if n else [p.constant(0.0)] * m
-    return torch.tensor(found, dtype=torch.int64).view(out.shape)
-
-
-def _mean(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    count = tracer.cells(float(args[0].numel() // max(1, out.numel())))
-    return tracer.pointwise("div", [_sum(tracer, args, options, out), count], out.shape)
+    return in_shape(found, out.shape)
 
 
 def _fold(name: str) -> Rule:
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
         rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
         found = [reduce(partial(tracer.program.apply, name), row) for row in rows]
-        return torch.tensor(found, dtype=torch.int64).view(out.shape)
-
-    return rule
-
-
-def _with_place(how: str) -> Rule:
-    """Greatest or least number of each row, and its place; NaN counts as greatest and least."""
-
-    def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
-        p, found = tracer.program, []
-        name = "maximum" if how == "gt" else "minimum"
-        if isinstance(out, Tensor) and len(args) == 1:
-            return _fold(name)(tracer, args, options, out)
-        if isinstance(out, Tensor):
-            return tracer.pointwise(name, [tracer.cells(a) for a in args], out.shape)
-        for first, *rest in _rows(tracer.cells(args[0]), args[1]).tolist():
-            value, place = first, p.constant(0.0)
-            for k, x in enumerate(rest, 1):
-                news = p.logic("and", p.apply("ne", x, x), p.apply("eq", value, value))
-                better = p.logic("or", p.apply(how, x, value), news)
-                value, place = p.select(better, x, value), p.select(better, p.constant(float(k)), place)
-            found.append((value, place))
-        return [torch.tensor(cells, dtype=torch.int64).view(out[0].shape) for cells in zip(*found, strict=True)]
-
-    return rule
-
-
-def _cumulate(name: str) -> Rule:
-    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-        cells = tracer.cells(args[0]).movedim(args[1], -1)
-        step = partial(tracer.program.apply, name)
-        rows = [list(accumulate(row, step)) for row in cells.reshape(-1, cells.shape[-1]).tolist()]
-        return torch.tensor(rows, dtype=torch.int64).view(cells.shape).movedim(-1, args[1])
+        return in_shape(found, out.shape)
 
     return rule
 
@@ -124,17 +83,10 @@ def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = 
                 for x, y in zip(row, column, strict=True):
                     total = p.apply("add", total, p.apply("mul", x, y))
                 found.append(total)
-        return torch.tensor(found, dtype=torch.int64).view(m, n)
+        return in_shape(found, (m, n))
     if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
         return first
-    accesses = [tracer.access(x) for x in (a, b, first)]
-    shape = (m, k, n, tuple(x for _, x in accesses))
-    array = p.new("product", *(i for i, _ in accesses), attributes=shape, kind="array")
-    return tracer.elements(array, m * n).view(m, n)
-
-
-def _mm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    return matrix_product(tracer, tracer.cells(args[0]), tracer.cells(args[1]))
+    return tracer.loop("product", (a, b, first), (m, n), k)
 
 
 def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
@@ -173,36 +125,21 @@ def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Te
             place = p.apply("add", place, p.apply("mul", safe, p.constant(float(stride))))
         numbers_there = (p.new("look_up", table, place, attributes=(r,)) for r in range(rest))
         found += [p.select(reduce(partial(p.logic, "and"), inside), x, nan) for x in numbers_there]
-    return torch.tensor(found, dtype=torch.int64).view(out.shape)
-
-
-def _bucketize(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    p, how = tracer.program, "gt" if options.get("right", False) else "ge"
-    knots = tracer.cells(args[1]).tolist()
-    found = []
-    for x in tracer.cells(args[0]).flatten().tolist():
-        passed = [p.as_number(p.logic("not", p.apply(how, knot, x))) for knot in knots]  # NaN passes all
-        found.append(reduce(partial(p.apply, "add"), passed, p.constant(0.0)))
-    return torch.tensor(found, dtype=torch.int64).view(out.shape)
+    return in_shape(found, out.shape)
 
 
 RULES: dict[str, Rule] = {
     **COPIES,
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
+    "zero": lambda tracer, args, options, out: tracer.cells(0.0),
     "_to_copy": _convert,
     "sum": _sum,
-    "mean": _mean,
     "amax": _fold("maximum"),
     "amin": _fold("minimum"),
-    "max": _with_place("gt"),
-    "min": _with_place("lt"),
     "prod": _fold("mul"),
-    "cumsum": _cumulate("add"),
-    "cumprod": _cumulate("mul"),
-    "mm": _mm,
+    "mm": lambda tracer, args, options, out: matrix_product(tracer, *map(tracer.cells, args)),
     "addmm": _addmm,
     "index": _index,
-    "bucketize": _bucketize,
 }
 
 

@@ -2,7 +2,6 @@
 
 import inspect
 import types
-from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -16,32 +15,22 @@ FOREIGN = frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype bui
 Name = tuple[dict[str, Any], str]
 
 
-def own_classes(kind: type) -> Iterator[type]:
-    """A class and those that it extends, without those of foreign packages."""
-    return (each for each in kind.__mro__ if not _foreign(each.__module__))
-
-
 def read_by(*functions: object) -> list[Name]:
     """The globals that functions read, also through the functions and modules among them."""
-    found: list[Name] = []
+    found: dict[tuple[int, str], Name] = {}
     stack, seen = [*functions], set[types.FunctionType]()
     while stack:
         f = stack.pop()
-        if not isinstance(f, types.FunctionType) or f in seen or _foreign(f.__module__):
+        if not isinstance(f, types.FunctionType) or f in seen or foreign(f.__module__):
             continue
         seen.add(f)
         names = _names(f.__code__)
-        for held in [f.__globals__, *_modules(f.__globals__, names)]:
-            for name in names:
-                if name in held and not isinstance(held[name], types.ModuleType):
-                    found.append((held, name))
-                    stack.append(function_of(held[name]))
-    return list({(id(held), name): (held, name) for held, name in found}.values())
-
-
-def _modules(held: dict[str, Any], names: Iterable[str]) -> list[dict[str, Any]]:
-    modules = [held[name] for name in names if isinstance(held.get(name), types.ModuleType)]
-    return [vars(module) for module in modules if not _foreign(module.__name__)]
+        modules = (x for x in map(f.__globals__.get, names) if isinstance(x, types.ModuleType))
+        for held in [f.__globals__, *(vars(module) for module in modules if not foreign(module.__name__))]:
+            here = [name for name in names if name in held and not isinstance(held[name], types.ModuleType)]
+            found |= {(id(held), name): (held, name) for name in here}
+            stack += [function_of(held[name]) for name in here]
+    return list(found.values())
 
 
 @lru_cache(maxsize=2**14)
@@ -51,11 +40,12 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
     return (*code.co_names, *inner)
 
 
-def function_of(attribute: object) -> object:
+def function_of(attribute: object) -> types.FunctionType | None:
     """The function behind an attribute of a class; None if there is none."""
     attribute = attribute.fget if isinstance(attribute, property) else getattr(attribute, "__func__", attribute)
     return inspect.unwrap(attribute) if isinstance(attribute, types.FunctionType) else None
 
 
-def _foreign(module: str | None) -> bool:
+def foreign(module: str | None) -> bool:
+    """Whether a module belongs to a package whose globals do not change."""
     return module is None or module.partition(".")[0] in FOREIGN

@@ -2,7 +2,8 @@
 
 import linecache
 import sys
-from types import CodeType, FrameType, ModuleType
+from traceback import walk_stack
+from types import CodeType, ModuleType
 
 import jaxtyping
 import torch
@@ -42,12 +43,8 @@ class Places:
 
     def _innermost(self) -> tuple[CodeType, int] | None:
         """The innermost line outside of torch, this room and the checks of annotations."""
-        frame: FrameType | None = sys._getframe(1)
-        while frame is not None:
-            if not frame.f_code.co_filename.startswith(self._own):
-                return frame.f_code, frame.f_lineno
-            frame = frame.f_back
-        return None
+        frames = walk_stack(sys._getframe(1))
+        return next(((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._own)), None)
 
 
 def _folder(module: ModuleType) -> str:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -36,11 +37,13 @@ class Access(NamedTuple):
     def over(cls, places: Tensor) -> "Access | None":
         """The way to walk through places on an even grid; None if they are on no such grid."""
         base = int(places.flatten()[0])
-        firsts = [int(places.movedim(d, 0)[1].flatten()[0]) if n > 1 else base for d, n in enumerate(places.shape)]
-        grid, strides = torch.tensor(base), tuple(first - base for first in firsts)
-        for d, (n, stride) in enumerate(zip(places.shape, strides, strict=True)):
-            grid = grid + (torch.arange(n) * stride).view([-1 if e == d else 1 for e in range(places.ndim)])
-        return cls(base, strides) if torch.equal(grid.expand(places.shape), places) else None
+        neighbours = [int(places.movedim(d, 0)[1].flatten()[0]) if n > 1 else base for d, n in enumerate(places.shape)]
+        strides = tuple(neighbour - base for neighbour in neighbours)
+        last = base + sum((n - 1) * stride for n, stride in zip(places.shape, strides, strict=True))
+        if min(strides, default=0) < 0:
+            return None
+        grid = torch.arange(last + 1).as_strided(places.shape, strides, base)
+        return cls(base, strides) if torch.equal(grid, places) else None
 
 
 class Program:
@@ -57,7 +60,7 @@ class Program:
         self.differentiating = False
         """While co-states are traced, 0·x is zero: a value that the result does not depend on has no derivative. In
         the trajectory itself 0·x stays, because x may be infinite or NaN."""
-        self._numbers: dict[int, float] = {}
+        self.numbers: dict[int, float] = {}
         self._known: dict[Operation, int] = {}
 
     def new(self, name: str, *operands: int, attributes: tuple[Any, ...] = (), kind: Kind = "number") -> int:
@@ -73,12 +76,12 @@ class Program:
         """A number or a truth value that is known."""
         kind: Kind = "truth" if isinstance(value, bool) else "number"
         found = self.new("constant", attributes=(kind, float(value).hex()), kind=kind)
-        self._numbers[found] = float(value)
+        self.numbers[found] = float(value)
         return found
 
     def number(self, value: int) -> float | None:
         """The number that a value is known to have; None if it is computed later."""
-        return self._numbers.get(value)
+        return self.numbers.get(value)
 
     def needed(self, outputs: Iterable[int]) -> list[int]:
         """The values that the outputs depend on, in the order of their computation."""
@@ -109,8 +112,7 @@ class Program:
         if a == b:
             return a
         if self.kinds[a] == "truth":
-            inverse = self.logic("not", condition)
-            return self.logic("or", self.logic("and", condition, a), self.logic("and", inverse, b))
+            return self.as_truth(self.select(condition, self.as_number(a), self.as_number(b)))
         return self.new("select", condition, a, b)
 
     def logic(self, how: str, *operands: int) -> int:
@@ -167,26 +169,8 @@ class Program:
             return self.new("pow", a, b)
         if y == 0.0:
             return one
-        found = self.apply("sqrt", a) if abs(y) == 0.5 else self._integer_power(a, int(abs(y)))
+        found = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
         return found if y > 0 else self.apply("div", one, found)
-
-    def _integer_power(self, a: int, exponent: int) -> int:
-        if exponent == 1:
-            return a
-        half = self._integer_power(a, exponent // 2)
-        square = self.apply("mul", half, half)
-        return self.apply("mul", square, a) if exponent % 2 else square
-
-    def _extreme(self, how: str, a: int, b: int) -> int:
-        """Minimum or maximum; NaN if one of the two is NaN."""
-        if self.number(b) is not None:
-            a, b = b, a
-        if self.number(a) != self.number(a):
-            return a
-        first = self.apply(how, a, b)
-        if self.number(a) is None:  # where b is NaN the comparison fails and b is chosen
-            first = self.logic("or", first, self.apply("ne", a, a))
-        return self.select(first, a, b)
 
 
 SIMPLER: dict[str, Callable[..., int]] = {
@@ -195,7 +179,5 @@ SIMPLER: dict[str, Callable[..., int]] = {
     "mul": Program._mul,
     "div": Program._div,
     "pow": Program._pow,
-    "minimum": lambda p, a, b: p._extreme("lt", a, b),
-    "maximum": lambda p, a, b: p._extreme("gt", a, b),
 }
 """Functions of numbers that may become simpler ones."""

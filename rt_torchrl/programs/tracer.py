@@ -2,15 +2,17 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
-from rt_torchrl.programs.decompositions import SIMPLER, known_to_torch
+from rt_torchrl.programs.decompositions import SIMPLER, tables_of_torch
 from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
 from rt_torchrl.programs.places import Places
 from rt_torchrl.programs.program import Access, Program, UntraceableError
@@ -21,10 +23,12 @@ DECISIONS = frozenset({"_local_scalar_dense", "is_nonzero", "equal", "nonzero"})
 """Operators by which Python takes a number or a branch from a tensor."""
 FILLS = frozenset(
     "zeros ones full empty zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty "
-    "scalar_tensor arange eye linspace empty_strided new_empty_strided zero".split()
+    "scalar_tensor arange eye linspace empty_strided new_empty_strided".split()
 )
 
-Rule = Callable[["Tracer", tuple[Any, ...], dict[str, Any], Any], Any]
+Arguments = tuple[Any, ...]
+Options = dict[str, Any]
+Rule = Callable[["Tracer", Arguments, Options, Any], Any]
 
 
 class Tracer(TorchDispatchMode):
@@ -43,7 +47,8 @@ class Tracer(TorchDispatchMode):
         super().__init__()
         self.program = Program()
         self.places = Places()
-        self._rules = rules
+        elementwise = {name: partial(Tracer._elementwise, name=name) for name in ELEMENTWISE}
+        self._rules: dict[str, Rule] = {**dict.fromkeys(FILLS, Tracer._filled), **elementwise, **rules}
         self._cells: dict[int, Tensor] = {}
         self._sizes = Counter[str]()  # of the inputs by their names, and of the weights
         self._alive: list[Tensor] = []  # a storage that is freed could give its address to another one
@@ -56,15 +61,18 @@ class Tracer(TorchDispatchMode):
             return torch.tensor(self.program.constant(x))
         key = _storage_of(x)
         if key not in self._cells:  # a tensor from outside is a constant
-            if x.is_complex():
-                raise self.refuse("complex numbers")
             if x.requires_grad and x.is_leaf and x.numel():
                 raise self.refuse("a tensor that requires a gradient but is no parameter of the modules")
             size = x.untyped_storage().nbytes() // x.element_size()
-            values = torch.as_strided(x.detach(), (size,), (1,), 0).tolist()
-            self._cells[key] = torch.tensor([self.program.constant(v) for v in values], dtype=torch.int64)
+            self._cells[key] = self._constants(torch.as_strided(x.detach(), (size,), (1,), 0))
             self._alive.append(x)
         return torch.as_strided(self._cells[key], x.shape, x.stride(), x.storage_offset())
+
+    def _constants(self, x: Tensor) -> Tensor:
+        """The cells of known numbers."""
+        if x.is_complex():
+            raise self.refuse("complex numbers")
+        return in_shape([self.program.constant(v) for v in x.flatten().tolist()], x.shape)
 
     def assign(self, x: Tensor, cells: Tensor) -> None:
         """Let a new tensor hold values of the program."""
@@ -77,14 +85,12 @@ class Tracer(TorchDispatchMode):
     def input(self, x: Tensor, name: str) -> None:
         """Let a tensor be the next part of an input, which varies over lanes and steps."""
         places = range(self._sizes[name], self._sizes[name] + x.numel())
-        found = [self.program.new("input", attributes=(name, i)) for i in places]
         self._sizes[name] = places.stop
-        self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
+        self.assign(x, in_shape([self.program.new("input", attributes=(name, i)) for i in places], x.shape))
 
     def weight(self, x: Tensor) -> None:
         """Let a tensor be the next part of the weights, which are the same for all lanes and steps."""
-        attributes = self._sizes["weights"], x.numel()
-        array = self.program.new("weights", attributes=attributes, kind="array")
+        array = self.program.new("weights", attributes=(self._sizes["weights"], x.numel()), kind="array")
         self._sizes["weights"] += x.numel()
         self.assign(x, self.elements(array, x.numel()).view(x.shape))
 
@@ -98,8 +104,8 @@ class Tracer(TorchDispatchMode):
 
     def numbers(self, cells: Tensor) -> list[float] | None:
         """The numbers that all cells are known to hold; None if one of them is computed later."""
-        found = [self.program.number(i) for i in cells.flatten().tolist()]
-        return None if None in found else [x for x in found if x is not None]
+        values, known = cells.flatten().tolist(), self.program.numbers
+        return [known[i] for i in values] if all(i in known for i in values) else None
 
     def refuse(self, what: str) -> UntraceableError:
         """The error of code that cannot become a program, with the line of the caller's code."""
@@ -107,9 +113,7 @@ class Tracer(TorchDispatchMode):
 
     # Operators
 
-    def __torch_dispatch__(
-        self, func: Any, types: Iterable[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: Arguments = (), kwargs: Options | None = None) -> Any:
         kwargs = kwargs or {}
         if not isinstance(func, OpOverload):
             raise self.refuse(f"torch operator {func} has no translation")
@@ -118,9 +122,12 @@ class Tracer(TorchDispatchMode):
             self.places.note()
             packet = func._schema.name.split("::")[1]
             name = packet if packet.startswith("_") else packet.rstrip("_")
-            if packet in DECISIONS or torch.Tag.nondeterministic_seeded in func.tags:
-                return self._decided(func, packet, args, kwargs)
-            known = name in ELEMENTWISE or name in FILLS or name in self._rules or name in SIMPLER
+            if torch.Tag.nondeterministic_seeded in func.tags:
+                raise self.refuse(f"{packet} draws random numbers")
+            if packet in DECISIONS:
+                self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
+                return func(*args, **kwargs)
+            known = name in self._rules or name in SIMPLER
             if not known and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
                     return func.decompose(*args, **kwargs)
@@ -137,7 +144,7 @@ class Tracer(TorchDispatchMode):
                 with self:
                     found = self._translated(func, SIMPLER[name], *args, **kwargs)
                     return args[0].copy_(found) if in_place else found
-            if not known and not in_place and (decomposition := known_to_torch(func)):
+            if not known and not in_place and (decomposition := tables_of_torch().get(func)):
                 with self:
                     return decomposition(*args, **kwargs)
             return self._executed(func, name, args, kwargs)
@@ -145,42 +152,32 @@ class Tracer(TorchDispatchMode):
     def _foldable(self, args: tuple[Any, ...]) -> bool:
         """Whether all tensors among arguments hold known numbers, which are those of torch."""
         exact = not self.program.differentiating  # 0·x may be NaN for torch
-        return all((exact or not x.is_floating_point()) and self._known(x) for x in tensors_in(args))
+        return all(
+            (exact or not x.is_floating_point()) and self.numbers(self.cells(x)) is not None for x in tensors_in(args)
+        )
 
-    def _known(self, x: Tensor) -> bool:
-        cells = self.cells(x)
-        return not cells.numel() or self.program.number(int(cells.flatten()[0])) is not None is not self.numbers(cells)
-
-    def _folded(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _folded(self, func: Any, args: Arguments, kwargs: Options) -> Any:
         """What an operator makes of known numbers: known numbers, whatever the operator is."""
         out = func(*args, **kwargs)
         for x in tensors_in([out]):
-            if x.is_complex():
-                raise self.refuse("complex numbers")
-            found = [self.program.constant(v) for v in x.detach().flatten().tolist()]
-            self.assign(x, torch.tensor(found, dtype=torch.int64).view(x.shape))
+            self.assign(x, self._constants(x.detach()))
         return out
-
-    def _decided(self, func: Any, packet: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """What Python takes from tensors, which must hold known numbers."""
-        if packet not in DECISIONS:
-            raise self.refuse(f"{packet} draws random numbers")
-        self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
-        return func(*args, **kwargs)
 
     def require_known(self, what: str, args: Iterable[Any]) -> None:
         """Refuse tensors whose numbers are not known when the program is made."""
         if any(self.numbers(self.cells(x)) is None for x in tensors_in(args)):
             raise self.refuse(what)
 
-    def _executed(self, func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _executed(self, func: Any, name: str, args: Arguments, kwargs: Options) -> Any:
         """What an operator returns, with the cells of what it computes."""
         out = func(*args, **kwargs)
-        outs = list(tensors_in([out]))
+        outs = tensors_in([out])
         if any(o.is_complex() for o in outs):
             raise self.refuse("complex numbers")
         written = args[0] if func._schema.is_mutable else out
-        found = self._translated(func, self._computed, func, name, args, kwargs, written)
+        if name not in self._rules:
+            raise self.refuse(f"torch operator {func} has no translation")
+        found = self._translated(func, self._rules[name], self, args, kwargs, written)
         if func._schema.is_mutable:
             if not func._schema.arguments[0].is_write or len(outs) != 1:
                 raise self.refuse(f"{func} writes into its argument out")
@@ -199,19 +196,10 @@ class Tracer(TorchDispatchMode):
         except Exception as error:
             raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
 
-    def _computed(self, func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> Any:
-        """The cells of what an operator computes."""
-        if name in FILLS:
-            values = torch.zeros(()) if name == "zero" else out
-            found = [self.program.constant(v) for v in values.flatten().tolist()]
-            return torch.tensor(found, dtype=torch.int64).view(values.shape)
-        if name in self._rules:
-            return self._rules[name](self, args, kwargs, out)
-        if name in ELEMENTWISE:
-            return self._elementwise(name, args, kwargs, out)
-        raise self.refuse(f"torch operator {func} has no translation")
+    def _filled(self, args: Arguments, kwargs: Options, out: Tensor) -> Tensor:
+        return self._constants(out)
 
-    def _elementwise(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Tensor) -> Tensor:
+    def _elementwise(self, args: Arguments, kwargs: Options, out: Tensor, name: str) -> Tensor:
         if out.is_floating_point() and out.dtype != torch.float64:
             raise self.refuse(f"{name} computes in {out.dtype}; trajectories need torch.float64")
         unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "rounding_mode", "dtype"))]
@@ -233,26 +221,28 @@ class Tracer(TorchDispatchMode):
         long = math.prod(shape) > STRAIGHT and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
         if not long or all(p.number(i) is not None for i in values):
             rows = zip(*(o.flatten().tolist() for o in spread), strict=True)
-            found = [ELEMENTWISE[name](p, *row) for row in rows]
-            return torch.tensor(found, dtype=torch.int64).view(shape)
-        shortcut = self._shortcut(name, spread)
-        if shortcut is not None:
+            return in_shape([ELEMENTWISE[name](p, *row) for row in rows], shape)
+        if (shortcut := self._shortcut(name, spread)) is not None:
             return shortcut
         dims = tuple(n for n in shape if n != 1)
-        accesses = [self.access(o.reshape(dims)) for o in spread]
-        attributes = name, dims, tuple(x for _, x in accesses)
-        array = p.new("map", *(a for a, _ in accesses), attributes=attributes, kind="array")
-        return self.elements(array, math.prod(shape)).view(shape)
+        return self.loop("map", [o.reshape(dims) for o in spread], dims, name).view(shape)
+
+    def loop(self, kind: str, operands: Iterable[Tensor], dims: tuple[int, ...], what: Any) -> Tensor:
+        """The cells of an array that a loop computes, see :class:`Program`."""
+        accesses = [self.access(o) for o in operands]
+        attributes = dims, what, tuple(x for _, x in accesses)
+        array = self.program.new(kind, *(a for a, _ in accesses), attributes=attributes, kind="array")
+        return self.elements(array, math.prod(dims)).view(dims)
 
     def _shortcut(self, name: str, operands: list[Tensor]) -> Tensor | None:
-        """The result of an operator on a long row that needs no loop, such as 1·x; None if it needs one."""
-        numbers = [self.uniform_number(o) for o in operands]
-        if name == "mul" and self.program.differentiating and 0.0 in numbers:
-            return operands[numbers.index(0.0)]
-        for plain, neutral in (("mul", 1.0), ("add", 0.0 if self.program.differentiating else None)):
-            if name == plain and neutral is not None and neutral in numbers:
-                return operands[1 - numbers.index(neutral)]
-        return operands[0] if (name, numbers[-1]) in (("sub", 0.0), ("div", 1.0)) else None
+        """The result on a long row that needs no loop, such as 0·x or x + 0; None if it needs one."""
+        firsts = [int(o.flatten()[0]) for o in operands]
+        known = [self.uniform_number(o) is not None for o in operands]
+        found = ELEMENTWISE[name](self.program, *firsts)  # what the rules of scalars make of it, they make of each
+        for cells, first, plain in zip(operands, firsts, known, strict=True):
+            if found == first and (plain or any(known)):
+                return cells
+        return None
 
     def uniform_number(self, cells: Tensor) -> float | None:
         """The number that all cells are known to hold; None if they hold different or unknown ones."""
@@ -269,11 +259,9 @@ class Tracer(TorchDispatchMode):
             walk = Access.over(torch.tensor([o.attributes[0] for o in found]).view(cells.shape))
             if walk is not None:
                 return found[0].operands[0], walk
-        numbers = self.numbers(cells)
-        if numbers is not None:
-            array = self.table(numbers)
-        else:
-            array = p.new("row", *(p.as_number(i) for i in flat), kind="array")
+        if numbers := self.numbers(cells):
+            return self.table(numbers), Access(0, torch.empty(cells.shape).stride())
+        array = p.new("row", *map(p.as_number, flat), attributes=(tuple(cells.shape),), kind="array")
         return array, Access(0, torch.empty(cells.shape).stride())
 
     def table(self, numbers: list[float]) -> int:
@@ -281,13 +269,14 @@ class Tracer(TorchDispatchMode):
         return self.program.new("table", attributes=tuple(x.hex() for x in numbers), kind="array")
 
 
-def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
+def tensors_in(values: Iterable[Any]) -> list[Tensor]:
     """The tensors among arguments, also within lists."""
-    for value in values:
-        if isinstance(value, Tensor):
-            yield value
-        elif isinstance(value, (list, tuple)):
-            yield from tensors_in(value)
+    return [value for value in tree_leaves(values) if isinstance(value, Tensor)]
+
+
+def in_shape(values: list[int], shape: Iterable[int]) -> Tensor:
+    """Values of a program as cells."""
+    return torch.tensor(values, dtype=torch.int64).view(tuple(shape))
 
 
 def _storage_of(x: Tensor) -> int:

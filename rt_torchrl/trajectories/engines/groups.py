@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import NamedTuple
 
@@ -51,10 +51,9 @@ def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> Non
     try:
         share()
     finally:  # nobody may still write into the arrays of a call that has ended
-        failures = [thread.exception() for thread in helping]
-    for failure in failures:
-        if failure is not None:
-            raise failure
+        wait(helping)
+    for thread in helping:
+        thread.result()  # raises what it raised
 
 
 @cache

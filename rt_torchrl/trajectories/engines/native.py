@@ -11,6 +11,7 @@ which computes each interval again from its start. The lanes of the processor's 
 lanes are divided among the threads of torch.
 """
 
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -23,12 +24,16 @@ from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.groups import Group, for_each_group
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
-from rt_torchrl.trajectories.engines.programs import Programs, programs_of
+from rt_torchrl.trajectories.engines.programs import programs_of
+from rt_torchrl.trajectories.engines.traced_interval import Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 
 MEMORY = 2.0**30
 """Bytes of states and drive that a sweep holds at once; of longer trajectories it holds checkpoints in time."""
 LEAST_MEMORY = 2.0**20
+
+Piece = tuple[slice, np.ndarray, np.ndarray, np.ndarray]
+"""Intervals with their drive, their states, and ∂J/∂s at their ends (``n n_s lanes``, or one row that serves all)."""
 
 
 class Native(GradientEngine):
@@ -65,11 +70,8 @@ class Native(GradientEngine):
 
     def own_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """The same by machine code; None, with a warning that says why, if the interval cannot become a program."""
-        found = programs_of(interval, initial_state, drive)
-        if found is None:
-            return None
-        task = _Task(*found, initial_state, drive, self.memory)
-        ends: Tensor = _EndStates.apply(task, initial_state, *drive, *task.weights.learned)
+        task = self._task(interval, initial_state, drive)
+        ends: Tensor | None = None if task is None else _EndStates.apply(task, *task.leaves)
         return ends
 
     def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
@@ -79,15 +81,14 @@ class Native(GradientEngine):
         """
         if self._costed is None or self._costed.interval is not interval:
             self._costed = CostInterval(interval)
-        state = nn.functional.pad(initial_state, (0, 1))
-        found = programs_of(self._costed, state, drive)
-        if found is None:
-            return None
-        task = _Task(*found, state, drive, self.memory)
-        leaves = (state, *drive, *task.weights.learned)
-        wanted = torch.is_grad_enabled() and any(x.requires_grad for x in leaves)
-        costs: Tensor = _Costs.apply(task, wanted, *leaves)
+        task = self._task(self._costed, nn.functional.pad(initial_state, (0, 1)), drive)
+        enabled = torch.is_grad_enabled()
+        costs: Tensor | None = None if task is None else _Costs.apply(task, enabled, *task.leaves)
         return costs
+
+    def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":
+        found = programs_of(interval, initial_state, drive)
+        return found and _Task(*found, initial_state, drive, self.memory)
 
 
 class _Task:
@@ -103,12 +104,12 @@ class _Task:
 
     def __init__(self, programs: Programs, weights: Weights, initial_state: Tensor, drive: Drive, memory: float):
         self.programs, self.weights, self.lanes = programs, weights, programs.lanes.number
-        self.row, self.n_w = weights.row(), sum(weights.sizes)
+        self.leaves, self.row = (initial_state, *drive, *weights.learned), weights.row()
         self.initial_state, self.n = initial_state.detach().numpy(), len(drive.t)
         t = drive.t.unsqueeze(-1).expand(-1, len(initial_state), 1)
         self.drive = [x.detach().numpy() for x in (t, *drive[1:])]
-        self.n_s, self.n_x = (programs.march.sizes[name] for name in "sx")
-        length = max(1, int(memory / torch.get_num_threads() / (16 * self.lanes * (self.n_s + self.n_x))))
+        in_lanes = 16 * self.lanes * (programs.sizes["s"] + programs.sizes["x"])
+        length = max(1, int(memory / torch.get_num_threads() / in_lanes))
         self.pieces = [slice(first, min(first + length, self.n)) for first in range(0, self.n, length)]
 
     def start(self, group: Group) -> np.ndarray:
@@ -127,32 +128,51 @@ class _Task:
         """The drive of a group in a piece, ``n n_x lanes``."""
         return group.gather(*(signal[piece] for signal in self.drive))
 
-    def of_drive(self, by_drive: Tensor, t: Tensor) -> list[Tensor]:
-        """Gradients by t, z and a, in their own shapes, of those by the drive, ``n batch n_x``."""
-        by_t, *rest = by_drive.split([signal.shape[-1] for signal in self.drive], -1)
-        return [by_t.squeeze(-1).sum_to_size(t.shape), *rest]
 
-
-class _Adjoint:
-    """The way back of a group.
+class _Gradients:
+    """Gradients by (s_0, t, z, a, w), of each realisation.
 
     Args:
         task: the trajectories.
-        group: the group.
-        by_drive: gradients by the drive of all groups, ``n batch n_x``, of which it writes its own; None to leave them.
+        driven: whether those by t, z and a are wanted.
     """
 
-    def __init__(self, task: _Task, group: Group, by_drive: np.ndarray | None):
-        self._task, self._group, self._by_drive = task, group, by_drive
-        self._sweep = task.programs.sweep(by_drive is not None)
-        self.costate, self.by_weights = np.zeros((task.n_s, task.lanes)), np.zeros((task.n_w, task.lanes))
+    def __init__(self, task: _Task, *, driven: bool):
+        self._task, (batch, n_s) = task, task.initial_state.shape
+        self._by_state, self._by_weights = np.empty((1, batch, n_s)), np.empty((1, batch, sum(task.weights.sizes)))
+        self._by_drive = np.empty((task.n, batch, task.programs.sizes["x"])) if driven else None
+        self._sweep = task.programs.sweeps[driven]
 
-    def sweep(self, piece: slice, x: np.ndarray, states: np.ndarray, source: np.ndarray) -> None:
-        """Go back over a piece, with its drive and its states as :meth:`_Task.march` gives them."""
-        by_drive = np.empty(x.shape if self._by_drive is not None else 0)
-        self._sweep(x, states, source, self.costate, self._task.row, by_drive, self.by_weights, len(x))
-        if self._by_drive is not None:
-            self._group.scatter(by_drive, self._by_drive[piece])
+    def sweep(self, group: Group, pieces: Iterable[Piece], *, last: float) -> None:
+        """Go back over the trajectories of a group.
+
+        Args:
+            group: the group.
+            pieces: the pieces from the last one on.
+            last: ∂J/∂s of the last signal at the end of all, beside that of the last piece.
+        """
+        costate, by_weights = (np.zeros((x.shape[-1], group.lanes)) for x in (self._by_state, self._by_weights))
+        costate[-1] = last
+        for piece, x, states, source in pieces:
+            by_drive = np.empty(x.shape if self._by_drive is not None else 0)
+            stride = int(len(source) > 1)
+            self._sweep(x, states, source, stride, costate, self._task.row, by_drive, by_weights, len(x))
+            if self._by_drive is not None:
+                group.scatter(by_drive, self._by_drive[piece])
+        group.scatter(costate[None], self._by_state)
+        group.scatter(by_weights[None], self._by_weights)
+
+    def weighed(self, factor: np.ndarray | None = None) -> list[Tensor | None]:
+        """The gradients of the sum of all realisations, which may have factors, in the shapes of the leaves."""
+        by_state, by_drive, by_weights = self._by_state[0], self._by_drive, self._by_weights[0]
+        if factor is not None:
+            by_state, by_weights = by_state * factor[:, None], by_weights * factor[:, None]
+            by_drive = None if by_drive is None else by_drive * factor[:, None]
+        along: list[Tensor | None] = [None] * 3
+        if by_drive is not None:
+            by_t, *rest = torch.from_numpy(by_drive).split([signal.shape[-1] for signal in self._task.drive], -1)
+            along = [by_t.squeeze(-1).sum_to_size(self._task.leaves[1].shape), *rest]
+        return [torch.from_numpy(by_state), *along, *self._task.weights.split(by_weights.sum(0))]
 
 
 class _EndStates(torch.autograd.Function):
@@ -179,35 +199,26 @@ class _EndStates(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cost_gradient: Tensor) -> tuple[Tensor | None, ...]:
-        task, (ends, _, t, *_) = ctx.task, ctx.saved_tensors
-        starts, sources = np.concatenate([task.initial_state[None], ends[:-1].numpy()]), cost_gradient.numpy()
-        by_state, by_weights = np.empty((1, *starts.shape[1:])), np.zeros((starts.shape[1], task.n_w))
-        by_drive = np.empty((*starts.shape[:2], task.n_x)) if any(ctx.needs_input_grad[2:5]) else None
+        task, ends, sources = ctx.task, ctx.saved_tensors[0].numpy(), cost_gradient.numpy()
+        starts = np.concatenate([task.initial_state[None], ends[:-1]])
+        gradients = _Gradients(task, driven=any(ctx.needs_input_grad[2:5]))
 
-        def work(group: Group) -> None:
-            adjoint = _Adjoint(task, group, by_drive)
+        def way_back(group: Group) -> Iterator[Piece]:
             for piece in reversed(task.pieces):
-                source = group.gather(sources[piece])
-                source[:, :, group.live :] = 0.0
-                adjoint.sweep(piece, task.driving(group, piece), group.gather(starts[piece]), source)
-            group.scatter(adjoint.costate[None], by_state)
-            by_weights[group.first] = adjoint.by_weights.sum(-1)
+                yield piece, task.driving(group, piece), group.gather(starts[piece]), group.gather(sources[piece])
 
-        for_each_group(starts.shape[1], task.lanes, work)
-        along = [None] * 3 if by_drive is None else task.of_drive(torch.from_numpy(by_drive), t)
-        return None, torch.from_numpy(by_state[0]), *along, *task.weights.split(by_weights.sum(0))
+        for_each_group(starts.shape[1], task.lanes, lambda group: gradients.sweep(group, way_back(group), last=0.0))
+        return None, *gradients.weighed()
 
 
 class _Costs(torch.autograd.Function):
     """Maps (s_0, t, z, a, w) to the last signal of s_n of each realisation, and computes its gradients at once."""
 
     @staticmethod
-    def forward(ctx: Any, task: _Task, wanted: bool, *leaves: Tensor) -> Tensor:
-        batch, driven = len(task.initial_state), wanted and any(ctx.needs_input_grad[3:6])
-        costs, by_state = np.empty(batch), np.empty((1, *task.initial_state.shape))
-        by_weights = np.empty((1, batch, task.n_w))
-        by_drive = np.empty((task.n, batch, task.n_x)) if driven else None
-        nothing = np.zeros((1, task.n_s, task.lanes))
+    def forward(ctx: Any, task: _Task, enabled: bool, *leaves: Tensor) -> Tensor:
+        costs, nothing = np.empty(len(task.initial_state)), np.zeros((1, task.programs.sizes["s"], task.lanes))
+        if enabled and any(ctx.needs_input_grad):
+            ctx.gradients = _Gradients(task, driven=any(ctx.needs_input_grad[3:6]))
 
         def work(group: Group) -> None:
             starts = [task.start(group)]
@@ -215,29 +226,20 @@ class _Costs(torch.autograd.Function):
                 x, states = task.march(group, piece, starts[-1])
                 starts.append(states[-1].copy())
             costs[group.first : group.last] = starts.pop()[-1, : group.live]
-            if not wanted:
-                return
-            adjoint = _Adjoint(task, group, by_drive)
-            adjoint.costate[-1] = 1.0
-            for piece in reversed(task.pieces):
-                start = starts.pop()
-                if piece.stop < task.n:  # those of the last piece are still there
-                    x, states = task.march(group, piece, start)
-                adjoint.sweep(piece, x, states, nothing)
-            group.scatter(adjoint.costate[None], by_state)
-            group.scatter(adjoint.by_weights[None], by_weights)
 
-        for_each_group(batch, task.lanes, work)
-        ctx.task, ctx.t, ctx.found = task, leaves[1], [by_state[0], by_weights[0], by_drive]
+            def way_back() -> Iterator[Piece]:
+                held = x, states  # those of the last piece are still there
+                for piece in reversed(task.pieces):
+                    start = starts.pop()
+                    yield piece, *(held if piece.stop == task.n else task.march(group, piece, start)), nothing
+
+            if hasattr(ctx, "gradients"):
+                ctx.gradients.sweep(group, way_back(), last=1.0)
+
+        for_each_group(len(costs), task.lanes, work)
         return torch.from_numpy(costs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        task, factor = ctx.task, gradient.numpy()
-        by_state, by_weights, by_drive = ctx.found
-        along = [None] * 3
-        if by_drive is not None:
-            along = task.of_drive(torch.from_numpy(by_drive * factor[:, None]), ctx.t)
-        state = torch.from_numpy(by_state * factor[:, None]) if ctx.needs_input_grad[2] else None
-        return None, None, state, *along, *task.weights.split(factor @ by_weights)
+        return None, None, *ctx.gradients.weighed(gradient.numpy())

@@ -3,7 +3,6 @@
 import threading
 import warnings
 from collections import OrderedDict
-from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
@@ -11,9 +10,9 @@ from torch import Tensor, nn
 
 from rt_torchrl.programs.fingerprint import Fingerprint, fingerprint
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
+from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.traced_interval import March, Point, Sweep
+from rt_torchrl.trajectories.engines.traced_interval import Point, Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 
 KEPT = 256
@@ -22,42 +21,8 @@ NUDGE = 1e-3
 """Relative change of the signals at which machine code is compared with torch, so that no two of them are equal."""
 
 
-class Programs:
-    """The machine code of one kind of interval.
-
-    Args:
-        interval: the map Φ.
-        point: a point at which it is traced, and compared with torch.
-        lanes: lanes of the processor.
-    """
-
-    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
-        self.point, self.lanes = point, lanes
-        self.march = March(interval, point, lanes)
-        self._sweeps: dict[bool, Sweep] = {}
-
-    def prepare_sweep(self, interval: nn.Module, driven: bool) -> None:
-        """Make the reverse sweep of an interval of this kind, unless it is there.
-
-        Raises:
-            UntraceableError: if it cannot become a program.
-        """
-        if driven not in self._sweeps:
-            self._sweeps[driven] = Sweep(interval, self.point, self.lanes, driven=driven)
-
-    def sweep(self, driven: bool) -> Sweep:
-        """The reverse sweep, with or without the gradients by the drive; it has been prepared."""
-        return self._sweeps[driven]
-
-
-class _Known(NamedTuple):
-    """An interval as it is as long as its fingerprint holds."""
-
-    fingerprint: Fingerprint
-    weights: Weights
-
-
-_known: "WeakKeyDictionary[nn.Module, _Known]" = WeakKeyDictionary()
+_known: "WeakKeyDictionary[nn.Module, tuple[Fingerprint, Weights]]" = WeakKeyDictionary()
+"""The fingerprint of an interval with its weights, as long as its fingerprint holds."""
 _kept: "OrderedDict[tuple[object, ...], tuple[Programs | UntraceableError, tuple[object, ...]]]" = OrderedDict()
 """The programs of each kind of interval, or why there are none for one of its sweeps, with the objects that its
 fingerprint knows by their address."""
@@ -73,15 +38,15 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
     if initial_state.device.type != "cpu":
         return None
     with _lock:
-        known, lanes = _known_as(interval), lanes_of_this_machine()
+        (held, weights), lanes = _known_as(interval), lanes_of_this_machine()
         widths = initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1]
-        key = (known.fingerprint.digest, lanes, *widths)
-        found, alive = _kept.get(key, (None, known.fingerprint.alive))
+        key = (held.digest, lanes, *widths)
+        found, alive = _kept.get(key, (None, held.alive))
         if not isinstance(found, UntraceableError):
             try:
                 found = found or Programs(interval, point_of(initial_state, drive, lanes.number), lanes)
                 driven = any(x.requires_grad for x in drive)
-                if torch.is_grad_enabled() and (driven or initial_state.requires_grad or known.weights.learned):
+                if torch.is_grad_enabled() and (driven or initial_state.requires_grad or weights.learned):
                     found.prepare_sweep(interval, driven)
             except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
                 found = _reason(error)
@@ -90,13 +55,13 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
-        return (found, known.weights) if isinstance(found, Programs) else None
+        return (found, weights) if isinstance(found, Programs) else None
 
 
-def _known_as(interval: nn.Module) -> _Known:
+def _known_as(interval: nn.Module) -> tuple[Fingerprint, Weights]:
     found = _known.get(interval)
-    if found is None or not found.fingerprint.watch.holds(interval):
-        found = _known[interval] = _Known(fingerprint(interval), Weights(interval))
+    if found is None or not found[0].watch.holds(interval):
+        found = _known[interval] = fingerprint(interval), Weights(interval)
     return found
 
 

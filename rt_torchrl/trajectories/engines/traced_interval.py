@@ -1,6 +1,8 @@
 """Machine code of the recurrence of an interval and of its reverse sweep, traced and compared with torch."""
 
 import ctypes
+from collections.abc import Sequence
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -41,8 +43,10 @@ class Point(NamedTuple):
         return lanes.gather(t[:, :, None], *rest), lanes.gather(self.state.unsqueeze(0).numpy())
 
 
-class March:
-    """Machine code of s_{k+1} = Φ(s_k, x_k; w).
+class Programs:
+    """The machine code of one kind of interval: ``march(x, s, w, n)`` and, once it is prepared, the reverse sweep.
+
+    :mod:`rt_torchrl.programs.machine_code` describes both functions.
 
     Args:
         interval: the map Φ.
@@ -54,113 +58,74 @@ class March:
     """
 
     def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
+        self.point, self.lanes = point, lanes
+        self.sweeps: dict[bool, ObjectCode] = {}
+        """The reverse sweeps that have been prepared, without and with the gradients by the drive."""
         tracer = new_tracer()
         state, drive, weights = _traced_inputs(tracer, interval, point)
         with torch.no_grad(), Escapes(tracer), tracer:
             end = with_weights(interval, weights, state, drive)
         if end.shape != state.shape:
             raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
-        self.lanes, self.sizes = lanes, {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
-        self._code = ObjectCode(march_text(tracer.program, tracer.outputs(end), self.sizes, lanes), "march", MARCH)
-        self._compare(interval, point)
-
-    def __call__(self, x: np.ndarray, states: np.ndarray, weights: np.ndarray, n: int) -> None:
-        """Write the states 1 ... n of ``states`` (``n+1 n_s lanes``), under the drive ``x`` (``n n_x lanes``)."""
-        self._code(x, states, weights, n)
-
-    @torch.no_grad()
-    def _compare(self, interval: nn.Module, point: Point) -> None:
+        self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
+        text = march_text(tracer.program, tracer.outputs(end), self.sizes, lanes)
+        self.march = ObjectCode(text, "march", MARCH)
         x, start = point.in_lanes()
         states = np.concatenate([start, start])
-        self(x, states, Weights(interval).row(), 1)
-        require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
+        self.march(x, states, Weights(interval).row(), 1)
+        with torch.no_grad():
+            require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
 
-
-class Sweep:
-    """Machine code of the reverse sweep λ_k = (∂Φ/∂s)ᵀλ_{k+1} + ∂J/∂s_k, which computes each interval again.
-
-    Args:
-        interval: the map Φ.
-        point: a point at which it is traced, and compared with torch.
-        lanes: lanes of the processor.
-        driven: whether it gives the gradients by the drive too.
-
-    Raises:
-        UntraceableError: if the interval cannot become a program, or the program differs from torch.
-    """
-
-    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes, *, driven: bool):
-        tracer = new_tracer()
-        state, drive, weights = _traced_inputs(tracer, interval, point)
-        learned = {name: weights[name] for name, w in interval.named_parameters() if w.requires_grad}
-        costate = torch.ones_like(state)
-        tracer.input(costate, "l")
-        leaves = [state, *(drive if driven else ()), *learned.values()]
-        with torch.enable_grad():
-            for leaf in leaves:
-                leaf.requires_grad_()
-            with Escapes(tracer), tracer:
-                end = with_weights(interval, weights, state, drive)
-                found = torch.autograd.grad(end, leaves, costate, allow_unused=True) if end.requires_grad else ()
-        zero = tracer.program.constant(0.0)
-        pairs = zip(found or [None] * len(leaves), leaves, strict=True)
-        by_state, *others = ([zero] * leaf.numel() if g is None else tracer.outputs(g) for g, leaf in pairs)
-        by_drive, by_weights = (sum(part, []) for part in (others[: 3 * driven], others[3 * driven :]))
-        self.lanes, self.driven, self.names = lanes, driven, list(learned)
-        self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
-        self.sizes["w"] = sum(w.numel() for w in learned.values())
-        text = sweep_text(tracer.program, by_state, by_weights, by_drive, self.sizes, lanes)
-        self._code = ObjectCode(text, "sweep", SWEEP)
-        self._compare(interval, point)
-
-    def __call__(
-        self,
-        x: np.ndarray,
-        states: np.ndarray,
-        source: np.ndarray,
-        costate: np.ndarray,
-        weights: np.ndarray,
-        by_drive: np.ndarray,
-        by_weights: np.ndarray,
-        n: int,
-    ) -> None:
-        """Replace the co-state of the end (``n_s lanes``) by that of the start, and give the gradients.
+    def prepare_sweep(self, interval: nn.Module, driven: bool) -> None:
+        """Make the reverse sweep of an interval of this kind, unless it is there.
 
         Args:
-            x: drive, ``n n_x lanes``.
-            states: states at the starts of the intervals, ``n n_s lanes``.
-            source: ∂J/∂s at the end of every interval, ``n n_s lanes``, or one row that serves all.
-            costate: the co-state.
-            weights: all weights of the interval.
-            by_drive: gradients by the drive, ``n n_x lanes``; untouched unless ``driven``.
-            by_weights: gradients by the learned weights, ``n_w lanes``, which are added to.
-            n: number of intervals.
-        """
-        stride = int(len(source) > 1)
-        self._code(x, states, source, stride, costate, weights, by_drive, by_weights, n)
+            interval: the interval.
+            driven: whether the sweep gives the gradients by the drive too.
 
-    def _compare(self, interval: nn.Module, point: Point) -> None:
-        n_lanes, names = self.lanes.number, self.names
-        costate = 1.0 + 0.1 * np.arange(self.sizes["s"] * n_lanes, dtype=float).reshape(-1, n_lanes)
-        source, (x, states) = np.zeros((1, self.sizes["s"], n_lanes)), point.in_lanes()
-        found = costate.copy(), np.zeros((1, self.sizes["x"], n_lanes)), np.zeros((self.sizes["w"], n_lanes))
-        self(x, states, source, found[0], Weights(interval).row(), *found[1:], 1)
-        state, *drive = (x.clone().requires_grad_() for x in (point.state, *point.drive))
-        weights = dict(interval.named_parameters())
-        leaves = [state, *drive, *(weights[name] for name in names)]
+        Raises:
+            UntraceableError: if it cannot become a program, or the program differs from torch.
+        """
+        if driven in self.sweeps:
+            return
+        tracer = new_tracer()
+        state, drive, weights = _traced_inputs(tracer, interval, self.point)
+        costate = torch.ones_like(state)
+        tracer.input(costate, "l")
+        learned = [weights[name] for name, w in interval.named_parameters() if w.requires_grad]
+        parts = [state], [*drive] if driven else [], learned
+        leaves = [leaf.requires_grad_() for part in parts for leaf in part]
+        with torch.enable_grad(), Escapes(tracer), tracer:
+            found = _gradients(with_weights(interval, weights, state, drive), leaves, costate)
+        values = map(tracer.outputs, found)
+        outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
+        code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
+        self._compare_sweep(code, interval, driven)
+        self.sweeps[driven] = code
+
+    def _compare_sweep(self, sweep: ObjectCode, interval: nn.Module, driven: bool) -> None:
+        weights, (x, states) = Weights(interval), self.point.in_lanes()
+        costate = 1.0 + 0.1 * np.arange(states[0].size, dtype=float).reshape(states[0].shape)
+        by_state, by_drive = costate.copy(), np.zeros_like(x)
+        by_weights = np.zeros((sum(weights.sizes), self.lanes.number))
+        sweep(x, states, np.zeros_like(states), 0, by_state, weights.row(), by_drive, by_weights, 1)
+        leaves = [x.clone().requires_grad_() for x in (self.point.state, *self.point.drive)]
         with torch.enable_grad():
-            end, by_end = interval(state, Drive(*drive)), torch.from_numpy(costate.T)
-            wanted = torch.autograd.grad(end, leaves, by_end, allow_unused=True, materialize_grads=True)
-        by_state, by_drive = wanted[0].numpy(), torch.cat([wanted[1].unsqueeze(-1), *wanted[2:4]], -1).numpy()
-        require_equal("the co-state", found[0].T, by_state, by_state)
-        if self.driven:
-            require_equal("the gradient by the drive", found[1][0].T, by_drive, by_drive)
-        parts = np.split(found[2].sum(-1), np.cumsum([w.numel() for w in wanted[4:]])[:-1]) if names else []
-        flat = [exactly.flatten().numpy() for exactly in wanted]
-        greatest = max(float(np.abs(values[np.isfinite(values)]).max(initial=0.0)) for values in flat)
-        for name, part, exactly in zip(names, parts, flat[4:], strict=True):
-            floor = np.full_like(exactly, ROUNDING / AGREEMENT * greatest)
-            require_equal(f"the gradient by {name}", part, exactly, floor)
+            end = interval(leaves[0], Drive(*leaves[1:]))
+            state, t, *rest = _gradients(end, [*leaves, *weights.learned], torch.from_numpy(costate.T))
+        exact = [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
+        found = [by_state.T, by_drive[0].T if driven else exact[1], *weights.split(by_weights.sum(-1))]
+        floor = ROUNDING / AGREEMENT * max(x[x.isfinite()].abs().amax().item() for x in exact if x.isfinite().any())
+        names = ["state", "drive", *(name for name, w in interval.named_parameters() if w.requires_grad)]
+        for name, part, exactly in zip(names, found, exact, strict=True):
+            require_equal(f"the gradient by {name}", np.asarray(part), exactly.numpy(), np.full(exactly.shape, floor))
+
+
+def _gradients(end: Tensor, leaves: list[Tensor], costate: Tensor) -> Sequence[Tensor]:
+    """The products of the co-state of an end with its Jacobians by the leaves."""
+    if not end.requires_grad:
+        return [torch.zeros_like(leaf) for leaf in leaves]
+    return torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
 
 
 def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:

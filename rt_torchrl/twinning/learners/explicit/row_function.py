@@ -93,8 +93,9 @@ def text_of(formula: Formula, n_w: int, lanes: Lanes) -> str:
         found = formula(row, weights)
     outputs = [i for part in found for i in tracer.cells(part).flatten().tolist()]
     writer = LaneWriter(lanes, "rows")
-    places = [writer.index(0, [(j, "%n"), (1, "%k")]) for j in range(max(formula.n_in, len(outputs)))]
-    inputs = {("x", j): writer.load("%x", places[j]) for j in range(formula.n_in)}
-    for place, output in zip(places, Lowering(tracer.program, writer, inputs, "%w").write(outputs), strict=False):
-        writer.store("%y", place, output)
+    with writer.loop("%n") as k:
+        places = [writer.index(0, [(j, "%n"), (1, k)]) for j in range(max(formula.n_in, len(outputs)))]
+        inputs = {("x", j): writer.load("%x", places[j]) for j in range(formula.n_in)}
+        for place, output in zip(places, Lowering(tracer.program, writer, inputs, "%w").write(outputs), strict=False):
+            writer.store("%y", place, output)
     return writer.function("rows", "ptr noalias %x, ptr noalias %y, ptr noalias %w")
