@@ -13,7 +13,17 @@ if __name__ == "__main__":
 import torch
 import tyro
 
-from rt_torchrl import ClassicalController, LimitConfig, LoadedRun, Plant, RunConfig, check_options, load_run, main_of
+from rt_torchrl import (
+    ClassicalController,
+    LimitConfig,
+    LoadedRun,
+    Plant,
+    PredictiveConfig,
+    RunConfig,
+    check_options,
+    load_run,
+    main_of,
+)
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
@@ -30,7 +40,6 @@ from rt_torchrl.evaluation.limits import (
 )
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.configured_plant import plant_of
 from rt_torchrl.runs.results_file import make_folder, write_results

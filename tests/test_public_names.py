@@ -42,6 +42,7 @@ ROOMS_OF = {
     "study.py": {"study", "runs"},
     "sweep.py": {"figures", "runs", "study"},
     "unknown.py": {"study", "runs"},
+    "worth.py": {"figures", "runs", "study"},
 }
 """Recipes that are the command line of a room, and the rooms whose internal names they use."""
 

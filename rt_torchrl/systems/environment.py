@@ -77,7 +77,6 @@ class PlantEnv(EnvBase):
         self._sensors = torch.Generator(device=device)
         self._set_seed(seed)
         self.compiled, self._noise, self._wear, self._episodes = compiled, noise, wear, 0
-        self._has_state = False
         declare_specs(self, plant)
 
     @property
@@ -91,17 +90,23 @@ class PlantEnv(EnvBase):
             self._sensors.manual_seed(seed + 1)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Everything that the next reset depends on, and the state in which the system goes on without one."""
+        """Everything that the next reset depends on."""
         generators = {"generator": self._generator.get_state(), "sensors": self._sensors.get_state()}
-        found = generators | {"episodes": self._episodes}
-        return found | {"state": self._state} if self._has_state else found
+        return generators | {"episodes": self._episodes}
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self._generator.set_state(state["generator"])
         self._sensors.set_state(state["sensors"])
-        self._episodes, self._has_state = state["episodes"], "state" in state
-        if self._has_state:
-            self._state = state["state"].to(self.device)
+        self._episodes = state["episodes"]
+
+    @property
+    def present(self) -> Float[Tensor, "batch n_s"]:
+        """The state in which :meth:`go_on` begins the next window; assign it to go on from an earlier one."""
+        return self._state
+
+    @present.setter
+    def present(self, state: Float[Tensor, "batch n_s"]) -> None:
+        self._state = state.to(self.device)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
         """Initial states and exogenous inputs of the next episodes."""
@@ -122,8 +127,6 @@ class PlantEnv(EnvBase):
         batch, (state, exogenous) = self.batch_size[0], self._draw()
         if self.plant.ended(state).any():
             raise ValueError(f"plant {self.plant.name!r} draws initial states in which the episode has ended.")
-        self._goes_on = False
-        self._has_state = True
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():
             self._step_count = torch.zeros(batch, dtype=torch.long, device=self.device)

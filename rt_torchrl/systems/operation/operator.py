@@ -199,9 +199,9 @@ class Operator:
             "env": self.env.state_dict(),
             "generator": self.actor.generator.get_state(),
             "interval": self.interval,
-            "begun": self._begun,
             "order": None if self._order is None else self._order._asdict(),
             "carried": self.actor.carried() if self.continuous else {},
+            "present": self.env.present if self._can_go_on() else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -217,6 +217,10 @@ class Operator:
         if state["order"] is not None:
             self.follow(Order(**state["order"]))
             self.actor.begin(self.actor.policy, strength=state["order"]["strength"])
-        if self.continuous and isinstance(self.env, PlantEnv) and state.get("begun", True) and "state" in state["env"]:
-            self._begun = True
+        if state["present"] is not None:
+            self.env.present, self._begun = state["present"], True
             self.actor.carry(state["carried"])
+
+    def _can_go_on(self) -> bool:
+        """Whether the next window begins in the present state, and this can be put back."""
+        return self.continuous and self._begun and isinstance(self.env, PlantEnv)
