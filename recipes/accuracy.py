@@ -14,7 +14,7 @@ import torch
 from rt_torchrl import AssimilationConfig, DigitalTwin, LoadedRun, check_options, load_run, main_of
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.twinning.assimilation import Assimilation
 
@@ -102,7 +102,7 @@ def main(config: Config) -> None:
     make_folder("log_dir", config.log_dir)
     trainings = {plant: config.trainings(plant) for plant in config.plants}
     tasks = [training for each in trainings.values() for training in each]
-    side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
+    on_this_machine(tasks, config.jobs)
     found = {
         plant: [
             over_best(load_run(one.folder), config.unseen) if plant == "wind_turbine" else weight_error(one)

@@ -11,7 +11,7 @@ if __name__ == "__main__":
 
 from rt_torchrl import check_options, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 
 FITTED = (
@@ -85,7 +85,7 @@ def main(config: Config) -> None:
     make_folder("log_dir", config.log_dir)
     pairs = {plant: [config.trainings(plant, partial=one) for one in (False, True)] for plant in config.plants}
     tasks = [training for pair in pairs.values() for trainings in pair for training in trainings]
-    side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
+    on_this_machine(tasks, config.jobs)
     found = {plant: dict(zip(("state", "sensors"), map(costs_of, pair), strict=True)) for plant, pair in pairs.items()}
     write_results(config.log_dir / "partial.json", {"config": config, "costs": found})
     print(table(found))

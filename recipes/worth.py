@@ -21,7 +21,7 @@ from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.arms import SystemResult, classical_arms, trained_arm
 from rt_torchrl.study.results import yardstick_entry
 from rt_torchrl.study.room import write_into
-from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.study.worth import WHOLE, findings_page
 from rt_torchrl.study.yardsticks import Yardstick, oracle
@@ -288,7 +288,7 @@ def main(config: Config) -> None:
     make_folder("folder", config.folder)
     if not config.finished:
         tasks = config.tasks()
-        side_by_side([tasks] if config.jobs == 1 else [[task] for task in tasks], backend="loky", jobs=config.jobs)
+        on_this_machine(tasks, config.jobs)
     print(f"findings in {write(config)}")
 
 

@@ -74,7 +74,7 @@ def test_a_row_is_made_of_what_is_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Training, "metrics", metrics)
     monkeypatch.setattr(Yardstick, "run", lambda yardstick: {"J_a": {"mean": 0.05}})
-    monkeypatch.setattr(made, "side_by_side", lambda batches, **options: None)
+    monkeypatch.setattr(made, "on_this_machine", lambda tasks, jobs: None)
     made.main(config)
     kept = json.loads((config.kept / "room.json").read_text())["rows"]
     assert kept == [vars(HELPED) | {"gap": pytest.approx(3.0)}]

@@ -5,12 +5,11 @@ from typing import cast
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.figures.animation import MovingCaption, Trace, save_scene
+from rt_torchrl.figures.animation import Trace, TracedScene, save_scene
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import FILTERED, REAL, SAMPLES, TWIN, array, last_episode, panels, time_axis
+from rt_torchrl.figures.style import FILTERED, REAL, SAMPLES, TWIN, array
 
 PUFFS = 12
 """Greatest number of drawn puffs of vented gas."""
@@ -36,37 +35,26 @@ def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     return save_scene(_Scene(snapshot), len(snapshot.record.actions), path)
 
 
-class _Scene:
+class _Scene(TracedScene):
     """The picture at the start of any interval of the record."""
 
     @torch.no_grad()
     def __init__(self, snapshot: Snapshot):
         plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
         state, n = record.states[:-1], len(record.actions)
-        self.time, label = time_axis(plant, n)
-        self.unit = label.removeprefix("time [").removesuffix("]")
+        super().__init__(snapshot, 3, title="Cryogenic tank", size=(9.0, 5.2), width_ratios=(1.0, 1.5))
         self.pressure, self.fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
         self.flow = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow)
         self.load = array(record.exogenous[:, 0])
-        title = f"Cryogenic tank, episode {last_episode(snapshot)}"
-        self.figure, axes = panels(3, 2, title=title, size=(9.0, 5.2), width_ratios=(1.0, 1.5))
-        grid = axes[0, 0].get_gridspec()
-        for ax in axes[:, 0]:
-            ax.remove()
-        self.ax = self.figure.add_subplot(grid[:, 0])
-        self.caption = MovingCaption(self.ax)
         self._draw_tank()
         held = np.full(n, 1e-3 * plant.set_point)
-        above, middle, below = axes[:, 1]
+        above, middle, below = self.beside
         thin = {"linewidth": 0.8}
         self.traces = [
             Trace(above, self.time, self.pressure, "pressure $p$ [kPa]", setpoint=held),
             Trace(middle, self.time, self.flow, r"vent flow $\dot m_c$ [g/s]", style=thin | {"color": SAMPLES}),
             Trace(below, self.time, self.load, plant.inputs[0].label, style=thin | {"color": TWIN}),
         ]
-        for ax in (above, middle):
-            ax.tick_params(labelbottom=False)
-        below.set_xlabel(label)
 
     def _draw_tank(self) -> None:
         ax = self.ax
@@ -83,12 +71,7 @@ class _Scene:
             [-1.75], [0.0], [0.0], [0.0], color=TWIN, angles="xy", scale_units="xy", scale=1.0, width=0.02
         )
         self.note = ax.text(-1.85, -1.25, "", fontsize=9)
-
-    @property
-    def moving(self) -> list[Artist]:
-        """What :meth:`show` moves."""
-        own: list[Artist] = [self.liquid, self.shell, self.valve, self.puffs, self.arrow, self.note]
-        return [*own, *self.caption.moving, *(artist for trace in self.traces for artist in trace.moving)]
+        self.own += [self.liquid, self.shell, self.valve, self.puffs, self.arrow, self.note]
 
     def show(self, k: int) -> None:
         """Move everything to sample ``k``."""

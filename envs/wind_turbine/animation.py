@@ -5,12 +5,11 @@ from typing import cast
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.figures.animation import MovingCaption, Trace, save_scene, shown_samples
+from rt_torchrl.figures.animation import Trace, TracedScene, save_scene, shown_samples
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array, last_episode, panels, time_axis
+from rt_torchrl.figures.style import REAL, REFERENCE, SAMPLES, array
 
 TURN = 25.0
 """Angle by which the rotor turns between two frames at rated speed [deg]; its true angle would seem to jump."""
@@ -42,41 +41,30 @@ def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     return save_scene(_Scene(snapshot), len(snapshot.record.actions), path)
 
 
-class _Scene:
+class _Scene(TracedScene):
     """The picture at the start of any interval of the record."""
 
     @torch.no_grad()
     def __init__(self, snapshot: Snapshot):
         plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
         state, n = record.states[:-1], len(record.actions)
-        self.time, label = time_axis(plant, n)
-        self.unit = label.removeprefix("time [").removesuffix("]")
+        super().__init__(snapshot, 4, title="Wind turbine", size=(9.0, 5.6), width_ratios=(1.15, 1.0))
         self.wind, self.pitch = array(record.exogenous[:, 0]), array(record.actions[:, 1])
         speed = array(state[:, 0]) / plant.rated_rotor_speed
         # The angle of a frame is the sum of what the frames before it have turned.
         shown = shown_samples(n)
         turned = np.cumsum(TURN * speed[shown])
         self.angle = dict(zip(shown, np.radians(turned), strict=True))
-        title = f"Wind turbine, episode {last_episode(snapshot)}"
-        self.figure, axes = panels(4, 2, title=title, size=(9.0, 5.6), width_ratios=(1.15, 1.0))
-        grid = axes[0, 0].get_gridspec()
-        for ax in axes[:, 0]:
-            ax.remove()
-        self.ax = self.figure.add_subplot(grid[:, 0])
-        self.caption = MovingCaption(self.ax)
         self._draw_tower()
         omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
         held = array(plant.reference_speed(state[:, 2])), array(1e-6 * plant.reference_power(omega_g))
-        wind, rotor, made, pitch = axes[:, 1]
+        wind, rotor, made, pitch = self.beside
         self.traces = [
             Trace(wind, self.time, self.wind, r"wind speed $u$ [m/s]", style={"linewidth": 0.8, "color": SAMPLES}),
             Trace(rotor, self.time, array(omega_g), r"generator speed $\omega_g$ [rad/s]", setpoint=held[0]),
             Trace(made, self.time, array(power), "generator power [MW]", setpoint=held[1]),
             Trace(pitch, self.time, self.pitch, r"blade pitch $\beta$ [deg]"),
         ]
-        for ax in (wind, rotor, made):
-            ax.tick_params(labelbottom=False)
-        pitch.set_xlabel(label)
 
     def _draw_tower(self) -> None:
         ax = self.ax
@@ -90,12 +78,7 @@ class _Scene:
             [-90.0], [150.0], [0.0], [0.0], color=SAMPLES, angles="xy", scale_units="xy", scale=1.0, width=0.012
         )
         self.note = ax.text(-90.0, 156.0, "", fontsize=9)
-
-    @property
-    def moving(self) -> list[Artist]:
-        """What :meth:`show` moves."""
-        own: list[Artist] = [*self.blades, self.hub, self.arrow, self.note]
-        return [*own, *self.caption.moving, *(artist for trace in self.traces for artist in trace.moving)]
+        self.own += [*self.blades, self.hub, self.arrow, self.note]
 
     def show(self, k: int) -> None:
         """Move everything to sample ``k``."""

@@ -12,7 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rt_torchrl.atomic_file import write_atomically
-from rt_torchrl.figures.style import REAL, REFERENCE_LINE, caption
+from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.figures.style import REAL, REFERENCE_LINE, caption, last_episode, panels, time_axis
 
 FRAMES = 125
 """Greatest number of frames: five seconds."""
@@ -155,3 +156,45 @@ class MovingCaption:
         """Write other words."""
         self._label.set_text(label)
         self._note.set_text(note)
+
+
+class TracedScene:
+    """A drawing of a plant on the left, with a caption that moves, beside one trace below the other on the right.
+
+    A subclass draws into ``ax``, sets ``traces`` in the panels ``beside``, and adds to ``own`` what it moves itself.
+
+    Args:
+        snapshot: snapshot with the episode.
+        traces: number of traces.
+        title: what the picture shows; the number of the episode follows.
+        size: width and height of the figure [inch].
+        width_ratios: widths of drawing and traces.
+    """
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        traces: int,
+        *,
+        title: str,
+        size: tuple[float, float],
+        width_ratios: tuple[float, float],
+    ):
+        self.time, label = time_axis(snapshot.plant, len(snapshot.record.actions))
+        self.unit = label.removeprefix("time [").removesuffix("]")
+        named = f"{title}, episode {last_episode(snapshot)}"
+        self.figure, axes = panels(traces, 2, title=named, size=size, width_ratios=width_ratios)
+        grid = axes[0, 0].get_gridspec()
+        for ax in axes[:, 0]:
+            ax.remove()
+        self.ax = self.figure.add_subplot(grid[:, 0])
+        self.caption = MovingCaption(self.ax)
+        self.beside, self.traces, self.own = list(axes[:, 1]), list[Trace](), list[Artist]()
+        for ax in self.beside[:-1]:
+            ax.tick_params(labelbottom=False)
+        self.beside[-1].set_xlabel(label)
+
+    @property
+    def moving(self) -> list[Artist]:
+        """What :meth:`show` moves."""
+        return [*self.own, *self.caption.moving, *(artist for trace in self.traces for artist in trace.moving)]

@@ -43,6 +43,19 @@ def side_by_side(
         raise RuntimeError(f"{len(failures)} failed, the others are kept:\n" + "\n".join(failures))
 
 
+def on_this_machine(tasks: Sequence[Task], jobs: int) -> None:
+    """Run tasks in processes on this machine, or all in one process, which then compiles nothing twice.
+
+    Args:
+        tasks: the tasks.
+        jobs: number of processes; 0 means one for every core.
+
+    Raises:
+        RuntimeError: after all tasks, if some failed; it repeats their errors.
+    """
+    side_by_side([tasks] if jobs == 1 else [[task] for task in tasks], backend="loky", jobs=jobs)
+
+
 def over_processes(batches: Sequence[Sequence[Task]], jobs: int) -> list[str]:
     """Run batches in processes on this machine, and return the errors of the tasks that failed."""
     with progress([task for batch in batches for task in batch]):
