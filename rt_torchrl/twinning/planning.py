@@ -135,8 +135,7 @@ class Planning:
     def _priced(self, policy: nn.Module, episodes: Scenario) -> Tensor:
         """The mean J_a with the price of leaving the bounds, if there are some, for a descent."""
         twin, constraints = self.virtual.twin, self.virtual.constraints
-        cost = twin.cost(policy, *episodes)
-        return constraints.priced(cost, twin.control(policy, *episodes)) if constraints else cost
+        return constraints.cost(twin, policy, episodes) if constraints else twin.cost(policy, *episodes)
 
     def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         policy = self.planner.policy

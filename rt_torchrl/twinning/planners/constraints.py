@@ -15,11 +15,12 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.state_bounds import StateBounds
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints_config import ConstraintsConfig
 
 
@@ -43,6 +44,11 @@ class Constraints:
     def __bool__(self) -> bool:
         """Whether there is any bound."""
         return bool(self.bounds.names)
+
+    def cost(self, twin: DigitalTwin, policy: nn.Module, episodes: Scenario) -> Float[Tensor, ""]:
+        """Mean J_a of virtual episodes with the price of their trajectories, differentiable by the policy's weights."""
+        found = twin.cost(policy, *episodes)
+        return self.priced(found, twin.control(policy, *episodes)) if self else found
 
     def priced(self, cost: Float[Tensor, ""], flown: Trajectory) -> Float[Tensor, ""]:
         """A mean J_a with the price of the trajectories that it is the mean of."""

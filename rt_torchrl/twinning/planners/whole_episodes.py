@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -31,14 +31,10 @@ class WholeEpisodes:
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradient steps; the policy keeps the best weights seen in them."""
-
-        def cost() -> Tensor:
-            found = self.twin.cost(self.policy, *episodes)
-            return self.constraints.priced(found, self.twin.control(self.policy, *episodes)) if constrained else found
-
-        constrained = bool(self.constraints)
-        found = self.descent.run(cost, self.config.iterations)
-        if constrained:
+        found = self.descent.run(
+            lambda: self.constraints.cost(self.twin, self.policy, episodes), self.config.iterations
+        )
+        if self.constraints:
             with torch.no_grad():
                 self.constraints.update(self.twin.control(self.policy, *episodes))
         return found
