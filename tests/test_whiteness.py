@@ -2,7 +2,12 @@
 
 import pytest
 import torch
+from linear_quadratic import LinearQuadratic
+from small_runs import SMALL
 
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.evidence.whiteness import whiteness
 
 
@@ -38,3 +43,13 @@ def test_shapes_that_differ_are_refused():
         whiteness(noise(20, 1), noise(20, 2))
     with pytest.raises(ValueError, match="ten samples"):
         whiteness(noise(9, 1), noise(9, 1))
+
+
+@pytest.mark.parametrize(("horizon", "tested"), [(0.8, False), (2.0, True)])
+def test_an_episode_too_short_for_the_test_is_examined_without_it(horizon, tested):
+    plant, generator = LinearQuadratic(horizon=horizon), torch.Generator().manual_seed(0)
+    policies = {role: plant.make_policy(generator) for role in ("model_free", "model_based")}
+    twin = DigitalTwin(plant, plant.make_closure(generator))
+    algorithm = ReinforcementTwinning(PlantEnv(plant, seed=0), twin, **policies, config=SMALL, generator=generator)
+    report = algorithm.episode()
+    assert "alarm" in report and ("whiteness" in report) == tested

@@ -14,7 +14,7 @@ from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
-from rt_torchrl.twinning.evidence.whiteness import whiteness
+from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
@@ -45,8 +45,8 @@ class Examination:
 
         Returns:
             ``paired_difference`` of the last episode; ``alarm``, with a ``warning`` in words if it is 1; and apart from
-            these ``whiteness`` of what the replay of the episode leaves over, see :func:`whiteness`. Nothing if state
-            feedback flew them.
+            these ``whiteness`` of what the replay of the episode leaves over, see :func:`whiteness`, if it is long
+            enough. Nothing if state feedback flew them.
         """
         found = self.track_record.differences(self.virtual)
         if not found.values:
@@ -56,7 +56,9 @@ class Examination:
         quiet = [d for d, noise in zip(found.values, found.exploration, strict=True) if noise <= QUIET]
         said = alarm(quiet)
         explained = self.virtual.twin.explanation()
-        report = findings(paired_difference=found.values[-1], alarm=float(said is not None), whiteness=self._white())
+        report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
+        if len(self.track_record.latest_record.actions) >= LEAST:
+            report = merged(report, findings(whiteness=self._white()))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
 
     def _white(self) -> float:

@@ -6,6 +6,8 @@ from torch import Tensor
 
 LAGS = 20
 """Greatest number of lags whose correlations count."""
+LEAST = 10
+"""Least number of samples of which correlations say anything."""
 NOTHING = 1e-6
 """Residual, as a share of a signal's own deviation, below which nothing is left over but rounding."""
 
@@ -24,12 +26,12 @@ def whiteness(residuals: Float[Tensor, "n n_s"], signals: Float[Tensor, "n_read 
         lags: greatest number m of lags; it is at most a fifth of the samples.
 
     Raises:
-        ValueError: if the shapes differ, or there are fewer than ten samples.
+        ValueError: if the shapes differ, or there are fewer than ``LEAST`` samples.
 
     Source: Ljung, Box, *On a measure of lack of fit in time series models*, Biometrika 65, 1978.
     """
     n = len(residuals)
-    if residuals.shape != signals.shape or n < 10:
+    if residuals.shape != signals.shape or n < LEAST:
         raise ValueError(
             f"residuals of shape {tuple(residuals.shape)} must have that of the signals, {tuple(signals.shape)}, and "
             "ten samples at least."
