@@ -208,6 +208,24 @@ def test_a_training_goes_back_to_what_was_better_in_reality(corrected):
     assert any(recalled) == corrected
 
 
+@pytest.mark.parametrize(("factor", "corrects"), [(1.0, False), (1.1, False), (1.3, True)])
+def test_plans_are_corrected_where_a_real_episode_contradicts_the_twin(factor, corrects):
+    """The twin is the real system, whose costs are reported multiplied; 15 % are beyond chance."""
+    plant = LinearQuadratic(horizon=2.0)
+    quiet = ExplorationConfig(spread=0.0)
+    found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=quiet)
+    fly = found.flights.fly
+
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
+        flight.transitions["next", "reward"] *= factor
+        return flight
+
+    found.flights.fly = flown
+    found.interact()
+    assert (found.examination.correction(found.short_term[-1]) is not None) == corrects
+
+
 @pytest.mark.parametrize("factor", [1.0, 10.0])
 def test_the_learner_trusts_the_twin_as_far_as_it_was_right(factor):
     """The real system costs the factor times what the twin says."""

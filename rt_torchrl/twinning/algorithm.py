@@ -220,7 +220,7 @@ class ReinforcementTwinning:
             incumbent=lambda episodes: self.virtual_costs(episodes, ("model_based",))["model_based"],
             worse=self.referee.worse,
             require_sound_twin=lambda episodes: self.track_record.require_sound_twin(self.virtual, episodes),
-            evidence=self.examination.judge(self.short_term[-1]) if self.config.corrected_plans else None,
+            evidence=self.examination.correction(self.short_term[-1]) if self.config.corrected_plans else None,
         )
         return self.planning.plan(self.episodes_done + 1, planned_on, judged_on, judgement)
 

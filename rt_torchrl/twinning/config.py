@@ -39,8 +39,8 @@ class TwinningConfig:
             arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
             ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
         corrected_plans: whether step 5 judges a plan by what it is expected to cost on the real system, as the paired
-            differences of real episodes say, and goes back to weights that have flown for less; without it the twin
-            alone judges.
+            differences of real episodes say, and goes back to weights that have flown for less, where one of the latest
+            real episodes contradicts the twin; without it the twin alone judges.
         exploration: parameters of step 1.
         learner: parameters of step 2.
         exogenous: parameters of step 3.

@@ -12,7 +12,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import same_architecture
-from rt_torchrl.twinning.evidence.alarm import QUIET, alarm
+from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE, QUIET, alarm
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
 from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
@@ -52,7 +52,7 @@ class Examination:
         if not found.values:
             self.unexplained = 0.0
             return findings()
-        self.unexplained = abs(found.values[-1]) - 2.0 * EXPLORED * found.exploration[-1]
+        self.unexplained = unexplained(found.values[-1], found.exploration[-1])
         quiet = [d for d, noise in zip(found.values, found.exploration, strict=True) if noise <= QUIET]
         said = alarm(quiet)
         explained = self.virtual.twin.explanation()
@@ -98,11 +98,26 @@ class Examination:
         found = self.track_record.differences(self.virtual)
         return RealJudge(found, found.learned(self.virtual.twin.plant, record), self.virtual, record)
 
+    def correction(self, record: Trajectory) -> "RealJudge | None":
+        """The judge of plans, where one of the latest real episodes contradicts the twin beyond chance; else None.
+
+        A twin that has been right so far keeps the last word: the belief about a policy that never flew is so wide that
+        it would refuse plans which are as good as the twin says.
+        """
+        judge = self.judge(record)
+        sizes = map(unexplained, judge.differences.values, judge.differences.exploration)
+        return judge if max(sizes, default=0.0) > BEYOND_CHANCE else None
+
     @torch.no_grad()
     def beliefs(self, policies: Mapping[Role, nn.Module], record: Trajectory) -> dict[Role, Belief]:
         """The belief about log J_real − log J_twin of each policy, compared in the observations of a record."""
         judge = self.judge(record)
         return {role: judge.belief(policy) for role, policy in policies.items()}
+
+
+def unexplained(value: float, exploration: float) -> float:
+    """Size of a paired difference beyond what exploration explains."""
+    return abs(value) - 2.0 * EXPLORED * exploration
 
 
 class RealJudge:
