@@ -41,7 +41,20 @@ def equal_(m, s, d):
     return s if torch.equal(torch.zeros(1, 3, **D), s) else s * m.w0
 
 
+def long_row(known):
+    """A row that is long enough for a loop, of which the first element is a known number."""
+
+    def found(m, s, d):
+        rest = torch.cat([s * k for k in range(1, 10)], -1)
+        row = torch.cat([torch.full_like(s[..., :1], known), rest], -1)
+        return ((row / 4.0) * m.w0 + (row * 4.0).sin()).unflatten(-1, (7, 4)).sum(-2)[..., :3]
+
+    return found
+
+
 OPERATORS = {
+    "long row after 0": F(long_row(0.0)),
+    "long row after 1": F(long_row(1.0)),
     "out=": F(out_arg),
     "fancy inplace": F(inplace_add),
     "mask put": F(maskput),

@@ -236,11 +236,11 @@ class Tracer(TorchDispatchMode):
 
     def _shortcut(self, name: str, operands: list[Tensor]) -> Tensor | None:
         """The result on a long row that needs no loop, such as 0·x or x + 0; None if it needs one."""
-        firsts = [int(o.flatten()[0]) for o in operands]
-        known = [self.uniform_number(o) is not None for o in operands]
-        found = ELEMENTWISE[name](self.program, *firsts)  # what the rules of scalars make of it, they make of each
-        for cells, first, plain in zip(operands, firsts, known, strict=True):
-            if found == first and (plain or any(known)):
+        if all(self.uniform_number(o) is None for o in operands):
+            return None
+        rows = list(zip(*(o.flatten().tolist() for o in operands), strict=True))
+        for k, cells in enumerate(operands):  # of each element, because 0/x is its operand where 0/x is not one
+            if all(ELEMENTWISE[name](self.program, *row) == row[k] for row in rows):
                 return cells
         return None
 
