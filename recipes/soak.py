@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import os
 import sys
 import threading
@@ -23,13 +24,17 @@ from rt_torchrl import check_options, main_of
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.results_file import make_folder, write_results
 
+SEEN = 1.0
+"""Time after its end within which a lost connection is in the log [s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """Let the served wind turbine operate for hours while twin and policies learn, and lose its connection at random.
 
-    The results hold, for each round of the learner, the cost and the memory and file handles of the three processes:
-    learner, acting process and server. These are read from /proc, so that this needs Linux.
+    The results hold, for each round of the learner, the cost and the memory and file handles of the processes: learner,
+    acting process, server and relay. These are read from /proc, so that this needs Linux. They also hold every lost
+    connection, and whether the log of the safety layer has an event of its time.
 
     Args:
         hours: length of the soak [h].
@@ -93,10 +98,9 @@ class Faults:
             self._thread.join()
 
     def _run(self) -> None:
-        begun = time.monotonic()
         while not self._ended.wait(self._draws.exponential(self._mean)):
             kind, seconds = str(self._draws.choice(["cut", "stall"])), float(self._draws.uniform(0.1, 2.0))
-            self.done.append({"at": time.monotonic() - begun, "kind": kind, "seconds": seconds})
+            self.done.append({"at": time.time(), "kind": kind, "seconds": seconds})
             getattr(self._relay, kind)(seconds)
 
 
@@ -110,7 +114,7 @@ def summary(rounds: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     """Growth of memory and handles of each process after the first quarter of the rounds."""
     found = {}
     kept = rounds[len(rounds) // 4 :]
-    for process in ("learner", "acting", "server"):
+    for process in ("learner", "acting", "server", "relay"):
         memory = np.array([each[f"{process}_MiB"] for each in kept])
         handles = [each[f"{process}_handles"] for each in kept]
         third = max(1, len(memory) // 3)
@@ -123,17 +127,23 @@ def summary(rounds: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     return found
 
 
-def operate(config: Config, algorithm, server, until: float) -> tuple[list[dict[str, float]], list[str]]:
+def logged(faults: list[dict[str, float | str]], log: Path) -> int:
+    """Number of lost connections of whose time the log has an event; the last one may have come after the last step."""
+    text = log.read_text(encoding="utf-8") if log.is_file() else ""
+    times = np.array([json.loads(line)["at"] for line in text.splitlines()])
+    return sum(bool(((times >= each["at"]) & (times <= each["at"] + each["seconds"] + SEEN)).any()) for each in faults)
+
+
+def operate(config: Config, algorithm, pids: dict[str, int], until: float) -> tuple[list[dict[str, float]], list[str]]:
     """Rounds of the learner until a time, and the reasons of those in which nothing could be learned."""
     rounds, refused = [], []
-    pids = {"learner": os.getpid(), "server": server.pid}
     while time.monotonic() < until:
         try:
             report = algorithm.episode()
         except ValueError as error:  # several windows in a row were cut up by faults
             refused.append(str(error))
             continue
-        pids["acting"] = algorithm.operating.operation.pid
+        pids = pids | {"acting": algorithm.operating.operation.pid}
         found = {"real_cost": report["real_cost"].item(), "windows": report["windows"].item()}
         for process, pid in pids.items():
             found[f"{process}_MiB"], found[f"{process}_handles"] = usage(pid)
@@ -169,7 +179,8 @@ def main(config: Config) -> None:
         try:
             with Faults(relay, config.faults, config.seed) as faults:
                 until = time.monotonic() + 3600.0 * config.hours
-                rounds, refused = operate(config, run.algorithm, server, until)
+                pids = {"learner": os.getpid(), "server": server.pid, "relay": relay.pid}
+                rounds, refused = operate(config, run.algorithm, pids, until)
         finally:
             run.algorithm.operating.operation.close()
     write(config, rounds, refused, faults.done, log)
@@ -180,10 +191,12 @@ def write(config: Config, rounds, refused: list[str], faults: list[dict[str, flo
     events = sum(1 for _ in log.open(encoding="utf-8")) if log.is_file() else 0
     if not rounds:
         raise ValueError(f"hours={config.hours} h are too short for one round of the learner; give more.")
+    seen = logged(faults, log)
     costs = np.array([each["real_cost"] for each in rounds])
     found = {
         "processes": summary(rounds),
         "faults": faults,
+        "faults_logged": seen,
         "refused": refused,
         "safety_events": events,
         "windows": sum(each["windows"] for each in rounds),
@@ -194,7 +207,7 @@ def write(config: Config, rounds, refused: list[str], faults: list[dict[str, flo
     for process, values in found["processes"].items():
         told = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
         print(f"{process}: {told}")
-    print(f"{len(faults)} lost connections, {events} events of the safety layer, {len(refused)} rounds refused")
+    print(f"{len(faults)} lost connections, {seen} of them in the log; {len(refused)} rounds refused")
     print(f"mean cost {found['cost']['mean']:.4g} ± {found['cost']['standard_error']:.2g} over {len(rounds)} rounds")
     print(f"results in {path}")
 

@@ -1,6 +1,7 @@
 """A safety layer between a policy and a real system: limits on what is sent, a watchdog on what comes back."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,6 +20,9 @@ __all__ = ["WRONG", "Fallback", "SafetyConfig", "SafetyLayer"]
 
 WRONG = frozenset({"missing", "not finite", "out of range", "frozen", "clock"})
 """Faults that make an observation wrong; a late one is right, and so is one of a system beyond its limits."""
+
+KEPT = 16
+"""Number of episodes whose reports are kept: a system may operate for years."""
 
 Fallback = Sequence[float] | Callable[[TensorDictBase], Tensor]
 
@@ -79,7 +83,8 @@ class SafetyLayer(AroundSystem):
         super().__init__(device=env.device, batch_size=env.batch_size)
         self.env, self.config = env, config
         self._clock = clock
-        self.reports: list[SafetyReport] = []
+        self.reports: deque[SafetyReport] = deque(maxlen=KEPT)
+        self._episodes = 0
         self._good: dict[str, Tensor] = {}
         self.watchdog = config.watchdog()
         self._unwritten: OSError | None = None
@@ -165,6 +170,7 @@ class SafetyLayer(AroundSystem):
         if self._step_count == 0:
             # The report begins with the first step, because a reset need not be followed by a step.
             self.reports.append(SafetyReport())
+            self._episodes += 1
         past = self._passed + self._step_count
         t, end = (self.config.interval * k for k in (past, past + 1))
         asked = tensordict["action"]
@@ -233,9 +239,9 @@ class SafetyLayer(AroundSystem):
     def _note(self, reasons: dict[str, str], asked: Tensor, applied: Tensor) -> None:
         if not reasons:
             return
-        flat = (value.flatten().tolist() for value in (asked, applied))
+        wanted, sent = asked.flatten().tolist(), applied.flatten().tolist()
         t = self._step_count * self.config.interval
-        event = SafetyEvent(len(self.reports) - 1, self._step_count, t, reasons, *flat)
+        event = SafetyEvent(self._episodes - 1, self._step_count, t, reasons, wanted, sent, time.time())
         self.report.events.append(event)
         self.report.counts.update(reasons.keys())
         if self.config.log is not None and self._unwritten is None:

@@ -23,6 +23,7 @@ class SafetyEvent(NamedTuple):
     reasons: dict[str, str]
     asked: list[float]
     applied: list[float]
+    at: float  # end of the interval on this machine's clock, counted from 1970 [s]
 
     def line(self) -> str:
         """The event as one line of JSON, with null for every number that is not finite."""
