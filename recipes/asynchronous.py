@@ -11,7 +11,7 @@ if __name__ == "__main__":
 import numpy as np
 from wind_turbine import Config as Turbine
 
-from rt_torchrl import OperationConfig, check_options, main_of
+from rt_torchrl import OperationConfig, check_options, main_of, require_finished
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.results_file import make_folder, write_results
 
@@ -81,7 +81,9 @@ def trained(config: Config, seed: int, kind: str, **options) -> list[dict]:
         overwrite=True,
         **options,
     )
-    return Run(run, run.plant(), first=JonkmanController).train()["episodes"]
+    found = Run(run, run.plant(), first=JonkmanController).train()["episodes"]
+    require_finished(len(found), config.windows)
+    return found
 
 
 def learning_time(record: dict) -> float:

@@ -13,7 +13,7 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from rt_torchrl import check_options, main_of
+from rt_torchrl import check_options, main_of, require_finished
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
@@ -84,6 +84,7 @@ def trained(config: Config, memory: str, seed: int) -> list[dict[str, float]]:
 
     run = Run(options, plant, first=JonkmanController, callbacks=[judge])
     run.train()
+    require_finished(len(found), config.episodes)
     return found
 
 

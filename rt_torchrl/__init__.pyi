@@ -85,6 +85,7 @@ from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, T
 from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
+from .interruption import require_finished
 from .options import check_options
 from .runs.callbacks import EarlyStopping
 from .runs.command_line import main_of
@@ -227,6 +228,7 @@ __all__ = [
     "main_of",
     "read_log",
     "require_device",
+    "require_finished",
     "require_request",
     "require_stable_step",
     "rk4_step",

@@ -76,3 +76,17 @@ def safe_point() -> None:
     """
     if Interruption._asked:
         raise KeyboardInterrupt
+
+
+def require_finished(done: int, asked: int) -> None:
+    """End the program after a training that Ctrl-C or SIGTERM has stopped, where other trainings would follow.
+
+    Args:
+        done: number of episodes done.
+        asked: number of episodes asked for.
+
+    Raises:
+        SystemExit: if fewer episodes are done.
+    """
+    if done < asked:
+        raise SystemExit(f"interrupted after {done} of {asked} episodes of a training; the trainings after it are left")
