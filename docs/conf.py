@@ -4,6 +4,9 @@ import logging
 import re
 import typing
 
+from sphinx.ext.autodoc.preserve_defaults import DefaultValue
+from sphinx.util import inspect
+
 # Before the library is imported: jaxtyping then writes annotations as people read them.
 typing.GENERATING_DOCUMENTATION = "rt_torchrl"  # type: ignore[attr-defined]
 
@@ -52,9 +55,30 @@ def absolute_values(app, what, name, obj, options, lines):
             lines[number] = re.sub(r"(?<!`)\|([^|`\s][^|`]*)\|(?!`)", r"\\|\1\\|", line)
 
 
+def _readable(default):
+    """A default of an argument as Python writes it, where it is a function, a class or what a factory makes."""
+    if default is inspect.Parameter.empty or not (callable(default) or repr(default).startswith("<")):
+        return default
+    name = getattr(default, "__name__", "<factory>")
+    return DefaultValue("..." if name.startswith("<") else name)
+
+
+def readable_signatures(app, what, name, obj, options, signature, returns):
+    """The arguments of a class itself, where its metaclass takes any, and defaults that are no objects in brackets."""
+    hidden = what == "class" and signature == "(*args, **kwargs)"
+    if hidden and getattr(obj, "_is_protocol", False):
+        return "", returns  # nobody makes a protocol
+    if what not in ("class", "method", "function") or not (hidden or "<" in (signature or "")):
+        return None
+    own = inspect.signature(obj.__init__ if what == "class" else obj, bound_method=what != "function")
+    own = own.replace(parameters=[p.replace(default=_readable(p.default)) for p in own.parameters.values()])
+    return inspect.stringify_signature(own, unqualified_typehints=True, show_return_annotation=False), returns
+
+
 def setup(app):
     """Sphinx calls this when it has read the settings above."""
     app.connect("autodoc-process-docstring", absolute_values)
+    app.connect("autodoc-process-signature", readable_signatures)
     # Patterns in the table of contents name pages that need not be there.
     place = logging.getLogger("sphinx.sphinx.directives.other")
     place.addFilter(lambda record: "glob pattern" not in str(record.msg))

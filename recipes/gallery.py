@@ -16,7 +16,7 @@ PICTURES = {
         *("exogenous.png", "policy_contours.png", "closure_weights.png", "learning_curves.png", "seconds.png"),
         *("unseen.png", "animation.gif"),
     ),
-    "flapping_wing": ("flight_path.png", "flight.png", "polars.png", "control_surfaces.png"),
+    "flapping_wing": ("flight_path.png", "flight.png", "polars.png", "control_surfaces.png", "animation.gif"),
     "cryogenic_tank": ("tank.png", "vent_path.png", "animation.gif"),
 }
 """Files of each plant that the gallery shows, by the name of its recipe."""
