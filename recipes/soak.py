@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,7 +35,8 @@ class Config:
 
     The results hold, for each round of the learner, the cost and the memory and file handles of the processes: learner,
     acting process, server and relay. These are read from /proc, so that this needs Linux. They also hold every lost
-    connection, and whether the log of the safety layer has an event of its time.
+    connection, how many of them the log of the safety layer has an event of, and the cost of the last policy on unseen
+    episodes in simulation.
 
     Args:
         hours: length of the soak [h].
@@ -134,9 +136,11 @@ def logged(faults: list[dict[str, float | str]], log: Path) -> int:
     return sum(bool(((times >= each["at"]) & (times <= each["at"] + each["seconds"] + SEEN)).any()) for each in faults)
 
 
-def operate(config: Config, algorithm, pids: dict[str, int], until: float) -> tuple[list[dict[str, float]], list[str]]:
+def operate(
+    config: Config, algorithm, pids: dict[str, int], until: float, lost: Sequence[object]
+) -> tuple[list[dict[str, float]], list[str]]:
     """Rounds of the learner until a time, and the reasons of those in which nothing could be learned."""
-    rounds, refused = [], []
+    rounds, refused, before = [], [], 0
     while time.monotonic() < until:
         try:
             report = algorithm.episode()
@@ -145,6 +149,7 @@ def operate(config: Config, algorithm, pids: dict[str, int], until: float) -> tu
             continue
         pids = pids | {"acting": algorithm.operating.operation.pid}
         found = {"real_cost": report["real_cost"].item(), "windows": report["windows"].item()}
+        found["lost_connections"], before = len(lost) - before, len(lost)
         for process, pid in pids.items():
             found[f"{process}_MiB"], found[f"{process}_handles"] = usage(pid)
         rounds.append(found | {"left": until - time.monotonic()})
@@ -180,19 +185,40 @@ def main(config: Config) -> None:
             with Faults(relay, config.faults, config.seed) as faults:
                 until = time.monotonic() + 3600.0 * config.hours
                 pids = {"learner": os.getpid(), "server": server.pid, "relay": relay.pid}
-                rounds, refused = operate(config, run.algorithm, pids, until)
+                rounds, refused = operate(config, run.algorithm, pids, until, faults.done)
         finally:
             run.algorithm.operating.operation.close()
-    write(config, rounds, refused, faults.done, log)
+    write(config, rounds, refused, faults.done, log, unseen_costs(run))
 
 
-def write(config: Config, rounds, refused: list[str], faults: list[dict[str, float | str]], log: Path) -> None:
+def unseen_costs(run) -> list[float]:
+    """J_a of the policy that acts at the end, on unseen episodes in simulation."""
+    live = run.algorithm.policies[run.algorithm.referee.live]
+    costs: list[float] = run.unseen.control_costs(live).tolist()
+    return costs
+
+
+def mean_cost(costs: Sequence[float]) -> dict[str, float]:
+    """Mean and standard error of costs."""
+    return {
+        "number": len(costs),
+        "mean": float(np.mean(costs)),
+        "standard_error": float(np.std(costs) / len(costs) ** 0.5),
+    }
+
+
+def write(config: Config, rounds, refused: list[str], faults, log: Path, unseen: list[float]) -> None:
     """Write the results, and say the most important ones."""
     events = sum(1 for _ in log.open(encoding="utf-8")) if log.is_file() else 0
     if not rounds:
         raise ValueError(f"hours={config.hours} h are too short for one round of the learner; give more.")
     seen = logged(faults, log)
-    costs = np.array([each["real_cost"] for each in rounds])
+    # A window of operation may have begun one round before; a whole one is told by its neighbour, too.
+    pairs = zip([rounds[0], *rounds[:-1]], rounds, strict=True)
+    whole = [each for before, each in pairs if not each["lost_connections"] + before["lost_connections"]]
+    kinds = {"all rounds": rounds, "rounds without a lost connection": whole}
+    costs = {kind: [each["real_cost"] for each in some] for kind, some in kinds.items()} | {"unseen episodes": unseen}
+    costs = {kind: mean_cost(some) for kind, some in costs.items() if some}
     found = {
         "processes": summary(rounds),
         "faults": faults,
@@ -200,7 +226,7 @@ def write(config: Config, rounds, refused: list[str], faults: list[dict[str, flo
         "refused": refused,
         "safety_events": events,
         "windows": sum(each["windows"] for each in rounds),
-        "cost": {"mean": float(costs.mean()), "standard_error": float(costs.std() / len(costs) ** 0.5)},
+        "cost": costs,
         "rounds": rounds,
     }
     path = write_results(config.log_dir / "soak.json", {"config": config, **found})
@@ -208,7 +234,8 @@ def write(config: Config, rounds, refused: list[str], faults: list[dict[str, flo
         told = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
         print(f"{process}: {told}")
     print(f"{len(faults)} lost connections, {seen} of them in the log; {len(refused)} rounds refused")
-    print(f"mean cost {found['cost']['mean']:.4g} ± {found['cost']['standard_error']:.2g} over {len(rounds)} rounds")
+    for kind, some in costs.items():
+        print(f"mean cost of {some['number']} {kind}: {some['mean']:.4g} ± {some['standard_error']:.2g}")
     print(f"results in {path}")
 
 
