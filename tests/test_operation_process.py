@@ -1,11 +1,16 @@
 """An operation in a process of its own, with true clocks, and whole runs of it."""
 
+import os
+from pathlib import Path
+
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from test_operation import QUIET, Constant
 
+from rt_torchrl.runs.operated import learner_threads
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.config import OperationConfig
@@ -37,6 +42,24 @@ def operation(make_env=simulation, **options):
     policies = {"one": Constant(0.5), "two": Constant(-0.5)}
     config = OperationConfig(clock="wall", speed=10.0, core=-2, **options)
     return ProcessOperation(Crew(make_env, PLANT, policies, QUIET, config, seed=1), make_env()), policies
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not let a process choose cores")
+@pytest.mark.parametrize(
+    "options, expected",
+    [
+        ({}, 0),
+        ({"asynchronous": True}, 0),
+        ({"asynchronous": True, "operation": OperationConfig(clock="wall")}, 2),
+        ({"asynchronous": True, "operation": OperationConfig(clock="wall", core=-2)}, 0),
+        ({"asynchronous": True, "operation": OperationConfig(clock="wall"), "threads": 7}, 7),
+        ({"asynchronous": True, "operation": OperationConfig(replay=Path("events.jsonl"))}, 2),
+    ],
+)
+def test_the_learner_has_a_thread_for_each_core_that_is_left(options, expected, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 5, 6})
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    assert learner_threads(RunConfig(**options)) == expected
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """A plant behind OPC UA and Modbus: the served plant, the client's environment, and both protocols between them."""
 
 import math
+import socket
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from rt_torchrl.systems.protocols.link import LinkLostError
 from rt_torchrl.systems.protocols.modbus import ModbusLink
 from rt_torchrl.systems.protocols.served_plant import ServedPlant
 from rt_torchrl.systems.protocols.served_system import link_to, served_system
+from rt_torchrl.systems.protocols.server_process import ServerProcess
 from rt_torchrl.systems.protocols.tags import ANSWERED, SAMPLE, Tags
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -224,3 +226,13 @@ def test_a_link_to_nobody_says_that_the_plant_does_not_answer(protocol):
         with pytest.raises(LinkLostError):
             work()
     link.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["opcua", "modbus"])
+def test_a_port_in_use_is_said_without_a_traceback(protocol, capfd):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=f"port={port}"):
+            ServerProcess(LinearQuadratic(), (0.0,), protocol=protocol, port=port, period=0.1).__enter__()
+    assert "Traceback" not in capfd.readouterr().err

@@ -1,14 +1,17 @@
 """The operation of an asynchronous run, as its configuration asks for it."""
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import torch
 from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.operation.acting import Crew
+from rt_torchrl.systems.operation.cores import chosen_core
 from rt_torchrl.systems.operation.event_log import EventLog, read_events
 from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.operation.order import FIRST
@@ -23,6 +26,18 @@ EVENTS = "events.jsonl"
 """File of the operation's events in a run folder."""
 NOISE = 2**20
 """Number of the seed of the exploration's noise among the seeds of a run; episodes have smaller ones."""
+
+
+def learner_threads(config: RunConfig) -> int:
+    """Number of CPU threads of the learner; 0 leaves torch's default.
+
+    Threads of torch wait actively: where there are more of them than cores, they take the time from each other.
+    """
+    options = config.operation
+    beside = config.asynchronous and (options.clock == "wall" or options.replay is not None)
+    if config.threads or not beside or chosen_core(options.core) is None:
+        return config.threads
+    return min(torch.get_num_threads(), max(1, len(os.sched_getaffinity(0)) - 1))
 
 
 def acting_by_name(policies: Mapping[Role, nn.Module], first: Start | None) -> dict[str, nn.Module]:

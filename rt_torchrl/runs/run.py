@@ -29,7 +29,7 @@ from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.drawing import Drawing, PlantFigures, first_flights
 from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
-from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, operation_of
+from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, learner_threads, operation_of
 from rt_torchrl.runs.progress import Progress
 from rt_torchrl.runs.real_side import judged_on, physics_known, require_simulation, simulated
 from rt_torchrl.runs.results_table import next_steps, results_table
@@ -108,8 +108,8 @@ class Run:
         for one in filter(None, (plant, believed)):
             check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
         self._start = start_of(config, physics, first)
-        if config.threads:
-            torch.set_num_threads(config.threads)
+        if threads := learner_threads(config):
+            torch.set_num_threads(threads)
         self._held = RunFolder(config, plant.name)
         self.folder = self._held.path
         try:

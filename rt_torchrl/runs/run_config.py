@@ -58,7 +58,8 @@ class RunConfig:
             nothing, because it computes itself; other engines and devices compile if this machine can, and a notice
             says if it cannot. Without compilation these start at once, but every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
-        threads: number of CPU threads; 0 leaves torch's default.
+        threads: number of CPU threads; 0 leaves torch's default or, beside an acting process, takes the cores that it
+            leaves.
         start: what the training begins with, so that the real system never flies a random policy. controller: the
             controller that the real system has had so far flies one episode before all others, and twin and policies
             learn from it. mpc: model predictive control on the first twin flies that episode. The folder of a finished

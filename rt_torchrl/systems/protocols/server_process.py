@@ -87,5 +87,5 @@ def run_server(arguments: bytes, started: Any, ended: Any) -> None:
     try:
         board = BOARDS[protocol](served.tags, port)
         asyncio.run(serve(served, board, period, ended=over, begun=started.set))
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # pymodbus raises a RuntimeError if it cannot listen
         sys.exit(f"the plant server has ended: {error}")
