@@ -1,13 +1,14 @@
 """How near a twin comes to the true system in a few real episodes without noise."""
 
 import copy
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import torch
 

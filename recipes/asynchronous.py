@@ -1,12 +1,13 @@
 """What it is worth to act while learning: synchronous against asynchronous trainings of the same real time."""
 
 import dataclasses
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import numpy as np
 from wind_turbine import Config as Turbine

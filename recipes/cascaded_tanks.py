@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import numpy as np
 import torch

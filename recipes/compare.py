@@ -1,14 +1,15 @@
 """Finished runs side by side: a table with intervals, and one figure over the real episodes."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import check_options, main_of
 

@@ -1,13 +1,14 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
 import dataclasses
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import (
     AssimilationConfig,

@@ -1,12 +1,13 @@
 """Draw the pictures of the documentation's gallery: train each plant, and copy its figures under their names."""
 
 import shutil
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import check_options, main_of
 

@@ -1,13 +1,14 @@
 """An exported policy in service: it acts on a served wind turbine, without a learner."""
 
 import contextlib
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import torch
 from served_turbine import SAFE, server_of

@@ -1,12 +1,13 @@
 """What one quantity costs another: the Pareto front of a plant over one weight of its cost, as table and figure."""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import ClassicalController, check_options, main_of
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve

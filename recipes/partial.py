@@ -1,13 +1,14 @@
 """What some sensors are enough for: plans on twins that were fitted to them, beside plans from the whole state."""
 
 import statistics
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import check_options, main_of
 from rt_torchrl.runs.results_file import make_folder, write_results

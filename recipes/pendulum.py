@@ -1,12 +1,13 @@
 """Reinforcement twinning of Gymnasium's pendulum, a real system that is not this library's own."""
 
-import sys
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import (
     AssimilationConfig,

@@ -1,12 +1,13 @@
 """Write the log of a simulated real system for ``identify.py``, with jittered intervals, noisy sensors and a gap."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import torch
 import tyro

@@ -1,14 +1,15 @@
 """The page of a finished run: one HTML file with the story of the training, to look at and to send to a colleague."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from rt_torchrl import check_options, load_run, main_of
 

@@ -2,13 +2,14 @@
 
 import contextlib
 import dataclasses
-import sys
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 from wind_turbine import Config as Turbine
 from wind_turbine import plant_figures

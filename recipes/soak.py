@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import json
 import os
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -13,8 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import numpy as np
 import torch

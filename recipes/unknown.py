@@ -1,14 +1,15 @@
 """How much room there is on real systems that their twin does not know: planned policies against the optimum."""
 
 import json
-import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from rt_torchrl import begin_loading
+
 if __name__ == "__main__":
-    print("loading PyTorch and TorchRL", file=sys.stderr)  # at once, because this takes seconds
+    begin_loading()
 
 import tyro
 

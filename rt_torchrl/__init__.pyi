@@ -86,6 +86,7 @@ from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, 
 
 # Trainings from the command line, and their results
 from .interruption import require_finished
+from .loading import begin_loading
 from .options import check_options
 from .runs.callbacks import EarlyStopping
 from .runs.command_line import main_of
@@ -211,6 +212,7 @@ __all__ = [
     "TwinningConfig",
     "Uncertainty",
     "WholeEpisodes",
+    "begin_loading",
     "check_options",
     "check_plant",
     "clairvoyant",

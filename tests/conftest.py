@@ -1,6 +1,7 @@
 """Fixtures that more than one file uses, and the table of the campaign of faults."""
 
 import os
+import signal
 from pathlib import Path
 
 import fault_counts
@@ -12,6 +13,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores, and so do the processes that they start.
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell ignores Ctrl-C for what it starts in the background; the tests that press it would wait for ever.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Between a command and its first episode, a recipe loads nothing that this episode does not use."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -58,3 +59,11 @@ def test_every_recipe_says_that_it_starts_before_it_loads_pytorch():
     recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py"))]
     done = subprocess.run([sys.executable, "-c", code, *recipes], cwd=ROOT, capture_output=True, text=True)
     assert done.stderr.splitlines() == ["loading PyTorch and TorchRL", "ended"] * len(recipes), done.stderr
+
+
+@pytest.mark.parametrize("given, expected", [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+def test_threads_of_a_program_wait_without_a_core_unless_its_user_says_otherwise(given, expected):
+    code = "import os; from rt_torchrl import begin_loading; begin_loading(); print(os.environ['OMP_WAIT_POLICY'])"
+    without = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=without | given, capture_output=True, text=True)
+    assert done.stdout.strip() == expected, done.stderr
