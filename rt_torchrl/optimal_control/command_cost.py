@@ -113,6 +113,11 @@ class CommandCost:
         self._low, self._span = low.numpy(), (high - low).numpy()
         self._programs: Programs | None = None
 
+    @property
+    def count(self) -> int:
+        """Number of realisations of the window."""
+        return len(self._state)
+
     def blocks(self, n: int) -> int:
         """Number of commands of a window of n control intervals; the last may be held for less time."""
         return -(-n // self.hold)
