@@ -53,6 +53,8 @@ CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
 """Classical controllers that are judged beside the limit."""
 TO_THE_END = BoundedDescentConfig(iterations=8000, tolerance=1e-15, gradient=1e-12)
 """Descents until nothing more is gained; each of the turbine's takes five to eight thousand gradients."""
+SOLVE = ("horizon", "iterations", "tolerance")
+"""Parameters of model predictive control that may differ from the recipe's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +69,9 @@ class Config:
         hold: number of control intervals for which a command of the optimum is held; 0 for the plant's own.
         starts: all, or classical to leave out constant and random commands; the policies of a run are always
             among them.
-        mpc: forecasts of model predictive control: some of held, decaying and preview; the tank has none while it
-            commands the drop.
+        mpc: forecasts of model predictive control: some of held, decaying, scattered and preview; the tank has none
+            while it commands the drop.
+        mpc_horizon: length of the window of model predictive control [s]; 0 for the recipe's.
         mpc_iterations: greatest number of iterations in a solve of model predictive control; 0 for the recipe's.
         mpc_tolerance: relative decrease of the cost below which a solve ends; 0 for the recipe's.
         run: folder of a training. Its plant takes the place of plant, with its cost, command and limits; its policies
@@ -83,7 +86,8 @@ class Config:
     horizon: float | None = None
     hold: int = 0
     starts: Literal["all", "classical"] = "all"
-    mpc: tuple[Literal["held", "decaying", "preview"], ...] = ("held", "decaying", "preview")
+    mpc: tuple[Literal["held", "decaying", "scattered", "preview"], ...] = ("held", "decaying", "scattered", "preview")
+    mpc_horizon: float = 0.0
     mpc_iterations: int = 0
     mpc_tolerance: float = 0.0
     run: Path | None = None
@@ -92,7 +96,7 @@ class Config:
 
     def __post_init__(self):
         check_options(self)
-        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0), ("mpc_iterations", 0), ("mpc_tolerance", 0)):
+        for argument, least in (("episodes", 2), ("seed", 0), ("hold", 0), *((f"mpc_{name}", 0) for name in SOLVE)):
             if getattr(self, argument) < least:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
         if self.run is not None and (self.plant is not None or self.horizon is not None):
@@ -153,7 +157,7 @@ def contenders(
     if known.window is None:
         return
     window = fitting(chosen_window(config, known.window), plant)
-    foreseen = forecasts(plant, episodes.exogenous, window.horizon)
+    foreseen = forecasts(plant, episodes.exogenous, window)
     models = {"exact": (plant, episodes.known_closure())}
     models |= {} if run is None else {"fitted": (run.physics, run.closure)}
     for title, model in models.items():
@@ -163,7 +167,7 @@ def contenders(
 
 def chosen_window(config: Config, window: PredictiveConfig) -> PredictiveConfig:
     """The recipe's window with the solves that are asked for."""
-    asked = {"iterations": config.mpc_iterations, "tolerance": config.mpc_tolerance}
+    asked = {name: getattr(config, f"mpc_{name}") for name in SOLVE}
     return dataclasses.replace(window, **{name: value for name, value in asked.items() if value})
 
 

@@ -41,7 +41,7 @@ from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
 from .optimal_control.clairvoyant import Clairvoyant, clairvoyant
-from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen
+from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
 from .optimal_control.predictive_control import PredictiveConfig, PredictiveControl
 from .optimal_control.receding_horizon import RecedingHorizon
 from .optimal_control.receding_horizon_config import RecedingHorizonConfig
@@ -143,6 +143,7 @@ __all__ = [
     "FirstController",
     "Forecast",
     "Foreseen",
+    "Futures",
     "Held",
     "HypothesesConfig",
     "Identification",
@@ -193,6 +194,7 @@ __all__ = [
     "SafetyReport",
     "SaturatedAffine",
     "SaturatedMLP",
+    "Scattered",
     "Scenario",
     "Sensor",
     "SensorRecord",

@@ -36,11 +36,13 @@ def mean(contender):
 
 def test_the_turbines_limit_is_below_all_controllers(tmp_path, capsys):
     config, _ = leave_run(tmp_path / "run", "wind_turbine", policy="paper", horizon=15.0)
-    found = run(tmp_path, mpc=("held", "preview"), run=tmp_path / "run")
+    found = run(tmp_path, mpc=("held", "scattered", "preview"), run=tmp_path / "run")
     episodes = UnseenEpisodes(config.plant(), 2)
     for role, policy in load_run(tmp_path / "run").policies.items():
         assert found[role.replace("_", "-")]["costs"] == pytest.approx(episodes.control_costs(policy).tolist())
-    planned = [f"MPC, {model}, {forecast}" for model in ("exact", "fitted") for forecast in ("held", "preview")]
+    planned = [
+        f"MPC, {model}, {forecast}" for model in ("exact", "fitted") for forecast in ("held", "scattered", "preview")
+    ]
     assert list(found) == ["clairvoyant", "Jonkman", "model-based", "model-free", *planned]
     best, details = mean(found["clairvoyant"]), found["clairvoyant"]["details"]
     assert all(best < mean(contender) for name, contender in found.items() if name != "clairvoyant")
@@ -70,8 +72,8 @@ def test_a_run_has_its_own_cost_and_command(tmp_path):
 def test_solves_have_the_recipes_window_with_what_is_asked_for():
     module, window = recipe("limit"), PredictiveConfig(horizon=2.0, iterations=7)
     assert module.chosen_window(module.Config(), window) == window
-    found = module.chosen_window(module.Config(mpc_iterations=60, mpc_tolerance=1e-6), window)
-    assert found == dataclasses.replace(window, iterations=60, tolerance=1e-6)
+    found = module.chosen_window(module.Config(mpc_horizon=8.0, mpc_iterations=60, mpc_tolerance=1e-6), window)
+    assert found == dataclasses.replace(window, horizon=8.0, iterations=60, tolerance=1e-6)
 
 
 @pytest.mark.parametrize("option", [{"plant": "wind_turbine"}, {"horizon": 15.0}])
@@ -111,7 +113,7 @@ def test_the_printed_example_runs(capsys):
     assert 0.0 < first < 0.1 and 0.0 < second < 0.1
 
 
-@pytest.mark.parametrize("option", [{"episodes": 1}, {"seed": -1}, {"hold": -1}])
+@pytest.mark.parametrize("option", [{"episodes": 1}, {"seed": -1}, {"hold": -1}, {"mpc_horizon": -1.0}])
 def test_impossible_options_are_refused(option):
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"{name}={value}"):

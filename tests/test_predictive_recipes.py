@@ -11,7 +11,10 @@ from rt_torchrl.runs.user_code import module_of
 
 SHORT = {
     "wind_turbine": ["--horizon", "20", "--twinning.learner.return-steps", "1"],
-    "flapping_wing": ["--horizon", "0.2", "--twinning.learner.return-steps", "1"],
+    "flapping_wing": [
+        *("--horizon", "0.2", "--twinning.learner.return-steps", "1"),
+        *("--twinning.planner.receding-horizon.horizon", "1"),
+    ],
     "cryogenic_tank": ["--horizon", "7200", "--twinning.learner.return-steps", "1", "--command", "duty"],
 }
 ALWAYS = (

@@ -16,7 +16,7 @@ from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
-from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
 from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
@@ -212,16 +212,17 @@ def receding(
 def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
     """Model predictive control on the exact model, with its own forecast; see :func:`receding`."""
     window = fitting(window, episodes.plant)
-    known = forecasts(episodes.plant, episodes.exogenous, window.horizon)
+    known = forecasts(episodes.plant, episodes.exogenous, window)
     return receding(episodes, episodes.plant, episodes.known_closure(), window, known[window.forecast])
 
 
-def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], horizon: float) -> dict[str, Forecast]:
-    """The forecasts that are compared: held, decaying to the mean as other episodes do, and known."""
+def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], window: PredictiveConfig) -> dict[str, Forecast]:
+    """The forecasts that are compared: held, decaying to the mean as other episodes do, with its scatter, and known."""
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
-    longest = min(horizon, 0.5 * plant.horizon)
-    decaying = Decaying.fitted(records, dt=plant.dt, horizon=longest)
-    return {"held": Held(), "decaying": decaying, "preview": Foreseen(exogenous, dt=plant.dt)}
+    over = {"dt": plant.dt, "horizon": min(window.horizon, 0.5 * plant.horizon)}
+    decaying = Decaying.fitted(records, **over)
+    scattered = Scattered.fitted(decaying, records, **over, pairs=window.pairs)
+    return {"held": Held(), "decaying": decaying, "scattered": scattered, "preview": Foreseen(exogenous, dt=plant.dt)}
 
 
 @torch.no_grad()

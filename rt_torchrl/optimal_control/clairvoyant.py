@@ -4,6 +4,8 @@ No controller costs less: it is the limit that all others are compared with.
 """
 
 import contextlib
+import dataclasses
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
@@ -15,11 +17,17 @@ from torch import Tensor, nn
 
 from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig, descend, projected_gradient
 from rt_torchrl.optimal_control.command_cost import PENALTY, CommandCost
+from rt_torchrl.optimal_control.relaxed_cost import FIRST_WEIGHT, RelaxedCost, held_back
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import constant
+
+DESCENTS = 20
+"""Greatest number of descents that follow each other where actuators hold commands back."""
+FOLLOWED = 1e-6
+"""Distance of a command from the action that is applied, in units of its range, below which it is followed."""
 
 
 class Clairvoyant(NamedTuple):
@@ -28,7 +36,8 @@ class Clairvoyant(NamedTuple):
     Args:
         costs: J_a of each episode under its best commands, without the penalty.
         flown: the episodes.
-        gradient: norm of the projected gradient of J_a of each episode, by commands in units of their ranges.
+        gradient: norm of the projected gradient of J_a of each episode, by commands in units of their ranges; where
+            actuators hold commands back, of the Lagrangian of that limit.
         excess: greatest distance of a command from the action that was applied, in units of its range.
         start_costs: J_a of each episode at the end of the descent from each start, by name.
         gradients: number of gradients of all episodes together.
@@ -47,6 +56,14 @@ class Clairvoyant(NamedTuple):
         return {name: (costs.mean() / best - 1.0).item() for name, costs in self.start_costs.items()}
 
 
+class _End(NamedTuple):
+    """Where a descent ended: commands in [0, 1], norms of the projected gradients, and the number of gradients."""
+
+    point: np.ndarray
+    slope: np.ndarray
+    evaluations: int
+
+
 def clairvoyant(
     plant: Plant,
     initial_state: Float[Tensor, "batch n_s"],
@@ -60,7 +77,10 @@ def clairvoyant(
 ) -> Clairvoyant:
     """Descend the costs of episodes by all their commands, from several starts.
 
-    The episodes are one problem of L-BFGS-B, because the lanes of the machine code then carry one episode each.
+    The episodes are one problem of L-BFGS-B, because the lanes of the machine code then carry one episode each. Where
+    actuators hold commands back and each interval has a command, up to twenty descents follow each other: their model
+    follows every command, for a charge that becomes greater until the real actuators follow, too; see
+    :class:`RelaxedCost`. No episode ends above the start.
 
     Args:
         plant: the plant.
@@ -69,8 +89,8 @@ def clairvoyant(
         starts: commands from which a descent starts, by name; see :func:`constant_starts` and :func:`random_starts`.
         closure: closure of the system; None for the plant's own.
         hold: number of control intervals for which a command is held.
-        penalty: weight of (command − applied)² over the squared range, in units of L_a.
-        config: parameters of the descents.
+        penalty: weight of (command − applied)² over the squared range, in units of L_a, for commands that are held.
+        config: parameters of the descents; the twenty that follow each other share the iterations.
 
     Raises:
         ValueError: if there is no start.
@@ -78,26 +98,28 @@ def clairvoyant(
     """
     if not starts:
         raise ValueError("starts is empty; name at least one, such as the commands of a classical controller.")
-    closure = constant(plant.closure if closure is None else closure)
+    closure, config = constant(plant.closure if closure is None else closure), config or BoundedDescentConfig()
     cost = CommandCost(plant, closure, hold=hold, penalty=penalty, terminal=plant.terminal_cost)
     cost.begin(initial_state, exogenous)
-    system, n, gradients = Rollout(plant, closure), exogenous.shape[1], 0
-    points: dict[str, np.ndarray] = {}
+    descent = partial(_ended, cost, config)
+    if hold == 1 and cost.traced and held_back(plant, initial_state):
+        relaxed = RelaxedCost(plant, closure, terminal=plant.terminal_cost)
+        descent = partial(_tightened, relaxed, config, initial_state, exogenous)
+    system, n, ends = Rollout(plant, closure), exogenous.shape[1], {}
     costs = {name: torch.full((len(initial_state),), torch.inf, dtype=torch.float64) for name in starts}
     for name, commands in starts.items():
         # A start from which the plant diverges keeps its infinite cost.
         with contextlib.suppress(FloatingPointError):
-            found = descend(partial(_together, cost), cost.units(commands), config or BoundedDescentConfig())
-            points[name], gradients = found.point, gradients + found.evaluations
-            costs[name] = system.costs(initial_state, exogenous, cost.commands(found.point, n))
-    if not points:
+            ends[name] = descent(cost.units(commands))
+            costs[name] = system.costs(initial_state, exogenous, cost.commands(ends[name].point, n))
+    if not ends:
         raise DivergenceError(f"plant {plant.name!r} diverges from every start: {', '.join(starts)}.")
-    best = _best_of_each(costs, points)
+    best, slope = _best_of_each(costs, ends)
     flown = system(initial_state, exogenous, cost.commands(best, n))
     low, high = bounds(plant.actions)
     excess = ((cost.commands(best, n) - flown.actions) / (high - low)).abs().max().item()
-    slope = torch.from_numpy(projected_gradient(best, cost(best)[1]))
-    return Clairvoyant(control_cost(plant, flown), flown, slope, excess, costs, gradients)
+    gradients = sum(end.evaluations for end in ends.values())
+    return Clairvoyant(control_cost(plant, flown), flown, torch.from_numpy(slope), excess, costs, gradients)
 
 
 def constant_starts(plant: Plant, batch: int, n: int) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:
@@ -120,8 +142,42 @@ def _together(cost: CommandCost, point: np.ndarray) -> tuple[float, np.ndarray]:
     return float(costs.mean()), gradient / len(costs)
 
 
-def _best_of_each(costs: Mapping[str, Tensor], points: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The best commands of each episode."""
-    names = list(points)
-    chosen = torch.stack([costs[name] for name in names]).argmin(0).tolist()
-    return np.stack([points[names[start]][episode] for episode, start in enumerate(chosen)])
+def _ended(cost: CommandCost, config: BoundedDescentConfig, start: np.ndarray) -> _End:
+    """The end of one descent."""
+    found = descend(partial(_together, cost), start, config)
+    return _End(found.point, projected_gradient(found.point, cost(found.point)[1]), found.evaluations)
+
+
+def _tightened(
+    cost: RelaxedCost,
+    config: BoundedDescentConfig,
+    initial_state: Tensor,
+    exogenous: Tensor,
+    start: np.ndarray,
+) -> _End:
+    """The end of descents under growing charges; an episode that costs more than at the start goes back to it."""
+    share = dataclasses.replace(config, iterations=max(1, config.iterations // DESCENTS))
+    cost.begin(initial_state, exogenous)
+    point, evaluations, weight, last = start, 0, FIRST_WEIGHT, math.inf
+    for _ in range(DESCENTS):
+        cost.charge(point, weight)
+        found = descend(partial(_together, cost), point, share)
+        point, evaluations = found.point, evaluations + found.evaluations
+        excess = cost.excess(point)
+        if excess <= FOLLOWED:
+            break
+        if excess > 0.5 * last:  # the multipliers alone are too slow
+            weight *= math.sqrt(10.0)
+        last = excess
+    system, n = Rollout(cost.plant, cost.closure), exogenous.shape[1]
+    before, after = (system.costs(initial_state, exogenous, cost.commands(each, n)) for each in (start, point))
+    point = np.where((before < after).numpy()[:, None, None], start, point)
+    return _End(point, projected_gradient(point, cost(point)[1]), evaluations)
+
+
+def _best_of_each(costs: Mapping[str, Tensor], ends: Mapping[str, _End]) -> tuple[np.ndarray, np.ndarray]:
+    """The best commands of each episode, and the norms of their gradients."""
+    names = list(ends)
+    chosen = [ends[names[k]] for k in torch.stack([costs[name] for name in names]).argmin(0).tolist()]
+    best = np.stack([end.point[episode] for episode, end in enumerate(chosen)])
+    return best, np.stack([end.slope[episode] for episode, end in enumerate(chosen)])

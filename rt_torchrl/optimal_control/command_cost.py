@@ -113,6 +113,16 @@ class CommandCost:
         self._low, self._span = low.numpy(), (high - low).numpy()
         self._programs: Programs | None = None
 
+    @property
+    def count(self) -> int:
+        """Number of realisations of the window."""
+        return len(self._state)
+
+    @property
+    def traced(self) -> bool:
+        """Whether the plant has become machine code, after :meth:`begin`."""
+        return self._programs is not None
+
     def blocks(self, n: int) -> int:
         """Number of commands of a window of n control intervals; the last may be held for less time."""
         return -(-n // self.hold)

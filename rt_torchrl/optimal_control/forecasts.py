@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+WINDOWS = 100
+"""Number of windows of a record in which the errors of a forecast are taken; neighbours say nearly the same."""
+
 
 @runtime_checkable
 class Forecast(Protocol):
@@ -14,6 +17,16 @@ class Forecast(Protocol):
 
     def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
         """The inputs of the n control intervals from t [s] on, of which the first is measured."""
+
+
+@runtime_checkable
+class Futures(Forecast, Protocol):
+    """A forecast that also says what else may come: several futures, equally likely."""
+
+    def futures(
+        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
+    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
+        """The inputs of the n control intervals from t [s] on in each future; the first are measured."""
 
 
 class Held:
@@ -57,12 +70,7 @@ class Decaying:
         Raises:
             ValueError: if the records are not longer than the horizon.
         """
-        lags = round(horizon / dt)
-        if not 1 <= lags < records.shape[1]:
-            raise ValueError(
-                f"horizon={horizon} s is {lags} control intervals; it must be at least one and below the "
-                f"{records.shape[1]} of the records."
-            )
+        lags = lags_within(records, dt=dt, horizon=horizon)
         mean = records.mean((0, 1))
         spectrum = np.abs(np.fft.rfft((records - mean).numpy(), 2 * records.shape[1], axis=1)) ** 2
         number = records.shape[1] - np.arange(lags + 1)
@@ -105,6 +113,97 @@ class Foreseen:
             return known
         last = t + self.dt * (known.shape[1] - 1)
         return torch.cat([known, self.beyond(last, known[:, -1], n - known.shape[1] + 1)[:, 1:]], 1)
+
+
+class Scattered:
+    r"""Equally likely futures in pairs about another forecast, as its errors on records scatter.
+
+    .. math::
+        z^{(\pm i)}_{k+j} = \hat z_{k+j} \pm d_{ij}, \qquad d_i = \sqrt{m\,\mu_i}\,v_i, \qquad i = 1 \dots m
+
+    with the m greatest eigenvalues μ_i and eigenvectors v_i of the second moments of the errors over a horizon, in
+    which every input counts in units of its standard deviation. The 2m futures have the forecast as their mean and, in
+    these m directions, the second moments of its errors. No future leaves the range of the records.
+
+    Args:
+        forecast: the forecast in the middle.
+        deviations: deviations d_i; the last ones hold beyond the horizon.
+        low: least recorded value of each input.
+        high: greatest recorded value of each input.
+    """
+
+    def __init__(
+        self,
+        forecast: Forecast,
+        deviations: Float[Tensor, "pairs n n_z"],
+        low: Float[Tensor, " n_z"],
+        high: Float[Tensor, " n_z"],
+    ):
+        self.forecast, self.deviations, self.low, self.high = forecast, deviations, low, high
+
+    @classmethod
+    def fitted(
+        cls, forecast: Forecast, records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float, pairs: int = 4
+    ) -> "Scattered":
+        """The scatter of a forecast's errors on records.
+
+        Args:
+            forecast: the forecast.
+            records: recorded inputs of episodes.
+            dt: control interval [s].
+            horizon: time over which errors are taken [s].
+            pairs: number m of pairs of futures.
+
+        Raises:
+            ValueError: if the records are not longer than the horizon, or do not have as many directions as pairs.
+        """
+        lags = lags_within(records, dt=dt, horizon=horizon)
+        episodes, length, n_z = records.shape
+        places = np.unique(np.linspace(0, length - 1 - lags, WINDOWS).round().astype(int)).tolist()
+        if not 1 <= pairs <= min(episodes * len(places), lags * n_z):
+            raise ValueError(
+                f"pairs={pairs} of futures must be at least 1, and at most the number of inputs that are forecast, "
+                f"{lags * n_z}, and of recorded windows, {episodes * len(places)}."
+            )
+        errors = torch.cat([records[:, k : k + lags + 1] - forecast(k * dt, records[:, k], lags + 1) for k in places])
+        scale = records.std((0, 1), correction=0)
+        scale = torch.where(scale > 0.0, scale, 1.0)
+        root = (errors / scale).flatten(1) / len(errors) ** 0.5
+        _, sizes, directions = torch.linalg.svd(root, full_matrices=False)
+        deviations = (pairs**0.5 * sizes[:pairs, None] * directions[:pairs]).reshape(pairs, lags + 1, n_z) * scale
+        return cls(forecast, deviations, records.amin((0, 1)), records.amax((0, 1)))
+
+    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+        return self.forecast(t, exogenous, n)
+
+    def futures(
+        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
+    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
+        """The futures, those with added deviations first."""
+        change = self.reaching(n)
+        found = self.forecast(t, exogenous, n).unsqueeze(1) + torch.cat([change, -change])
+        found = torch.maximum(torch.minimum(found, self.high), self.low)
+        found[:, :, 0] = exogenous.unsqueeze(1)  # what is measured is certain
+        return found
+
+    def reaching(self, n: int) -> Float[Tensor, "pairs {n} n_z"]:
+        """The deviations of n control intervals."""
+        return self.deviations[:, torch.arange(n).clamp(max=self.deviations.shape[1] - 1)]
+
+
+def lags_within(records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float) -> int:
+    """The number of control intervals of a horizon [s].
+
+    Raises:
+        ValueError: if the records are not longer than the horizon.
+    """
+    lags = round(horizon / dt)
+    if not 1 <= lags < records.shape[1]:
+        raise ValueError(
+            f"horizon={horizon} s is {lags} control intervals; it must be at least one and below the "
+            f"{records.shape[1]} of the records."
+        )
+    return lags
 
 
 def _decay_time(covariance: Float[np.ndarray, " lags"], dt: float, longest: float) -> float:

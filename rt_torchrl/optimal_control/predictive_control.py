@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held
+from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Held, Scattered
 from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon, Solve
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.options import check_options
@@ -29,8 +29,10 @@ class PredictiveConfig(RecedingHorizonConfig):
 
     Args:
         horizon: length of the window over which a plan is made [s]; every plant needs its own.
-        forecast: forecast of the exogenous inputs: held for the measured ones, or decaying to the mean of the inputs
-            met so far with the time that fits them best; until inputs have been met, they are held.
+        forecast: forecast of the exogenous inputs: held for the measured ones, decaying to the mean of the inputs met
+            so far with the time that fits them best, or scattered, several futures about the decaying one as its errors
+            on these inputs scatter; until inputs have been met, they are held.
+        pairs: number of pairs of futures of the scattered forecast.
         terminal: cost of the state at the end of a window: plant for the plant's own where the window ends with the
             episode, or critic for the value that the model-free half has learned of what comes after the window.
         virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
@@ -41,15 +43,17 @@ class PredictiveConfig(RecedingHorizonConfig):
     """
 
     horizon: float = 1.0
-    forecast: Literal["held", "decaying"] = "decaying"
+    forecast: Literal["held", "decaying", "scattered"] = "decaying"
+    pairs: int = 4
     terminal: Literal["plant", "critic"] = "plant"
     virtual_episodes: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_options(self, infinite=("deadline",))
-        if self.virtual_episodes < 1:
-            raise ValueError(f"virtual_episodes={self.virtual_episodes} of the receding horizon must be at least 1.")
+        for argument in ("pairs", "virtual_episodes"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the receding horizon must be at least 1.")
 
 
 class PredictiveControl(nn.Module):
@@ -73,6 +77,9 @@ class PredictiveControl(nn.Module):
 
     mean: Tensor
     time: Tensor
+    deviations: Tensor
+    low: Tensor
+    high: Tensor
 
     def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig):
         super().__init__()
@@ -84,6 +91,12 @@ class PredictiveControl(nn.Module):
         # With an infinite time, the inputs are held.
         self.register_buffer("mean", torch.zeros(n_z, dtype=torch.float64))
         self.register_buffer("time", torch.full((n_z,), math.inf, dtype=torch.float64))
+        if config.forecast == "scattered":
+            deviations = torch.zeros(config.pairs, round(config.horizon / plant.dt), n_z, dtype=torch.float64)
+            ends = torch.full((2, n_z), math.inf, dtype=torch.float64)
+            self.register_buffer("deviations", deviations)
+            self.register_buffer("low", -ends[0])
+            self.register_buffer("high", ends[1])
         self.value: CostToGo | None = None
         tail = self._tail if config.terminal == "critic" else None
         timeless = dataclasses.replace(config, deadline=math.inf)
@@ -108,7 +121,10 @@ class PredictiveControl(nn.Module):
         """The forecast of the configuration, whose numbers are the buffers."""
         if self._config.forecast == "held":
             return Held()
-        return Decaying(self.mean, self.time, dt=self._plant[0].dt)
+        decaying = Decaying(self.mean, self.time, dt=self._plant[0].dt)
+        if self._config.forecast == "decaying":
+            return decaying
+        return Scattered(decaying, self.deviations, self.low, self.high)
 
     def _tail(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         if self.value is None:
@@ -132,6 +148,12 @@ class PredictiveControl(nn.Module):
         fitted = Decaying.fitted(records, dt=plant.dt, horizon=longest)
         self.mean.copy_(fitted.mean)
         self.time.copy_(fitted.time)
+        if self._config.forecast == "scattered":
+            pairs = self._config.pairs
+            scattered = Scattered.fitted(fitted, records, dt=plant.dt, horizon=longest, pairs=pairs)
+            self.deviations.copy_(scattered.reaching(self.deviations.shape[1]))
+            self.low.copy_(scattered.low)
+            self.high.copy_(scattered.high)
 
     @property
     def solves(self) -> list[Solve]:

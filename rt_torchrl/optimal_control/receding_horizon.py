@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimal_control.bounded_descent import descend
 from rt_torchrl.optimal_control.command_cost import CommandCost, TerminalCost
-from rt_torchrl.optimal_control.forecasts import Forecast, Held
+from rt_torchrl.optimal_control.forecasts import Forecast, Futures, Held
 from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.optimal_control.shared_commands import SharedCommands
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
@@ -52,6 +53,9 @@ class RecedingHorizon:
 
     .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state, under a forecast of z}
 
+    Under a forecast with several futures the integral is the mean over them. They share the commands until the next
+    plan; later ones answer what has come by then, see :class:`SharedCommands`.
+
     Every plan starts from the rest of the last one, whose end is held. The first plan of an episode starts from the
     best constant command and has no deadline, because there is no plan to go on with; :meth:`prepare` makes one before
     the episode begins, so that the first solve has a deadline too.
@@ -63,7 +67,8 @@ class RecedingHorizon:
         forecast: forecast of the exogenous inputs; None holds what is measured.
         terminal: cost V after the horizon, of the end states ``batch n_s``, in units of L_a·s; None for none. A window
             that ends with the episode has the plant's ``terminal_cost`` instead.
-        tail: the cost V where it also depends on the time and on the inputs after the window; None for none.
+        tail: the cost V where it also depends on the time and on the inputs after the window, of several futures on
+            their mean; None for none.
         guess: commands that a solve starts from where they cost less than the rest of the last plan, such as those of a
             classical controller on the model; None for none.
 
@@ -91,6 +96,7 @@ class RecedingHorizon:
             raise ValueError(f"period={config.period} s must not be longer than horizon={config.horizon} s.")
         self.cost = CommandCost(plant, constant(closure), hold=hold, penalty=config.penalty, terminal=terminal)
         self._terminal, self._tail = terminal, tail
+        self._shared = SharedCommands(self.cost, self.period // hold)
         self._prepared: np.ndarray | None = None
         self.solves: list[Solve] = []
         self.begin()
@@ -143,32 +149,40 @@ class RecedingHorizon:
         n = min(self.horizon, self.plant.n_steps - k) if self.config.ends else self.horizon
         ends = self.config.ends and k + n == self.plant.n_steps
         self.cost.terminal = self.plant.terminal_cost if ends else self._terminal
-        inputs = self.forecast(t, exogenous, n)
+        inputs = self._futures(t, exogenous, n)
         first, found = not self._plans, []
         for episode in range(len(state)):
             safe_point()
-            one = slice(episode, episode + 1)
+            begins, coming = state[episode].expand(inputs.shape[1], -1), inputs[episode]
             began = time.perf_counter()
             if self._tail is not None and not ends:
-                self.cost.terminal = self._tail_at(t + n * self.plant.dt, inputs[one, -1])
-            self.cost.begin(state[one], inputs[one], start=t)
+                self.cost.terminal = self._tail_at(t + n * self.plant.dt, coming[:, -1].mean(0))
+            self.cost.begin(begins, coming, start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
             starts = ([] if last is None else [last]) + (self._constants() if first else [])
             if self.guess is not None:
-                starts.append(self.cost.units(self.guess(state[one], inputs[one]))[0])
+                starts.append(self.cost.units(self.guess(begins, coming)))
             start = starts[0] if len(starts) == 1 else self._cheapest(starts)
             found.append(self._solved(start, last, began))
         self._plans = found
-        return self.cost.commands(np.stack(found), n)
+        return self.cost.commands(np.stack([plans.mean(0) for plans in found]), n)
 
-    def _tail_at(self, t: float, exogenous: Float[Tensor, "1 n_z"]) -> TerminalCost:
+    def _futures(
+        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
+    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
+        """The futures that count; most forecasts know one."""
+        if isinstance(self.forecast, Futures):
+            return self.forecast.futures(t, exogenous, n)
+        return self.forecast(t, exogenous, n).unsqueeze(1)
+
+    def _tail_at(self, t: float, exogenous: Float[Tensor, " n_z"]) -> TerminalCost:
         """The tail as a function of the end states alone."""
-        tail, end = self._tail, torch.tensor([t], dtype=torch.float64)
+        tail = self._tail
         assert tail is not None
-        return lambda state: tail(end, state, exogenous)
+        return lambda state: tail(state.new_full((len(state),), t), state, exogenous.expand(len(state), -1))
 
     def _solved(self, start: np.ndarray, last: np.ndarray | None, began: float) -> np.ndarray:
-        """The plan of one episode; if it is late or diverges, the last plan goes on, where there is one."""
+        """The plans for the futures of an episode; if it is late or diverges, the last ones go on, if there are any."""
         count, deadline = 0, math.inf if last is None else self.config.deadline
 
         def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -176,12 +190,13 @@ class RecedingHorizon:
             if time.perf_counter() - began > deadline:
                 raise _LateError
             count += 1
-            costs, gradient = self.cost(point)
-            return float(costs[0]), gradient
+            cost, gradient = self._shared(point[0], len(start))
+            return cost, gradient[None]
 
         late = diverged = False
         try:
-            found = descend(evaluate, start[None], self.config.descent()).point[0]
+            best = descend(evaluate, self._shared.point(start)[None], self.config.descent()).point[0]
+            found = self._shared.plans(best, len(start))
         except _LateError:
             found, late = start, True
         except FloatingPointError as error:
@@ -192,19 +207,19 @@ class RecedingHorizon:
         self.solves.append(Solve(time.perf_counter() - began, count, late, diverged))
         return found
 
-    def _shifted(self, plan: np.ndarray) -> np.ndarray:
-        """The rest of the last plan, whose end is held for as long as the window needs."""
+    def _shifted(self, plans: np.ndarray) -> np.ndarray:
+        """The rest of the last plans, whose ends are held for as long as the window needs."""
         blocks, passed = self.cost.blocks(self.cost.n), self.period // self.cost.hold
-        return plan[np.minimum(np.arange(passed, passed + blocks), len(plan) - 1)]
+        return plans[:, np.minimum(np.arange(passed, passed + blocks), plans.shape[1] - 1)]
 
     def _constants(self) -> list[np.ndarray]:
         """Constant commands at both ends and the middle of every range."""
-        blocks, n_a = self.cost.blocks(self.cost.n), len(self.plant.actions)
-        return [np.full((blocks, n_a), levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=n_a)]
+        shape = self.cost.count, self.cost.blocks(self.cost.n), len(self.plant.actions)
+        return [np.full(shape, levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=shape[-1])]
 
     def _cheapest(self, plans: Sequence[np.ndarray]) -> np.ndarray:
         """The plan of the least cost; one that diverges costs more than any other, and the first is taken if all do."""
-        costs = [float(self.cost(plan[None])[0][0]) for plan in plans]
+        costs = [self._shared(self._shared.point(plan), len(plan))[0] for plan in plans]
         return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
     def act(
