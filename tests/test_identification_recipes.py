@@ -59,7 +59,8 @@ class Kept:
 def test_the_greatest_error_of_a_weight_counts():
     accuracy = recipe("accuracy")
     assert accuracy.weight_error(Kept({"a": 1.01, "b": 0.49}, {"a": 1.0, "b": 0.5})) == pytest.approx(0.02)
-    assert "| flapping_wing | 2 | 0.1 %, 20 % |" in accuracy.table({"flapping_wing": [0.001, 0.2]})
+    assert "| flapping_wing | 2 | 0.1 %, 20 % |" in accuracy.table({"flapping_wing": [0.001, 0.2]}, {})
+    assert "on its records | 1 %, 0.02 % |" in accuracy.table({}, {"records": [0.01, 0.0002]})
     assert [len(accuracy.Config().trainings(plant)) for plant in accuracy.EPISODES] == [5, 5, 5]
     with pytest.raises(ValueError, match="seeds=0"):
         accuracy.Config(seeds=0)

@@ -21,7 +21,7 @@ HOMES = {
 }
 """The module that each public name comes from."""
 ROOMS_OF = {
-    "accuracy.py": {"evaluation", "runs", "study", "twinning"},
+    "accuracy.py": {"evaluation", "runs", "study", "trajectories", "twinning"},
     "asynchronous.py": {"runs"},
     "benchmark.py": {"trajectories"},
     "cascaded_tanks.py": {"figures", "identification"},

@@ -1,14 +1,16 @@
 """Step 4: the closure is trained until the twin replays the record."""
 
+import contextlib
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from rt_torchrl.identification.first_values import move
 from rt_torchrl.identification.output_error import (
     NOISE_TOLERANCE,
     InitialStates,
@@ -38,6 +40,9 @@ class AssimilationConfig:
             it also does not find weights that move the states less than that chance does.
         method: method of the fit: ``gradient`` takes the steps of ``descent``; ``levenberg_marquardt`` solves the
             normal equations from forward sensitivities, for closures of some ten weights, and does not use ``descent``.
+        starts: number of first weights in every episode: the present ones, those of the first closure, and then these
+            two in turns, moved at random. The best fit stays, as a law that has bent to one record may be in a local
+            minimum of the next ones. More than 1 needs ``levenberg_marquardt`` and ``initial="measured"``.
         prior: factor ρ of a cost ½ρ‖w − w⁰‖² beside J_p, in the unit of J_p, on the weights w of the closure's
             perceptrons (:class:`BoundedPerceptron`); 0 leaves it out. Weights of which the records say nothing then
             keep their initial values, and so the law keeps its initial form where no record has been.
@@ -68,6 +73,7 @@ class AssimilationConfig:
     stop_ratio: float = 0.0
     inputs: Literal["realisations", "record"] = "realisations"
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
+    starts: int = 1
     prior: float = 0.0
     segment: int = 0
     initial: Literal["measured", "estimated"] = "measured"
@@ -97,6 +103,11 @@ class AssimilationConfig:
             raise ValueError(
                 f"sensors={self.sensors} of the assimilation need initial='estimated' and segment=0; they are "
                 f"{self.initial!r} and {self.segment}."
+            )
+        if self.starts < 1 or (self.starts > 1 and (self.method, self.initial) != ("levenberg_marquardt", "measured")):
+            raise ValueError(
+                f"starts={self.starts} of the assimilation must be at least 1, and more than 1 need "
+                f"method='levenberg_marquardt' and initial='measured', not {self.method!r} and {self.initial!r}."
             )
         self._check_likelihood()
 
@@ -200,10 +211,27 @@ class Assimilation:
             method = LevenbergMarquardt(output_error.unknowns, tolerance=NOISE_TOLERANCE)
             found = method.run(lambda: self._mean_equations(output_error), iterations, stop_below=stop_below)
         elif self.config.method == "levenberg_marquardt":
-            found = self.second_order.run(equations, iterations, stop_below=stop_below)
+            found = self._from_starts(equations)
         else:
             found = self.descent.run(cost, iterations, stop_below=stop_below)
         return found._replace(start=found.start - before, best=found.best - self.prior.cost().item())
+
+    def _from_starts(self, equations: Callable[[], NormalEquations]) -> Descended:
+        """Descend from each of the first weights; the best weights stay."""
+        closure, iterations, stop_below = self.twin.closure, self.config.iterations, self.config.stop_ratio
+        found = self.second_order.run(equations, iterations, stop_below=stop_below)
+        generator = torch.Generator().manual_seed(0)
+        least, best = found.best, copy.deepcopy(closure.state_dict())
+        for number in range(1, self.config.starts):
+            closure.load_state_dict(self._first if number % 2 else best)
+            if number > 1:
+                move(closure, generator)
+            with contextlib.suppress(FloatingPointError):  # weights drawn at random may be nonsense
+                other = LevenbergMarquardt(closure).run(equations, iterations)
+                if other.best < least:
+                    least, best = other.best, copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(best)
+        return found._replace(best=least)
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
         measured, actions, exogenous, start = replayed
