@@ -51,7 +51,8 @@ class TangentInterval(nn.Module):
 
         jacobians = torch.func.vmap(torch.func.jacrev(end, argnums=(0, 1)), in_dims=(None, 0, 0, 0, 0))
         by_weights, A = jacobians(weights, s, t, drive.exogenous, drive.command)
-        sources = [jacobian.flatten(2) for jacobian in by_weights.values()]
+        # A weight may be one number, of no dimension.
+        sources = [jacobian.reshape(*A.shape[:2], -1) for jacobian in by_weights.values()]
         # s_0 acts like weights that are used in the first interval alone.
         unused = S.shape[-1] - sum(part.shape[-1] for part in sources)
         B = torch.cat([*sources, s.new_zeros(*s.shape, unused)], -1)

@@ -105,4 +105,6 @@ def linearise_by_rows(interval: nn.Module, names: tuple[str, ...], starts: Tenso
 
     rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
     by_state, by_weights = rows(weights, starts, *drive)
-    return torch.cat([by_state, *(jacobian.flatten(2) for jacobian in by_weights.values())], -1)
+    # A weight may be one number, of no dimension.
+    parts = (jacobian.reshape(*by_state.shape[:2], -1) for jacobian in by_weights.values())
+    return torch.cat([by_state, *parts], -1)
