@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,17 +53,26 @@ class Fit:
             measured, method="levenberg_marquardt", initial="measured", segment=segment, iterations=SHORT_STEPS
         )
         self.stages = {"short": Assimilation(twin, short), "whole": Assimilation(twin, measured)}
-        self.fitted, self.waiting, self.pause = False, 0, 1
+        self.least, self.waiting, self.pause = math.inf, 0, 1
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        """Fit the records, in more rounds the first time.
+        """Fit the records, in more rounds the first time, and where one round leaves far more over than last time.
 
         Returns:
             The misfit of the best weights, which the closure has then.
         """
+        rounds = FIRST_ROUNDS if math.isinf(self.least) else 1
+        least = self._rounds(records, rounds, generator)
+        if rounds == 1 and not least < FAR * self.least:
+            least = self._rounds(records, FIRST_ROUNDS, generator)
+        self.least = least
+        return least
+
+    def _rounds(self, records: Sequence[Trajectory], count: int, generator: torch.Generator) -> float:
+        """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
         closure = self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
-        for stage in (1 if self.fitted else FIRST_ROUNDS) * list(self.stages.values()):
+        for stage in count * list(self.stages.values()):
             safe_point()
             # A twin that diverges on the way only loses the stage.
             with contextlib.suppress(FloatingPointError):
@@ -73,7 +83,6 @@ class Fit:
             elif not found < FAR * least:
                 closure.load_state_dict(best)
         closure.load_state_dict(best)
-        self.fitted = True
         return least
 
     def due(self) -> bool:
@@ -90,11 +99,11 @@ class Fit:
 
     def state_dict(self) -> dict[str, Any]:
         stages = {name: stage.state_dict() for name, stage in self.stages.items()}
-        counters = {"fitted": self.fitted, "waiting": self.waiting, "pause": self.pause}
+        counters = {"least": self.least, "waiting": self.waiting, "pause": self.pause}
         return counters | {"closure": self.twin.closure.state_dict(), **stages}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.fitted, self.waiting, self.pause = state["fitted"], state["waiting"], state["pause"]
+        self.least, self.waiting, self.pause = state["least"], state["waiting"], state["pause"]
         self.twin.closure.load_state_dict(state["closure"])
         for name, stage in self.stages.items():
             stage.load_state_dict(state[name])
@@ -190,9 +199,9 @@ class EnsembleAssimilation(Assimilation):
 @torch.no_grad()
 def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> float:
     """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
-    stacked = batch_of([with_hidden_states(twin, record) for record in records])
-    measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
     try:
+        stacked = batch_of([with_hidden_states(twin, record) for record in records])
+        measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
         flown = twin.replay(measured[:, 0], exogenous, actions, start=start)
     except DivergenceError:
         return float("inf")
