@@ -25,9 +25,9 @@ from rt_torchrl.twinning.hypotheses.reread import Reread, reread
 SEGMENTS = 60
 """Number of segments of an episode by default."""
 FIRST_ROUNDS = 3
-"""Rounds of the first fit."""
+"""Greatest number of rounds of the first fit."""
 STEPS = 10
-"""Levenberg-Marquardt steps over segments in a round."""
+"""Greatest number of Levenberg-Marquardt steps over segments in a round."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 LONGEST_PAUSE = 8
@@ -43,7 +43,7 @@ class Fit:
 
     Over a whole record of a system that oscillates nearly every weight has local minima. Over segments that begin with
     what was read (multiple shooting) it has few; the hidden states go on through all segments, with their derivatives.
-    Weights that act slowly hardly show in segments: the methods take turns, and each frees the other.
+    Where some steps over segments have not arrived, the methods take turns, and each frees the other.
 
     Args:
         twin: twin of the hypothesis, whose closure is updated in place.
@@ -88,14 +88,17 @@ class Fit:
         for name in count * list(self.stages):
             safe_point()
             taken = [reread(r, plant, self.segment) if name == "short" else _started(r, plant) for r in records]
+            steps = STEPS
             # A twin that diverges on the way only loses the stage.
             with contextlib.suppress(FloatingPointError):
-                self.stages[name].update(taken, (), 1, generator)
+                steps = self.stages[name].update(taken, (), 1, generator).iterations
             found = misfit(self.twin, records, self.segment)
             if found < least:
                 least, best = found, copy.deepcopy(closure.state_dict())
             elif not found < FAR * least:
                 closure.load_state_dict(best)
+            if name == "short" and steps < STEPS:
+                break
         closure.load_state_dict(best)
         return least
 
