@@ -6,14 +6,15 @@ import random
 
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from test_algorithm import twinning
 
+from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.evidence.alarm import alarm
 from rt_torchrl.twinning.evidence.examination import RealJudge
@@ -28,8 +29,12 @@ from rt_torchrl.twinning.evidence.paired_differences import (
     PairedDifferences,
     difference,
 )
+from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration
+from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.learners.config import IncrementalTD3Config
+from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.planning import Costs, Judgement, Planning
 from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
 from rt_torchrl.twinning.track_record import Differences
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -204,8 +209,104 @@ def test_a_training_goes_back_to_what_was_better_in_reality(corrected):
         return flight
 
     found.flights.fly = flown
-    recalled = [found.episode()["recalled"].item() for _ in range(3)]
-    assert any(recalled) == corrected
+    reports = [found.episode() for _ in range(3)]
+    assert any(report["recalled"].item() for report in reports) == corrected
+
+
+@pytest.mark.parametrize(
+    ("plan", "stays", "withheld"),
+    [
+        (Costs(1.0, 5.0, 4.0), Costs(2.0, 2.1, 2.0), math.log(2.0)),
+        (Costs(1.0, 2.2, 1.5), Costs(2.0, 2.1, 2.0), 0.0),  # the belief is wide, but real episodes do not contradict
+        (Costs(3.0, 9.0, 8.0), Costs(2.0, 2.1, 2.0), 0.0),  # the twin does not prefer it
+        (Costs(math.inf, math.inf, math.inf), Costs(2.0, 2.1, 2.0), 0.0),
+    ],
+)
+def test_what_evidence_withholds(plan, stays, withheld):
+    assert plan.withheld(stays) == pytest.approx(withheld)
+
+
+@pytest.mark.parametrize(("withheld", "wrong"), [(0.0, False), (0.09, False), (math.log(1.65), True)])
+def test_a_plan_that_real_episodes_contradict_raises_the_alarm(withheld, wrong):
+    told = twinning(arm="model_based").examination.told(findings(plan_accepted=0.0, withheld=withheld))
+    assert ("alarm" in told) == wrong
+    assert not wrong or "a plan would cost 1/1.65 of the policy that stays" in told["warning"]
+
+
+class Content:
+    """A planner that leaves the policy as it is."""
+
+    def __init__(self, policy):
+        self.policy = policy
+
+    def plan(self, episodes):
+        return Descended(1.0, 1.0, 0.0, 0)
+
+    def refuse(self):
+        pass
+
+    restart = load_state_dict = state_dict = refuse
+
+
+def test_the_report_says_what_a_recall_withholds():
+    """The twin says 2 of the present policy, which cost e² times as much, and 4 of an earlier one, which cost it."""
+    judge, policy = judge_of([4.0, 2.0], [0.0, 2.0]), LinearGain([[2.0, 0.0]])
+    planning = Planning(Content(policy), judge.virtual, PlannerConfig())
+    judgement = Judgement(lambda episodes: judge.virtual.cost(policy, episodes), lambda a, b: a > b, print, judge)
+    episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
+    report = planning.plan(1, episodes, episodes, judgement)
+    assert policy.gain.tolist() == [[4.0, 0.0]] and report["recalled"] == 1.0
+    assert report["withheld"].item() == pytest.approx(math.log(2.0))
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5])
+def test_exploration_is_repeated_on_the_twin(wrong):
+    """The oracle steps the plant by hand with the noise that was added."""
+    plant = LinearQuadratic(horizon=2.0)
+    generator = torch.Generator().manual_seed(3)
+    policy, other = LinearGain([[0.4, 0.7]]), LinearClosure(plant.closure.matrix.detach() + wrong)
+    noise = 0.6 * torch.randn(plant.n_steps, 1, generator=generator, dtype=torch.float64)
+    start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+
+    def flown(closure, nudges):
+        states, actions, t = [start], [], torch.zeros((), dtype=torch.float64)
+        for k in range(plant.n_steps):
+            actions.append((policy(states[-1]) + nudges[k]).clamp(-2.0, 2.0))
+            states.append(plant.step(t + k * plant.dt, states[-1], actions[-1], inputs[:, k], closure).state)
+        return Trajectory(torch.cat(states), torch.cat(actions), inputs[0])
+
+    with torch.no_grad():
+        record = flown(plant.closure, noise)
+        nudges = record.actions - policy(record.states[:-1])
+        all_flown = [record, flown(plant.closure, 0.0 * noise), flown(other, nudges)]
+        real, quiet, expected = control_cost(plant, batch_of(all_flown)).tolist()
+    twin = DigitalTwin(plant, other)
+    found = RepeatedExploration().cost(twin, policy, record, Scenario(record.states[:1], inputs))
+    assert found == pytest.approx(expected, rel=1e-10) and abs(quiet / real - 1.0) > 0.01  # noise counts
+    assert (found == pytest.approx(real, rel=1e-10)) == (not wrong)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_the_alarm_needs_no_quiet_episodes(factor):
+    """Both episodes explore by a fifth of half the range; the twin is the real system, whose costs are multiplied."""
+    plant = LinearQuadratic(horizon=2.0)
+    loud = ExplorationConfig(spread=0.2, least=1.0)
+    found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=loud)
+    fly = found.flights.fly
+
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
+        flight.transitions["next", "reward"] *= factor
+        return flight
+
+    found.flights.fly = flown
+    raised = []
+    for _ in range(2):
+        found.interact()
+        report = found.examination.examine()
+        raised.append(report["alarm"].item())
+    assert raised == [0.0, float(factor > 1.0)]
+    assert factor == 1.0 or "cost 2 times as much as the twin says of them" in report["warning"]
 
 
 @pytest.mark.parametrize(("factor", "corrects"), [(1.0, False), (1.1, False), (1.3, True)])

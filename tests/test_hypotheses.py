@@ -7,19 +7,21 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
+from rt_torchrl.plants.extensions.extension import ExtendedClosure
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.runs.results import hypotheses_of
 from rt_torchrl.runs.results_table import hypothesis_lines
-from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
-from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, evidence
+from rt_torchrl.twinning.hypotheses.assimilation import FIRST_ROUNDS, EnsembleAssimilation, evidence, misfit
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
+from rt_torchrl.twinning.hypotheses.reread import Reread, reread
 
 LAG = 0.6
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
@@ -64,6 +66,44 @@ def test_hidden_states_follow_from_what_was_read():
     found = with_hidden_states(DigitalTwin(real, real.closure), record)
     torch.testing.assert_close(found.states, states, rtol=1e-12, atol=1e-12)
     assert with_hidden_states(DigitalTwin(PLANT, PLANT.closure), record) is record
+
+
+def test_hidden_states_that_diverge_are_refused_and_cost_a_hypothesis_its_weight():
+    real = LaggedActuator(PLANT, "force", LAG)
+    record, _ = recorded(real)
+    broken = DigitalTwin(real, real.closure)
+    wild = record._replace(exogenous=record.exogenous + 1e308, actions=record.actions * 1e308)
+    with pytest.raises(DivergenceError, match="is not finite"):
+        with_hidden_states(broken, wild)
+    assert misfit(broken, [wild], 5) == float("inf") > misfit(broken, [record], 5)
+
+
+def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_states():
+    """The oracle replays every segment from readings and hidden states, which the same closure gives."""
+    real = LaggedActuator(PLANT, "force", LAG)
+    record, _ = recorded(real)
+    twin = DigitalTwin(real, ExtendedClosure(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), real.closure.own))
+    reading, again = twin.of(Reread(real)), reread(record, real, 20)
+    flown = reading.replay(again.states[None, 0], again.exogenous[None], again.actions[None]).states[0]
+    hidden = with_hidden_states(twin, record)
+    for first in range(0, 100, 20):
+        start = torch.cat([record.states[first], flown[first, 2:]])[None]
+        part = twin.replay(start, record.exogenous[None, first : first + 20], record.actions[None, first : first + 20])
+        torch.testing.assert_close(flown[first + 1 : first + 21], part.states[0, 1:], rtol=1e-12, atol=1e-12)
+    # A lag of the actuator does not depend on what is read.
+    torch.testing.assert_close(flown[:, 2], hidden.states[:, 2], rtol=1e-12, atol=1e-12)
+
+
+def test_a_hypothesis_that_suddenly_leaves_more_over_is_fitted_in_more_rounds():
+    real = LaggedActuator(PLANT, "force", LAG)
+    twin, assimilation = fitted(real, PLANT)
+    fit, (record, _) = assimilation.fits["lags"], recorded(real)
+    rounds, run = [], fit._rounds
+    fit._rounds = lambda records, count, generator: rounds.append(count) or run(records, count, generator)
+    fit.update([record], torch.Generator())
+    fit.least *= 1e-9
+    fit.update([record], torch.Generator())
+    assert rounds == [1, 1, FIRST_ROUNDS]
 
 
 def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():

@@ -15,6 +15,7 @@ from rt_torchrl.envs.cryogenic_tank.two_zones import TwoZones
 from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.envs.wind_turbine.lagged_power import LaggedPower
 from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
 from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -102,6 +103,30 @@ def test_the_torque_of_a_rotor_that_keeps_its_speed_follows_exponentially():
     expected = steady + (torques[0] - steady) * torch.exp(-t / 10.0)
     torch.testing.assert_close(torques, expected, rtol=1e-6, atol=0.0)
     assert torques[0] < 0.9 * steady
+
+
+def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
+    base = WindTurbine(inertia=1e15, observe=("scheduled",))
+    plant = LaggedPower(base, 10.0)
+    check_plant(LaggedPower(WindTurbine(horizon=20.0), 10.0), steps=5, traced=False, trained=False)
+    read, n, wind = base.draw_initial_state(1, torch.Generator().manual_seed(0)), 60, 13.0
+    state, exogenous = plant.at_rest(read), torch.full((1, n, 1), wind, dtype=torch.float64)
+    power = 1e6 * flown(plant, state, exogenous, read[:, None, 4:6].expand(1, n, 2))[0, :, -1]
+    steady = read[:, 0] * base.aerodynamic_torque(read[:, 0], read[:, 5], torch.tensor([wind]).double(), base.closure)
+    t = base.dt * torch.arange(n + 1, dtype=torch.float64)
+    torch.testing.assert_close(power, steady + (power[0] - steady) * torch.exp(-t / 10.0), rtol=1e-6, atol=0.0)
+    # C_p is 0.4 at the start, in the filtered wind.
+    assert power[0].item() == pytest.approx(0.2 * 1.225 * math.pi * 63.0**2 * read[0, 2].item() ** 3, rel=1e-9)
+
+
+def test_a_fast_lag_of_the_power_is_none():
+    base = WindTurbine()
+    plant = LaggedPower(base, 0.2)
+    generator = torch.Generator().manual_seed(0)
+    read, exogenous = base.draw_initial_state(2, generator), torch.full((2, 40, 1), 9.0, dtype=torch.float64)
+    command = read[:, None, 4:6].expand(2, 40, 2)
+    found = flown(plant, plant.at_rest(read), exogenous, command)[..., 0]
+    torch.testing.assert_close(found, flown(base, read, exogenous, command)[..., 0], rtol=5e-3, atol=0.0)
 
 
 def test_a_rotor_turns_in_the_wind_and_its_filter_in_what_the_anemometer_reads():

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
 from rt_torchrl.plants.plant import Plant
 
 if TYPE_CHECKING:
@@ -13,7 +12,6 @@ if TYPE_CHECKING:
 
 PITCH_LAG = 0.7  # [s]; guess with which the identification begins
 INFLOW_LAG = 6.0  # [s]; about D/u at rated wind speed, 126 m/11.4 m/s = 11 s, within a factor of two
-INFLOW = (0.4,)  # C_p at the start of an episode [-]
 
 
 def suspects(plant: "WindTurbine") -> Mapping[str, Plant]:
@@ -26,7 +24,9 @@ def suspects(plant: "WindTurbine") -> Mapping[str, Plant]:
         return LaggedActuator(base, "blade_pitch", PITCH_LAG)
 
     def inflow() -> Plant:
-        return LaggedCoefficients(plant, INFLOW_LAG, INFLOW)
+        from rt_torchrl.envs.wind_turbine.lagged_power import LaggedPower  # here, because it extends the plant
+
+        return LaggedPower(plant, INFLOW_LAG)
 
     return {
         "pitch lag": lagging(plant),

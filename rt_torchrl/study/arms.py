@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from rt_torchrl.runs.results_table import SIGNIFICANT
 from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.results import Entry, arm_entry
 from rt_torchrl.study.training import Training
@@ -26,11 +27,13 @@ class Arm:
         entry: costs of the live policy on the unseen episodes, and after each real episode.
         paid: J_a of every real episode, with that of the start, for each seed; empty for a yardstick.
         alarms: whether the alarm was up after each real episode, for each seed; empty for an arm without a twin.
+        correlated: whether the replay of each real episode left more over than white noise; empty without a twin.
     """
 
     entry: Entry
     paid: list[list[float]] = field(default_factory=list)
     alarms: list[list[bool]] = field(default_factory=list)
+    correlated: list[list[bool]] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -93,9 +96,25 @@ def missed_alarms(arm: Arm, oracle: float) -> AlarmCount:
         arm: arm on a system that its twin does not know.
         oracle: mean J_a of the oracle on the same unseen episodes.
     """
+    return _unsaid(arm, arm.alarms, oracle)
+
+
+def falsely_correlated(arm: Arm) -> AlarmCount:
+    """Episodes of a system as its twin knows it whose replay left more over than white noise."""
+    found = [correlated for seed in arm.correlated for correlated in seed]
+    return AlarmCount(len(found), sum(found))
+
+
+def not_correlated(arm: Arm, oracle: float) -> AlarmCount:
+    """As :func:`missed_alarms`, of the replay that left more over than white noise in the place of the alarm."""
+    return _unsaid(arm, arm.correlated, oracle)
+
+
+def _unsaid(arm: Arm, said: list[list[bool]], oracle: float) -> AlarmCount:
+    """Episodes after the first ones whose policy costs at least a tenth more than the oracle, where nothing is said."""
     silent = [
         not up
-        for curve, seed in zip(arm.entry.curves, arm.alarms, strict=True)
+        for curve, seed in zip(arm.entry.curves, said, strict=True)
         for cost, up in list(zip(curve, seed, strict=False))[SETTLED:]
         if cost >= (1.0 + MATTERS) * oracle
     ]
@@ -108,7 +127,9 @@ def trained_arm(name: str, trainings: Sequence[Training]) -> Arm:
     paid = [[one[key] for one in seed for key in ("start_cost", "real_cost") if key in one] for seed in found]
     watched = all("alarm" in one for seed in found for one in seed)
     alarms = [[bool(one["alarm"]) for one in seed] for seed in found] if watched else []
-    return Arm(entry=arm_entry(name, list(trainings)), paid=paid, alarms=alarms)
+    # An episode too short for the test has no whiteness.
+    correlated = [[one.get("whiteness", 1.0) < SIGNIFICANT for one in seed] for seed in found] if watched else []
+    return Arm(entry=arm_entry(name, list(trainings)), paid=paid, alarms=alarms, correlated=correlated)
 
 
 def classical_arms(training: Training) -> list[Arm]:

@@ -4,13 +4,29 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rt_torchrl.study.arms import NO_WORTH, AlarmCount, Arm, SystemResult, false_alarms, missed_alarms
+from rt_torchrl.study.arms import (
+    NO_WORTH,
+    AlarmCount,
+    Arm,
+    SystemResult,
+    false_alarms,
+    falsely_correlated,
+    missed_alarms,
+    not_correlated,
+)
 from rt_torchrl.study.results import difference
 
 COST = ["J_a, median", "range", "95 % interval of the mean", "over oracle"]
 HEADER = ["arm", "seeds", *COST, "Σ paid", "regret", "alarms"]
 WHOLE = "twinning"
 """Arm with all parts, of which the ablation takes one after another."""
+COUNTED = {
+    "false": "false, of the episodes as the twin",
+    "missed": "missed, of the episodes with a gap of 10 %",
+    "not white, false": "residuals not white, of the episodes as the twin",
+    "not white, missed": "residuals white, of the episodes with a gap of 10 %",
+}
+"""Headings of what is counted."""
 TARGET = 0.05
 """Greatest share of false alarms, and of missed ones."""
 
@@ -106,6 +122,13 @@ def verdict(shares: Sequence[tuple[float, float]]) -> str:
     )
 
 
+def counted(arm: Arm, found: SystemResult) -> dict[str, AlarmCount]:
+    """What is wrong with the alarms of an arm on a system, and apart from these with the test of whiteness."""
+    if not found.system:
+        return {"false": false_alarms(arm), "not white, false": falsely_correlated(arm)}
+    return {"missed": missed_alarms(arm, found.least), "not white, missed": not_correlated(arm, found.least)}
+
+
 def alarm_section(results: Sequence[SystemResult]) -> str:
     """False and missed alarms of every arm that has a twin, over all systems."""
     from rt_torchrl.study.tables import table  # here, because the help of a recipe need not wait for Matplotlib
@@ -114,20 +137,20 @@ def alarm_section(results: Sequence[SystemResult]) -> str:
     for found in results:
         for arm in found.arms:
             if arm.alarms:
-                count = counts.setdefault(arm.name, {"false": AlarmCount(0, 0), "missed": AlarmCount(0, 0)})
-                kind = "missed" if found.system else "false"
-                count[kind] += missed_alarms(arm, found.least) if found.system else false_alarms(arm)
+                count = counts.setdefault(arm.name, dict.fromkeys(COUNTED, AlarmCount(0, 0)))
+                for kind, one in counted(arm, found).items():
+                    count[kind] += one
     if not counts:
         return ""
-    rows = [[name, count["false"].words(), count["missed"].words()] for name, count in counts.items()]
-    total = {kind: sum((count[kind] for count in counts.values()), AlarmCount(0, 0)) for kind in ("false", "missed")}
+    rows = [[name, *(count[kind].words() for kind in COUNTED)] for name, count in counts.items()]
+    total = {kind: sum((count[kind] for count in counts.values()), AlarmCount(0, 0)) for kind in COUNTED}
     said = [
         f"- {kind}: {count.words()}; at most {100 * TARGET:.0f} % are wanted: "
         f"{'yes' if count.wrong <= TARGET * count.episodes else 'no'}."
         for kind, count in total.items()
         if count.episodes
     ]
-    header = ["arm", "false, of the episodes as the twin", "missed, of the episodes with a gap of 10 %"]
+    header = ["arm", *COUNTED.values()]
     return "\n\n".join(["## Alarms", table(header, rows), "\n".join(said)])
 
 

@@ -222,7 +222,7 @@ class ReinforcementTwinning:
             require_sound_twin=lambda episodes: self.track_record.require_sound_twin(self.virtual, episodes),
             evidence=self.examination.correction(self.short_term[-1]) if self.config.corrected_plans else None,
         )
-        return self.planning.plan(self.episodes_done + 1, planned_on, judged_on, judgement)
+        return self.examination.told(self.planning.plan(self.episodes_done + 1, planned_on, judged_on, judgement))
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:

@@ -1,6 +1,7 @@
 """Step 5: the planner's plan, which stays unless the referee finds it worse."""
 
 import copy
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from rt_torchrl.optimisers.descent import Descended, by_small_steps
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.examination import RealJudge
+from rt_torchrl.twinning.evidence.paired_differences import difference
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.planners import Planner, PlannerConfig
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -32,9 +34,29 @@ class Judgement(NamedTuple):
     require_sound_twin: Callable[[Scenario], None]
     evidence: RealJudge | None = None
 
-    def expected(self, policy: nn.Module, cost: float) -> float:
-        """The cost by which a policy is judged: on the real system if there is evidence, else on the twin."""
-        return cost if self.evidence is None else self.evidence.expected(policy, cost)
+    def of(self, policy: nn.Module, cost: float) -> "Costs":
+        """What a policy costs that has this mean J_a on the twin: on the real system if there is evidence."""
+        if self.evidence is None:
+            return Costs(cost, cost, cost)
+        return Costs(cost, self.evidence.expected(policy, cost), self.evidence.median(policy, cost))
+
+
+class Costs(NamedTuple):
+    """What a policy costs on the twin, and is expected to cost on the real system: in the mean and in the median."""
+
+    twin: float
+    expected: float
+    median: float
+
+    def withheld(self, stays: "Costs") -> float:
+        """How much better the twin alone finds this policy than the one that stays, as log of the costs' ratio.
+
+        It is zero where the twin does not, and where real episodes do not contradict it: a policy that is refused for
+        the width of the belief alone may be as good as the twin says.
+        """
+        if not math.isfinite(self.twin) or self.median < stays.median:
+            return 0.0
+        return max(0.0, difference(stays.twin, self.twin))
 
 
 class Planning:
@@ -70,15 +92,11 @@ class Planning:
         Raises:
             DivergenceError: if the twin diverges with the weights that have just flown.
         """
-        policy, recalled = self.planner.policy, None
-        if judgement.evidence is not None and not isinstance(policy, StateFeedback):
-            recalled = judgement.evidence.recalled(policy, judged_on)
-        if recalled is not None:
-            policy.load_state_dict(recalled)
-            self.planner.restart()
-        found = merged(
-            self._from_the_present(planned_on, judged_on, judgement), findings(recalled=float(recalled is not None))
-        )
+        withheld = self._recall(judged_on, judgement)
+        found = self._from_the_present(planned_on, judged_on, judgement)
+        found = merged(found, findings(recalled=float(withheld is not None)))
+        if withheld is not None:
+            found.update(findings(withheld=max(withheld, float(found.get("withheld", 0.0)))))
         while self.others:
             other = self._from_others(self.others.pop(), planned_on, judged_on)
             found = found if other is None else other
@@ -86,6 +104,19 @@ class Planning:
             found = self._approached(found, planned_on, judged_on)
         constraints = self.virtual.constraints
         return merged(found, findings(**constraints.report())) if constraints else found
+
+    def _recall(self, judged_on: Scenario, judgement: Judgement) -> float | None:
+        """Go back to weights that have flown for less on the real system, and say what that withholds."""
+        policy, evidence = self.planner.policy, judgement.evidence
+        if evidence is None or isinstance(policy, StateFeedback):
+            return None
+        recalled = evidence.recalled(policy, judged_on)
+        if recalled is None:
+            return None
+        left = judgement.of(policy, self.virtual.price(policy, judged_on).item())
+        policy.load_state_dict(recalled)
+        self.planner.restart()
+        return left.withheld(judgement.of(policy, self.virtual.price(policy, judged_on).item()))
 
     def _approached(self, found: TensorDict, planned_on: Scenario, judged_on: Scenario) -> TensorDict:
         """The best plan by small steps from the present weights and from the first ones, or the plan found so far."""
@@ -141,7 +172,7 @@ class Planning:
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         judged = not isinstance(policy, StateFeedback)
-        incumbent = judgement.expected(policy, judgement.incumbent(judged_on).item()) if judged else 0.0
+        incumbent = judgement.of(policy, judgement.incumbent(judged_on).item()) if judged else None
         try:
             found = self.planner.plan(planned_on)
         except FloatingPointError as error:
@@ -149,12 +180,14 @@ class Planning:
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
-        cost = judgement.expected(policy, self.virtual.price(policy, judged_on).item()) if judged else 0.0
-        accepted = not judged or not judgement.worse(cost, incumbent)
-        if not accepted:
-            policy.load_state_dict(before)
-            self.planner.refuse()
-        return planned(found, accepted=accepted)
+        if incumbent is None:
+            return planned(found, accepted=True)
+        plan = judgement.of(policy, self.virtual.price(policy, judged_on).item())
+        if not judgement.worse(plan.expected, incumbent.expected):
+            return planned(found, accepted=True)
+        policy.load_state_dict(before)
+        self.planner.refuse()
+        return merged(planned(found, accepted=False), findings(withheld=plan.withheld(incumbent)))
 
 
 def planned(found: Descended, *, accepted: bool) -> TensorDict:

@@ -2,7 +2,7 @@
 
 import copy
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -78,7 +78,7 @@ class TrackRecord:
         """The paired differences of all episodes that are kept, but not of state feedback, whose flights are long."""
         flown = [one for one in self._flown if not isinstance(self._policies[one.role], StateFeedback)]
         pairs = [difference(one.cost, self._predicted(one, virtual)) for one in flown]
-        return Differences([self._policy(one) for one in flown], pairs, [one.exploration for one in flown])
+        return Differences([self._policy(one) for one in flown], pairs, [one.exploration for one in flown], flown)
 
     def _latest(self) -> list[Flown]:
         return list(self._flown)[-COMPARED:]
@@ -124,11 +124,12 @@ class TrackRecord:
 
 
 class Differences(NamedTuple):
-    """Paired differences of real episodes, oldest first, with the policies that flew them."""
+    """Paired differences of real episodes, oldest first, with the policies that flew them, and the episodes."""
 
     policies: list[nn.Module]
     values: list[float]
     exploration: list[float]
+    flown: Sequence[Flown] = ()
 
     def learned(self, plant: Plant, record: Trajectory) -> PairedDifferences:
         """The belief about all policies, which are compared in the observations of a record."""

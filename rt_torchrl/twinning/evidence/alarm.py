@@ -46,6 +46,18 @@ def alarm(differences: Sequence[float]) -> str | None:
     return f"the twin is wrong where it matters: the last {n} episodes cost {relation} the twin says of them"
 
 
+def contradiction(withheld: float) -> str:
+    """What is wrong with a twin whose plan real episodes contradict, in plain words.
+
+    Args:
+        withheld: log of the ratio of costs on the twin by which it prefers the plan to the policy that stays.
+    """
+    return (
+        f"the twin is wrong where it matters: it says that a plan would cost 1/{math.exp(withheld):.3g} of the policy "
+        "that stays, and real episodes of its neighbours cost so much more than it said that the plan is refused"
+    )
+
+
 def twice(latest: Sequence[float]) -> bool:
     """Whether the last two differences are both beyond chance, to the same side."""
     before, now = latest[-2:]

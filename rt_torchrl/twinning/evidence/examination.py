@@ -12,8 +12,9 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.cloning import same_architecture
-from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE, QUIET, alarm
+from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE, EPISODES, MATTERS, QUIET, alarm, contradiction
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
+from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration, repeatable
 from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
@@ -37,7 +38,7 @@ class Examination:
 
     def __init__(self, track_record: TrackRecord, virtual: VirtualEpisodes):
         self.track_record, self.virtual = track_record, virtual
-        self.unexplained = 0.0
+        self.unexplained, self._repeated, self._said = 0.0, RepeatedExploration(), False
 
     @torch.no_grad()
     def examine(self) -> TensorDict:
@@ -50,16 +51,33 @@ class Examination:
         """
         found = self.track_record.differences(self.virtual)
         if not found.values:
-            self.unexplained = 0.0
+            self.unexplained, self._said = 0.0, False
             return findings()
         self.unexplained = unexplained(found.values[-1], found.exploration[-1])
-        quiet = [d for d, noise in zip(found.values, found.exploration, strict=True) if noise <= QUIET]
-        said = alarm(quiet)
+        said = alarm(self._comparable(found))
+        self._said = said is not None
         explained = self.virtual.twin.explanation()
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
         if len(self.track_record.latest_record.actions) >= LEAST:
             report = merged(report, findings(whiteness=self._white()))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
+
+    def _comparable(self, found: Differences) -> list[float]:
+        """Paired differences of the latest episodes in which luck cancels, oldest first.
+
+        That of an episode that explored is that with its exploration repeated, where the plant allows it.
+        """
+        values: list[float] = []
+        for policy, value, one in reversed(list(zip(found.policies, found.values, found.flown, strict=True))):
+            if len(values) == EPISODES:
+                break
+            if one.exploration <= QUIET:
+                values.append(value)
+            elif repeatable(self.virtual.twin.plant):
+                episode = self.virtual.repeated(one.trajectory)
+                predicted = self._repeated.cost(self.virtual.twin.believed, policy, one.trajectory, episode)
+                values.append(difference(one.cost, predicted))
+        return values[::-1]
 
     def _white(self) -> float:
         """Whiteness of what the replay of the latest real episode leaves over, by the likeliest twin."""
@@ -78,6 +96,19 @@ class Examination:
         if not assimilation.explain(self.unexplained, generator):
             return found
         return merged(findings(**assimilation.report()), self.examine())
+
+    def told(self, plan: TensorDict) -> TensorDict:
+        """The report of a plan, with the alarm where real episodes contradict what the twin would plan.
+
+        Args:
+            plan: report of step 5, in which ``withheld`` is the log of the ratio of costs on the twin by which it
+                prefers what was refused to the policy that stays.
+        """
+        withheld = float(plan.get("withheld", 0.0))
+        if withheld <= MATTERS or self._said:
+            return plan
+        said = f"{contradiction(withheld)}; {self.virtual.twin.explanation()}".rstrip("; ")
+        return plan.update(findings(alarm=1.0)).set_non_tensor("warning", said)
 
     @torch.no_grad()
     def replayed(self, records: Sequence[Trajectory]) -> float:
@@ -144,6 +175,10 @@ class RealJudge:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
         mean, deviation = self.belief(policy)
         return cost * math.exp(mean + 0.5 * deviation**2) if cost > 0.0 else cost
+
+    def median(self, policy: nn.Module, cost: float) -> float:
+        """The cost on the real system that is as likely exceeded as not."""
+        return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
 
     @torch.no_grad()
     def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:

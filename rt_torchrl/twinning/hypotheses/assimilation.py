@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -18,26 +20,30 @@ from rt_torchrl.twinning.exogenous import ExogenousProcess
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
+from rt_torchrl.twinning.hypotheses.reread import Reread, reread
 
 SEGMENTS = 60
 """Number of segments of an episode by default."""
 FIRST_ROUNDS = 3
-"""Rounds of the first fit; three take the inflow of a turbine from a misfit of 2000 to 2, one to 24."""
-SHORT_STEPS = 10
-"""Levenberg-Marquardt steps over segments in a round."""
+"""Greatest number of rounds of the first fit."""
+STEPS = 10
+"""Greatest number of Levenberg-Marquardt steps over segments in a round."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
+MORE = 3.0
+"""Ratio of misfits of two episodes beyond which one round has not been enough."""
 FAR = 10.0
 """Ratio of misfits beyond which a stage has gone astray."""
 
 
 class Fit:
-    """The fit of one hypothesis: rounds of steps over short segments, then over whole records; the best weights stay.
+    """The fit of one hypothesis: rounds of steps over segments, then over whole records; the best weights stay.
 
-    Over a whole record of a system that oscillates nearly every weight has local minima. Over segments (multiple
-    shooting) it has few, but weights that act slowly hardly show. The methods take turns, and each frees the other.
+    Over a whole record of a system that oscillates nearly every weight has local minima. Over segments that begin with
+    what was read (multiple shooting) it has few; the hidden states go on through all segments, with their derivatives.
+    Where some steps over segments have not arrived, the methods take turns, and each frees the other.
 
     Args:
         twin: twin of the hypothesis, whose closure is updated in place.
@@ -49,31 +55,51 @@ class Fit:
         self.twin, self.segment = twin, segment
         measured = dataclasses.replace(config, inputs="record")
         short = dataclasses.replace(
-            measured, method="levenberg_marquardt", initial="measured", segment=segment, iterations=SHORT_STEPS
+            measured,
+            method="levenberg_marquardt",
+            initial="measured",
+            segment=0,
+            stop_ratio=0.0,
+            iterations=STEPS,
         )
-        self.stages = {"short": Assimilation(twin, short), "whole": Assimilation(twin, measured)}
-        self.fitted, self.waiting, self.pause = False, 0, 1
+        self.stages = {
+            "short": Assimilation(twin.of(Reread(twin.plant)), short),
+            "whole": Assimilation(twin, measured),
+        }
+        self.least, self.waiting, self.pause = math.inf, 0, 1
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        """Fit the records, in more rounds the first time.
+        """Fit the records, in more rounds the first time, and where one round leaves more over than the last time.
 
         Returns:
             The misfit of the best weights, which the closure has then.
         """
-        closure = self.twin.closure
+        rounds = FIRST_ROUNDS if math.isinf(self.least) else 1
+        least = self._rounds(records, rounds, generator)
+        if rounds == 1 and not least < MORE * self.least:
+            least = self._rounds(records, FIRST_ROUNDS, generator)
+        self.least = least
+        return least
+
+    def _rounds(self, records: Sequence[Trajectory], count: int, generator: torch.Generator) -> float:
+        """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
+        plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
-        for stage in (1 if self.fitted else FIRST_ROUNDS) * list(self.stages.values()):
+        for name in count * list(self.stages):
             safe_point()
+            taken = [reread(r, plant, self.segment) if name == "short" else _started(r, plant) for r in records]
+            steps = STEPS
             # A twin that diverges on the way only loses the stage.
             with contextlib.suppress(FloatingPointError):
-                stage.update([with_hidden_states(self.twin, record) for record in records], (), 1, generator)
+                steps = self.stages[name].update(taken, (), 1, generator).iterations
             found = misfit(self.twin, records, self.segment)
             if found < least:
                 least, best = found, copy.deepcopy(closure.state_dict())
             elif not found < FAR * least:
                 closure.load_state_dict(best)
+            if name == "short" and steps < STEPS:
+                break
         closure.load_state_dict(best)
-        self.fitted = True
         return least
 
     def due(self) -> bool:
@@ -90,11 +116,11 @@ class Fit:
 
     def state_dict(self) -> dict[str, Any]:
         stages = {name: stage.state_dict() for name, stage in self.stages.items()}
-        counters = {"fitted": self.fitted, "waiting": self.waiting, "pause": self.pause}
+        counters = {"least": self.least, "waiting": self.waiting, "pause": self.pause}
         return counters | {"closure": self.twin.closure.state_dict(), **stages}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.fitted, self.waiting, self.pause = state["fitted"], state["waiting"], state["pause"]
+        self.least, self.waiting, self.pause = state["least"], state["waiting"], state["pause"]
         self.twin.closure.load_state_dict(state["closure"])
         for name, stage in self.stages.items():
             stage.load_state_dict(state[name])
@@ -187,12 +213,17 @@ class EnsembleAssimilation(Assimilation):
         self.called = state["called"]
 
 
+def _started(record: Trajectory, plant: Plant) -> Trajectory:
+    """The record with the hidden states of a plant at rest, of which a replay takes those of the start."""
+    return record._replace(states=plant.at_rest(record.states))
+
+
 @torch.no_grad()
 def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> float:
     """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
-    stacked = batch_of([with_hidden_states(twin, record) for record in records])
-    measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
     try:
+        stacked = batch_of([with_hidden_states(twin, record) for record in records])
+        measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
         flown = twin.replay(measured[:, 0], exogenous, actions, start=start)
     except DivergenceError:
         return float("inf")

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
-from rt_torchrl.trajectories.rollout import drive_of
+from rt_torchrl.trajectories.rollout import drive_of, require_finite
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -26,6 +26,9 @@ def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
 
     The hidden states are at rest at the start. Errors of the twin do not build up in them, because every interval
     begins with what was read.
+
+    Raises:
+        DivergenceError: if the hidden states diverge all the same.
     """
     plant, read = twin.plant, record.states
     start = plant.at_rest(read[:1])
@@ -33,5 +36,6 @@ def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
         return record
     drive = drive_of(plant, record.exogenous[None], torch.cat([record.actions, read[:-1]], -1)[None])
     ends = Native(compiled=False).end_states(ReadInterval(plant, twin.closure, None), start, drive)[:, 0]
+    require_finite(plant, ends.unsqueeze(1), start, [twin.closure])
     states = torch.cat([start, ends])
     return record._replace(states=torch.cat([read, states[:, read.shape[-1] :]], -1))

@@ -62,7 +62,11 @@ class Lesson:
             part["slope"], part["slope_weight"] = torch.zeros_like(part["action"]), torch.zeros_like(part["weight"])
         first = max(0, len(memory) - own.actor_episodes)
         for part, episode in zip(parts[first : len(memory)], list(memory.episodes)[first:], strict=True):
-            slope = teacher.decision_slopes(episode, part["place"], reward_scale)
+            try:
+                slope = teacher.decision_slopes(episode, part["place"], reward_scale)
+            except DivergenceError as error:
+                self.refused.append(f"no slopes: {error}")
+                continue
             if slope.isfinite().all():
                 part["slope"], part["slope_weight"] = slope, torch.full_like(part["weight"], learner.trust)
             else:
