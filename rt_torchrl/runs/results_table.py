@@ -5,12 +5,11 @@ from typing import Any
 
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
+from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 
 SCREEN = 24
 """Lines of a terminal that need no scrolling."""
 LEAST_WEIGHTS = 4
-SIGNIFICANT = 0.01
-"""Probability below which what a replay leaves over is no white noise."""
 
 
 def progress(record: dict[str, Any]) -> str:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from rt_torchrl.runs.results_table import SIGNIFICANT
 from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.results import Entry, arm_entry
 from rt_torchrl.study.training import Training
+from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 
 MATTERS = 0.1
 """Gap over the oracle from which an alarm is missed if it does not rise."""

@@ -8,6 +8,8 @@ LAGS = 20
 """Greatest number of lags whose correlations count."""
 LEAST = 10
 """Least number of samples of which correlations say anything."""
+SIGNIFICANT = 0.01
+"""Probability below which what a replay leaves over is no white noise."""
 NOTHING = 1e-6
 """Residual, as a share of a signal's own deviation, below which nothing is left over but rounding."""
 
