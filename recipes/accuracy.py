@@ -2,7 +2,9 @@
 
 import copy
 import statistics
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -45,6 +47,8 @@ GROUPS = 5
 """Number of groups of other episodes of the trained policy, each of as many as a twin has seen."""
 OTHER_SEED = 3_000_000
 """Seed of these episodes."""
+Misfit = Callable[[nn.Module, Trajectory], float]
+"""J_p of a law on episodes."""
 MEANINGS = {
     "records": "the twin on its records",
     "unseen": "the twin on unseen episodes of the policy",
@@ -126,31 +130,33 @@ def over_best(training: Training, unseen: int) -> OverBest:
     memory = ShortTermMemory(count)
     memory.load_state_dict(load_tensors(training.folder / NAME)["state"]["algorithm"]["short_term"])
     policy, seen = run.policies["model_based"], batch_of(memory)
-    flown = UnseenEpisodes(run.plant, unseen).fly(policy)
+    episodes = UnseenEpisodes(run.plant, unseen)
+    flown, misfit = episodes.fly(policy), partial(misfit_of, episodes, run)
     others = UnseenEpisodes(run.plant, GROUPS * count, seed=OTHER_SEED).fly(policy)
-    best = best_law(run, flown, [run.closure, run.initial_closure])
-    best_seen = best_law(run, seen, [run.closure, run.initial_closure, best])
+    best_law = partial(best_of, run, misfit)
+    best = best_law(flown, [run.closure, run.initial_closure])
+    best_seen = best_law(seen, [run.closure, run.initial_closure, best])
     groups = [others.each()[k * count : (k + 1) * count] for k in range(GROUPS)]
-    allowed = [misfit(run, best_law(run, batch_of(group), [best]), flown) for group in groups]
-    least = misfit(run, best, flown)
+    allowed = [misfit(best_law(batch_of(group), [best]), flown) for group in groups]
+    least = misfit(best, flown)
     return OverBest(
-        misfit(run, run.closure, seen) / misfit(run, best_seen, seen) - 1.0,
-        misfit(run, run.closure, flown) / least - 1.0,
+        misfit(run.closure, seen) / misfit(best_seen, seen) - 1.0,
+        misfit(run.closure, flown) / least - 1.0,
         statistics.median(allowed) / least - 1.0,
     )
 
 
-def best_law(run: LoadedRun, flown: Trajectory, starts: list[nn.Module]) -> nn.Module:
+def best_of(run: LoadedRun, misfit: Misfit, flown: Trajectory, starts: list[nn.Module]) -> nn.Module:
     """The law with the least J_p on episodes among those that are found from several first laws."""
     found = [copy.deepcopy(start).requires_grad_(True) for start in starts]
     for law in found:
         Assimilation(DigitalTwin(run.physics, law), TO_THE_END).update(flown.each(), [], 1, torch.Generator())
-    return min(found, key=lambda law: misfit(run, law, flown))
+    return min(found, key=lambda law: misfit(law, flown))
 
 
-def misfit(run: LoadedRun, law: nn.Module, flown: Trajectory) -> float:
-    """J_p of a law, the mean over episodes."""
-    return UnseenEpisodes(run.plant, 2).identification_costs(run.physics, law, flown).mean().item()
+def misfit_of(episodes: UnseenEpisodes, run: LoadedRun, law: nn.Module, flown: Trajectory) -> float:
+    """J_p of a law, the mean over episodes as flown."""
+    return episodes.identification_costs(run.physics, law, flown).mean().item()
 
 
 def main(config: Config) -> None:

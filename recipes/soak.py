@@ -130,10 +130,14 @@ def summary(rounds: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     return found
 
 
-def logged(faults: list[dict[str, float | str]], log: Path) -> int:
-    """Number of lost connections of whose time the log has an event; the last one may have come after the last step."""
+def times_of(log: Path) -> np.ndarray:
+    """Times of the events in the log of a safety layer [s]."""
     text = log.read_text(encoding="utf-8") if log.is_file() else ""
-    times = np.array([json.loads(line)["at"] for line in text.splitlines()])
+    return np.array([json.loads(line)["at"] for line in text.splitlines()])
+
+
+def logged(faults: list[dict[str, float | str]], times: np.ndarray) -> int:
+    """Number of lost connections of whose time there is an event; the last one may have come after the last step."""
     return sum(bool(((times >= each["at"]) & (times <= each["at"] + each["seconds"] + SEEN)).any()) for each in faults)
 
 
@@ -210,10 +214,10 @@ def mean_cost(costs: Sequence[float]) -> dict[str, float]:
 
 def write(config: Config, rounds, refused: list[str], faults, log: Path, unseen: list[float]) -> None:
     """Write the results, and say the most important ones."""
-    events = sum(1 for _ in log.open(encoding="utf-8")) if log.is_file() else 0
     if not rounds:
         raise ValueError(f"hours={config.hours} h are too short for one round of the learner; give more.")
-    seen = logged(faults, log)
+    times = times_of(log)
+    seen = logged(faults, times)
     # A window of operation may have begun one round before; a whole one is told by its neighbour, too.
     pairs = zip([rounds[0], *rounds[:-1]], rounds, strict=True)
     whole = [each for before, each in pairs if not each["lost_connections"] + before["lost_connections"]]
@@ -225,7 +229,7 @@ def write(config: Config, rounds, refused: list[str], faults, log: Path, unseen:
         "faults": faults,
         "faults_logged": seen,
         "refused": refused,
-        "safety_events": events,
+        "safety_events": len(times),
         "windows": sum(each["windows"] for each in rounds),
         "cost": costs,
         "rounds": rounds,

@@ -195,6 +195,18 @@ def test_weights_are_recalled_that_are_expected_to_cost_less():
     assert judge_of([], []).recalled(LinearGain([[2.0, 0.0]]), episodes) is None
 
 
+def report_costs(found, factor):
+    """Let the real system report its costs multiplied by a factor."""
+    fly = found.flights.fly
+
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
+        flight.transitions["next", "reward"] *= factor
+        return flight
+
+    found.flights.fly = flown
+
+
 @pytest.mark.parametrize("corrected", [False, True])
 def test_a_training_goes_back_to_what_was_better_in_reality(corrected):
     """The twin's plans cost ten times as much on the real system, which the paired differences show."""
@@ -292,14 +304,7 @@ def test_the_alarm_needs_no_quiet_episodes(factor):
     plant = LinearQuadratic(horizon=2.0)
     loud = ExplorationConfig(spread=0.2, least=1.0)
     found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=loud)
-    fly = found.flights.fly
-
-    def flown(policy, *, strength, whole):
-        flight = fly(policy, strength=strength, whole=whole)
-        flight.transitions["next", "reward"] *= factor
-        return flight
-
-    found.flights.fly = flown
+    report_costs(found, factor)
     raised = []
     for _ in range(2):
         found.interact()
@@ -315,14 +320,7 @@ def test_plans_are_corrected_where_a_real_episode_contradicts_the_twin(factor, c
     plant = LinearQuadratic(horizon=2.0)
     quiet = ExplorationConfig(spread=0.0)
     found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=quiet)
-    fly = found.flights.fly
-
-    def flown(policy, *, strength, whole):
-        flight = fly(policy, strength=strength, whole=whole)
-        flight.transitions["next", "reward"] *= factor
-        return flight
-
-    found.flights.fly = flown
+    report_costs(found, factor)
     found.interact()
     assert (found.examination.correction(found.short_term[-1]) is not None) == corrects
 
@@ -337,14 +335,7 @@ def test_the_learner_trusts_the_twin_as_far_as_it_was_right(factor):
     found = twinning(
         plant, closure=copy.deepcopy(plant.closure), learner=learner, exploration=ExplorationConfig(spread=0.0)
     )
-    fly = found.flights.fly
-
-    def flown(policy, *, strength, whole):
-        flight = fly(policy, strength=strength, whole=whole)
-        flight.transitions["next", "reward"] *= factor
-        return flight
-
-    found.flights.fly = flown
+    report_costs(found, factor)
     trusts = [found.episode()["trust"].item() for _ in range(3)]
     assert found.learner.trust == trusts[-1]
     assert trusts[-1] > 0.8 if factor == 1.0 else trusts[-1] < 0.01

@@ -9,10 +9,12 @@ from torch import nn
 from rt_torchrl import check_plant
 from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
+from rt_torchrl.plants.extensions.extension import Extension
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
 from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
 from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -196,3 +198,12 @@ class Stepping(LinearQuadratic):
 def test_what_cannot_be_extended_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_hidden_states_need_a_start():
+    class Startless(Extension):
+        pass
+
+    with pytest.raises(TypeError, match=r"Startless has hidden states.*rest\(\)"):
+        Startless(LinearQuadratic(), [Signal(symbol="x", name="hidden", unit="-")])
+    assert Startless(LinearQuadratic(), []).at_rest(torch.ones(1, 2).double()).tolist() == [[1.0, 1.0]]

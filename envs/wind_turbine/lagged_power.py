@@ -51,7 +51,7 @@ class LaggedPower(Extension):
         base, hidden = self.split(state)
         plant, inner, u = self.base, self.of_base(closure), exogenous[..., 0]
         # The floor is that of the torque, where the rotor hardly turns.
-        speed = torch.maximum(base[..., 0], 0.5 * plant.standstill_tip_speed_ratio * u / plant.radius)
+        speed = torch.maximum(base[..., 0], plant.least_tip_speed_ratio * u / plant.radius)
         torque = plant.aerodynamic_torque(base[..., 0], action[..., 1], u, inner)
         missing = hidden[..., 0] * MEGA / speed - torque
         field = plant.vector_field(t, base, action, exogenous, inner)

@@ -51,9 +51,6 @@ class MisreadWind(Extension):
         field = self.base.vector_field(t, state, action, replaced(exogenous, 0, true), closure)
         return replaced(field, 2, field[..., 2] + self.cutoff * (read - true))
 
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 0"]:
-        return base[..., :0]
-
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
         """The filtered wind speed starts at what the anemometer reads of the mean wind."""
         state = self.base.draw_initial_state(batch, generator)

@@ -188,6 +188,11 @@ class WindTurbine(Plant):
         # The fast filter is the seventh state, or there is none.
         return torch.cat([rates, sensors.FAST_FILTER * (omega_g.unsqueeze(-1) - state[..., 6:])], -1)
 
+    @property
+    def least_tip_speed_ratio(self) -> float:
+        """λ below which the torque divides by this one [-]; it has faded there."""
+        return 0.5 * self.standstill_tip_speed_ratio
+
     def aerodynamic_torque(self, omega_r: Tensor, beta: Tensor, u: Tensor, closure: nn.Module) -> Tensor:
         r"""Torque τ_a = ½ρπR³(C_p/λ)u² [N m], which fades to zero over λ < 1 (standstill), where no closure is defined.
 
@@ -195,7 +200,7 @@ class WindTurbine(Plant):
         """
         lam = omega_r * self.radius / u
         fade = smoothstep(lam / self.standstill_tip_speed_ratio)
-        lam = torch.where(lam > 0.5 * self.standstill_tip_speed_ratio, lam, 0.5 * self.standstill_tip_speed_ratio)
+        lam = torch.where(lam > self.least_tip_speed_ratio, lam, self.least_tip_speed_ratio)
         C_p = closure(torch.stack(torch.broadcast_tensors(lam, beta), -1)).squeeze(-1)
         return 0.5 * self.air_density * math.pi * self.radius**3 * fade * C_p / lam * u**2
 

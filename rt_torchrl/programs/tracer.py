@@ -239,7 +239,7 @@ class Tracer(TorchDispatchMode):
         if all(self.uniform_number(o) is None for o in operands):
             return None
         rows = list(zip(*(o.flatten().tolist() for o in operands), strict=True))
-        for k, cells in enumerate(operands):  # of each element, because 0/x is its operand where 0/x is not one
+        for k, cells in enumerate(operands):  # of each element: 0/4 is its operand 0, and x/4 is not x
             if all(ELEMENTWISE[name](self.program, *row) == row[k] for row in rows):
                 return cells
         return None

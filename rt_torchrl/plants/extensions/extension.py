@@ -78,6 +78,8 @@ class Extension(Plant):
                 f"plant {base.name!r} overrides step(), so that nothing can act between its actuators and its system; "
                 "override actuate(), advance() and latch() instead."
             )
+        if hidden and type(self).rest is Extension.rest:
+            raise TypeError(f"{type(self).__name__} has hidden states, and must say by rest() where they begin.")
         twice = {signal.name for signal in base.states} & {signal.name for signal in hidden}
         if twice:
             raise ValueError(f"plant {base.name!r} already has the states {', '.join(sorted(twice))}.")
@@ -121,9 +123,9 @@ class Extension(Plant):
         """The inputs that act on the plant in an interval; by default those that sensors read."""
         return exogenous
 
-    @abstractmethod
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n_x"]:
-        """The hidden states at the start of an episode, from the states of the plant."""
+        """The hidden states at the start of an episode, from the states of the plant; by default there are none."""
+        return base[..., :0]
 
     # The system
 

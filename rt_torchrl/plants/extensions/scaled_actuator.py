@@ -39,6 +39,3 @@ class ScaledActuator(Extension):
         self, hidden: Float[Tensor, "*batch 0"], applied: Float[Tensor, "*batch n_a"]
     ) -> Float[Tensor, "*batch n_a"]:
         return replaced(applied, self.place, self.gain * applied[..., self.place])
-
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 0"]:
-        return base[..., :0]

@@ -65,6 +65,3 @@ class ScaledCoefficients(Extension):
         closure: nn.Module,
     ) -> Float[Tensor, "*batch n_s"]:
         return self.base.advance(t, state, applied, exogenous, _Scaled(closure, self.gain))
-
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 0"]:
-        return base[..., :0]

@@ -9,6 +9,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.systems.ended_process import end_process
 from rt_torchrl.systems.operation.acting import STOP, Crew, act
 from rt_torchrl.systems.operation.cores import chosen_core, learn_beside, require_realtime, run_on
 from rt_torchrl.systems.operation.event_log import EventLog
@@ -170,10 +171,7 @@ class ProcessOperation:
                 self._connection.recv_bytes()  # windows that nobody takes would keep it from ending
         except (EOFError, OSError):
             pass
-        self._process.join(END)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        end_process(self._process, END)
         self._connection.close()
         self._process = self._connection = None
         run_on(self._before)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.systems.ended_process import end_process
 from rt_torchrl.systems.protocols.plant_server import BOARDS, serve
 from rt_torchrl.systems.protocols.served_plant import ServedPlant
 
@@ -67,10 +68,7 @@ class ServerProcess:
 
     def __exit__(self, *raised: object) -> None:
         self._ended.set()
-        self._process.join(END)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        end_process(self._process, END)
 
 
 def run_server(arguments: bytes, started: Any, ended: Any) -> None:

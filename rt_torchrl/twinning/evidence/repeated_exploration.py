@@ -33,9 +33,6 @@ class Nudged(Extension):
     ) -> Float[Tensor, "*#batch n_b"]:
         return exogenous[..., : self._read]
 
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 0"]:
-        return base[..., :0]
-
     def observe(
         self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch n_s"], exogenous: Float[Tensor, "*#batch n_z"]
     ) -> Float[Tensor, "*batch n_o"]:

@@ -11,7 +11,6 @@ import torch
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -20,7 +19,7 @@ from rt_torchrl.twinning.exogenous import ExogenousProcess
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
-from rt_torchrl.twinning.hypotheses.reread import Reread, reread
+from rt_torchrl.twinning.hypotheses.reread import Reread, at_rest, reread
 
 SEGMENTS = 60
 """Number of segments of an episode by default."""
@@ -85,13 +84,14 @@ class Fit:
         """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
+        taken = {"short": [reread(record, plant, self.segment) for record in records]}
+        taken["whole"] = [at_rest(record, plant) for record in records]
         for name in count * list(self.stages):
             safe_point()
-            taken = [reread(r, plant, self.segment) if name == "short" else _started(r, plant) for r in records]
             steps = STEPS
             # A twin that diverges on the way only loses the stage.
             with contextlib.suppress(FloatingPointError):
-                steps = self.stages[name].update(taken, (), 1, generator).iterations
+                steps = self.stages[name].update(taken[name], (), 1, generator).iterations
             found = misfit(self.twin, records, self.segment)
             if found < least:
                 least, best = found, copy.deepcopy(closure.state_dict())
@@ -211,11 +211,6 @@ class EnsembleAssimilation(Assimilation):
             fit.load_state_dict(state["fits"][name])
         self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
         self.called = state["called"]
-
-
-def _started(record: Trajectory, plant: Plant) -> Trajectory:
-    """The record with the hidden states of a plant at rest, of which a replay takes those of the start."""
-    return record._replace(states=plant.at_rest(record.states))
 
 
 @torch.no_grad()

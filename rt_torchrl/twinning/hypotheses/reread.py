@@ -26,9 +26,6 @@ class Reread(Extension):
         readings = [Signal(symbol=s.symbol, name=f"read_{s.name}", unit=s.unit) for s in base.readings]
         self.inputs = (*base.inputs, *readings, Signal(symbol="r", name="is_read", unit="-"))
 
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 0"]:
-        return base[..., :0]
-
     def step(
         self,
         t: Float[Tensor, "*#batch"],
@@ -55,4 +52,9 @@ def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
     read = record.states[:-1]
     flag = torch.zeros_like(read[:, :1])
     flag[::segment] = 1.0
-    return record._replace(states=plant.at_rest(record.states), exogenous=torch.cat([record.exogenous, read, flag], -1))
+    return at_rest(record, plant)._replace(exogenous=torch.cat([record.exogenous, read, flag], -1))
+
+
+def at_rest(record: Trajectory, plant: Plant) -> Trajectory:
+    """A record with the hidden states of a plant at rest, of which a replay takes those of the start."""
+    return record._replace(states=plant.at_rest(record.states))
