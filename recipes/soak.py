@@ -76,7 +76,7 @@ class Config:
 
 
 class Faults:
-    """Lost connections at random times: half of them are cut, half are silent.
+    """Lost connections at random times from :meth:`begin` on: half of them are cut, half are silent.
 
     Args:
         relay: relay that loses them.
@@ -87,7 +87,7 @@ class Faults:
     def __init__(self, relay, mean: float, seed: int):
         self._relay, self._mean, self._draws = relay, mean, np.random.default_rng(seed)
         self.done: list[dict[str, float | str]] = []
-        self._ended = threading.Event()
+        self._begun, self._ended = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> "Faults":
@@ -95,12 +95,18 @@ class Faults:
             self._thread.start()
         return self
 
+    def begin(self) -> None:
+        """Lose connections from now on: before the system operates, there is none that the log could miss."""
+        self._begun.set()
+
     def __exit__(self, *raised: object) -> None:
         self._ended.set()
+        self._begun.set()
         if self._mean:
             self._thread.join()
 
     def _run(self) -> None:
+        self._begun.wait()
         while not self._ended.wait(self._draws.exponential(self._mean)):
             kind, seconds = str(self._draws.choice(["cut", "stall"])), float(self._draws.uniform(0.1, 2.0))
             self.done.append({"at": time.time(), "kind": kind, "seconds": seconds})
@@ -142,7 +148,7 @@ def logged(faults: list[dict[str, float | str]], times: np.ndarray) -> int:
 
 
 def operate(
-    config: Config, algorithm, pids: dict[str, int], until: float, lost: Sequence[object]
+    config: Config, algorithm, pids: dict[str, int], until: float, faults: Faults
 ) -> tuple[list[dict[str, float]], list[str]]:
     """Rounds of the learner until a time, and the reasons of those in which nothing could be learned."""
     rounds, refused, before = [], [], 0
@@ -154,7 +160,8 @@ def operate(
             continue
         pids = pids | {"acting": algorithm.operating.operation.pid}
         found = {"real_cost": report["real_cost"].item(), "windows": report["windows"].item()}
-        found["lost_connections"], before = len(lost) - before, len(lost)
+        faults.begin()
+        found["lost_connections"], before = len(faults.done) - before, len(faults.done)
         for process, pid in pids.items():
             found[f"{process}_MiB"], found[f"{process}_handles"] = usage(pid)
         rounds.append(found | {"left": until - time.monotonic()})
@@ -190,7 +197,7 @@ def main(config: Config) -> None:
             with Faults(relay, config.faults, config.seed) as faults:
                 until = time.monotonic() + 3600.0 * config.hours
                 pids = {"learner": os.getpid(), "server": server.pid, "relay": relay.pid}
-                rounds, refused = operate(config, run.algorithm, pids, until, faults.done)
+                rounds, refused = operate(config, run.algorithm, pids, until, faults)
         finally:
             run.algorithm.operating.operation.close()
     write(config, rounds, refused, faults.done, log, unseen_costs(run))
