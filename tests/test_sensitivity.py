@@ -1,5 +1,7 @@
 """Forward sensitivities and Levenberg-Marquardt against backpropagation and known minima."""
 
+from collections import OrderedDict
+
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
@@ -9,12 +11,13 @@ from rt_torchrl import shipped_plants
 from rt_torchrl.contract.calls import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
-from rt_torchrl.trajectories.engines import linearisation
+from rt_torchrl.trajectories.engines import linearisation, programs, traced_interval
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.hypotheses.choice import extended
 
 
 def recorded(plant, batch=3, seed=0):
@@ -56,6 +59,27 @@ def test_they_are_machine_code_on_every_plant(kind, monkeypatch):
         torch.testing.assert_close(twin.sensitivities(*given)[1], whole[..., first.numel() :])
     first.requires_grad_(True)
     torch.testing.assert_close(twin.sensitivities(*given)[1], whole)
+
+
+def test_tangents_leave_out_what_is_known_to_be_zero(monkeypatch):
+    """By n_w weights they take n_w times the operators of the states alone; in loops over long rows it is 27 times."""
+    suspect = WindTurbine(horizon=2.0).suspects()["inflow, pitch lag, late by 2"]
+    counts, text = list[int](), traced_interval.march_text
+
+    def counted(program, *rest):
+        counts.append(len(program.operations))
+        return text(program, *rest)
+
+    monkeypatch.setattr(traced_interval, "march_text", counted)
+    monkeypatch.setattr(programs, "_kept", OrderedDict())  # programs of other tests
+    closure = extended(suspect, WindTurbine().make_closure(torch.Generator()))
+    generator = torch.Generator().manual_seed(0)
+    given = suspect.draw_initial_state(2, generator), suspect.draw_exogenous(2, generator)
+    actions = random_commands(suspect, (2, suspect.n_steps), generator)
+    DigitalTwin(suspect, closure).replay(given[0], given[1], actions)
+    Sensitivities(suspect, closure)(*given, actions)
+    states, tangents = counts
+    assert tangents < sum(w.numel() for w in closure.parameters()) * states
 
 
 class Stiffness(nn.Module):

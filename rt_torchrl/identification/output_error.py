@@ -186,9 +186,14 @@ def discrepancy_derivatives(
     plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
 ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
     """Gradient and Hessian of L_p by the state, in every sample."""
-    pointwise = torch.func.vmap(torch.func.vmap(torch.func.grad(plant.discrepancy)))
-    curvature = torch.func.vmap(torch.func.vmap(torch.func.hessian(plant.discrepancy)))
-    return pointwise(states, measured), curvature(states, measured)
+
+    def gradient(state: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
+        found = torch.func.grad(plant.discrepancy)(state, reading)
+        return found, found
+
+    samples = torch.func.vmap(torch.func.jacrev(gradient, has_aux=True))
+    curvature, slope = samples(states.flatten(0, 1), measured.flatten(0, 1))
+    return slope.unflatten(0, states.shape[:2]), curvature.unflatten(0, states.shape[:2])
 
 
 def compared(curvature: Float[Tensor, "batch n n_s n_s"]) -> Bool[Tensor, " n_s"]:

@@ -143,6 +143,6 @@ RULES: dict[str, Rule] = {
 }
 
 
-def new_tracer() -> Tracer:
+def new_tracer(straight: int = STRAIGHT) -> Tracer:
     """A tracer with all translations."""
-    return Tracer(RULES)
+    return Tracer(RULES, straight)

@@ -18,7 +18,7 @@ from rt_torchrl.programs.places import Places
 from rt_torchrl.programs.program import Access, Program, UntraceableError
 
 STRAIGHT = 24
-"""Greatest number of elements of a row that becomes straight-line code; a longer one becomes a loop."""
+"""Greatest number of elements of a row that becomes straight-line code, unless a tracer is told another one."""
 DECISIONS = frozenset({"_local_scalar_dense", "is_nonzero", "equal", "nonzero"})
 """Operators by which Python takes a number or a branch from a tensor."""
 FILLS = frozenset(
@@ -39,14 +39,15 @@ class Tracer(TorchDispatchMode):
 
     Args:
         rules: operators that do not act elementwise, by name.
+        straight: greatest number of elements of a row that becomes straight-line code; a longer one becomes a loop.
     """
 
     supports_higher_order_operators = True  # to refuse them with a message
 
-    def __init__(self, rules: dict[str, Rule]):
+    def __init__(self, rules: dict[str, Rule], straight: int):
         super().__init__()
         self.program = Program()
-        self.places = Places()
+        self.places, self.straight = Places(), straight
         elementwise = {name: partial(Tracer._elementwise, name=name) for name in ELEMENTWISE}
         self._rules: dict[str, Rule] = {**dict.fromkeys(FILLS, Tracer._filled), **elementwise, **rules}
         self._cells: dict[int, Tensor] = {}
@@ -218,7 +219,7 @@ class Tracer(TorchDispatchMode):
         shape, p = tuple(shape), self.program
         spread = [o.expand(shape) for o in operands]
         values = {i for o in spread for i in o.flatten().tolist()}
-        long = math.prod(shape) > STRAIGHT and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
+        long = math.prod(shape) > self.straight and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
         if not long or all(p.number(i) is not None for i in values):
             rows = zip(*(o.flatten().tolist() for o in spread), strict=True)
             return in_shape([ELEMENTWISE[name](p, *row) for row in rows], shape)

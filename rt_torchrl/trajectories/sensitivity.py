@@ -34,6 +34,9 @@ class TangentInterval(nn.Module):
             ask for no gradients.
     """
 
+    straight = 400
+    """Rows of Jacobians are long but mostly zero, which straight-line code leaves out and loops do not."""
+
     def __init__(self, interval: Interval, names: tuple[str, ...]):
         super().__init__()
         self.interval, self.names = interval, names

@@ -14,7 +14,7 @@ from rt_torchrl.programs.machine_code import march_text, sweep_text
 from rt_torchrl.programs.object_code import ObjectCode
 from rt_torchrl.programs.operators import new_tracer
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.programs.tracer import Tracer
+from rt_torchrl.programs.tracer import STRAIGHT, Tracer
 from rt_torchrl.programs.vector_functions import Lanes
 from rt_torchrl.trajectories.engines.groups import Group
 from rt_torchrl.trajectories.engines.interval import Drive, with_weights
@@ -49,7 +49,7 @@ class Programs:
     :mod:`rt_torchrl.programs.machine_code` describes both functions.
 
     Args:
-        interval: the map Φ.
+        interval: the map Φ; its attribute ``straight``, if it has one, is that of the :class:`Tracer`.
         point: a point at which it is traced, and compared with torch.
         lanes: lanes of the processor.
 
@@ -61,7 +61,7 @@ class Programs:
         self.point, self.lanes = point, lanes
         self.sweeps: dict[bool, ObjectCode] = {}
         """The reverse sweeps that have been prepared, without and with the gradients by the drive."""
-        tracer = new_tracer()
+        tracer = new_tracer(getattr(interval, "straight", STRAIGHT))
         state, drive, weights = _traced_inputs(tracer, interval, point)
         with torch.no_grad(), Escapes(tracer), tracer:
             end = with_weights(interval, weights, state, drive)
