@@ -403,7 +403,7 @@ def test_a_transition_beyond_an_episode_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change", [{"critics": 0}, {"virtual": -1}, {"trust": 1.1}, {"recovery": 1.0}, {"trust_region": 0.0}]
+    "change", [{"critics": 1}, {"virtual": -1}, {"trust": 1.1}, {"recovery": 1.0}, {"trust_region": 0.0}]
 )
 def test_wrong_parameters_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):

@@ -64,7 +64,7 @@ class IncrementalTD3Config:
     """Parameters of incremental TD3 that the other learners do not have.
 
     Args:
-        critics: number of critics, of whose targets the least counts.
+        critics: number of critics, at least two, of whose targets the least counts.
         delay: number of critic iterations for each iteration of the policy and of the targets.
         decisions: number of decisions in the time 1/(1 − γ); a decision lasts as many control intervals as fit.
         actor_episodes: number of latest real episodes in whose states the policy is improved.
@@ -106,12 +106,10 @@ class IncrementalTD3Config:
 
     def __post_init__(self) -> None:
         check_options(self, infinite=("cooling", "trust_region", "recovery"))
-        for argument in ("critics", "delay", "decisions", "actor_episodes", "episodes"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} of incremental TD3 must be at least 1.")
-        for argument in ("return_episodes", "virtual"):
-            if getattr(self, argument) < 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of incremental TD3 must not be negative.")
+        least = {"critics": 2, "delay": 1, "decisions": 1, "actor_episodes": 1, "episodes": 1}
+        for argument, lowest in (least | {"return_episodes": 0, "virtual": 0}).items():
+            if getattr(self, argument) < lowest:
+                raise ValueError(f"{argument}={getattr(self, argument)} of incremental TD3 must be at least {lowest}.")
         for argument in ("actor_rate", "cooling", "trust_region", "settled"):
             if not getattr(self, argument) > 0.0:
                 raise ValueError(f"{argument}={getattr(self, argument)} of incremental TD3 must be positive.")
