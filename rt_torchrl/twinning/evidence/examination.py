@@ -18,7 +18,7 @@ from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploratio
 from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
-from rt_torchrl.twinning.track_record import Differences, TrackRecord, shares
+from rt_torchrl.twinning.track_record import Differences, Flown, TrackRecord, shares
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 RECALLED_BELOW = 0.98
@@ -28,8 +28,8 @@ RECALLED_BELOW = 0.98
 class Examination:
     """Compares what real episodes cost with what the twin says of them.
 
-    The attribute ``unexplained`` is the paired difference of the latest episode beyond two standard deviations of what
-    its exploration explains.
+    The attribute ``unexplained`` is the size of the paired difference of the latest episode with its exploration
+    repeated or, where the plant does not allow that, beyond two standard deviations of what exploration explains.
 
     Args:
         track_record: the real episodes.
@@ -53,8 +53,10 @@ class Examination:
         if not found.values:
             self.unexplained, self._said = 0.0, False
             return findings()
-        self.unexplained = unexplained(found.values[-1], found.exploration[-1])
-        said = alarm(self._comparable(found))
+        *earlier, latest = zip(found.policies, found.values, found.flown, strict=True)
+        now = self._without_luck(*latest)
+        self.unexplained = unexplained(found.values[-1], found.exploration[-1]) if now is None else abs(now)
+        said = alarm([*self._comparable(earlier), *([] if now is None else [now])])
         self._said = said is not None
         explained = self.virtual.twin.explanation()
         report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
@@ -62,22 +64,25 @@ class Examination:
             report = merged(report, findings(whiteness=self._white()))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
 
-    def _comparable(self, found: Differences) -> list[float]:
-        """Paired differences of the latest episodes in which luck cancels, oldest first.
+    def _comparable(self, earlier: Sequence[tuple[nn.Module, float, Flown]]) -> list[float]:
+        """Paired differences of the latest earlier episodes in which luck cancels, oldest first."""
+        values: list[float] = []
+        for flown in reversed(earlier):
+            value = self._without_luck(*flown) if len(values) < EPISODES else None
+            values += [] if value is None else [value]
+        return values[::-1]
+
+    def _without_luck(self, policy: nn.Module, value: float, one: Flown) -> float | None:
+        """The paired difference of an episode in which luck cancels; None if it does not.
 
         That of an episode that explored is that with its exploration repeated, where the plant allows it.
         """
-        values: list[float] = []
-        for policy, value, one in reversed(list(zip(found.policies, found.values, found.flown, strict=True))):
-            if len(values) == EPISODES:
-                break
-            if one.exploration <= QUIET:
-                values.append(value)
-            elif repeatable(self.virtual.twin.plant):
-                episode = self.virtual.repeated(one.trajectory)
-                predicted = self._repeated.cost(self.virtual.twin.believed, policy, one.trajectory, episode)
-                values.append(difference(one.cost, predicted))
-        return values[::-1]
+        if one.exploration <= QUIET:
+            return value
+        if not repeatable(self.virtual.twin.plant):
+            return None
+        episode = self.virtual.repeated(one.trajectory)
+        return difference(one.cost, self._repeated.cost(self.virtual.twin.believed, policy, one.trajectory, episode))
 
     def _white(self) -> float:
         """Whiteness of what the replay of the latest real episode leaves over, by the likeliest twin."""
