@@ -207,9 +207,9 @@ def _rebuilt(
     """The configuration and the plant that a run's settings describe; a given plant is taken as it is."""
     if plant is None and not issubclass(config_class, MakesPlant):
         raise ValueError(
-            f"{config_class.__qualname__} has no method plant() that makes the plant from its options; give load_run the "
-            "plant, load_run(folder, plant=...), or train with a Config that has such a method, as docs/own_plant.md "
-            "shows."
+            f"{config_class.__qualname__} has no method plant() that makes the plant from its options; either "
+            "give load_run the plant, load_run(folder, plant=...), or train with a Config that has such a method, as "
+            "docs/own_plant.md shows."
         )
     options = {key: value for key, value in settings.items() if key not in BESIDE}
     try:

@@ -264,12 +264,13 @@ class RunConfig:
         return dataclasses.replace(twinning, exploration=exploration, judged_updates=True)
 
     def defaults(self) -> "RunConfig":
-        """The defaults of all options, given the closure and the sensors that the options ask for.
+        """The defaults of all options on a command line, given the start, closure and sensors that it asks for.
 
-        Override this method if some defaults depend on other options; see
+        Override this method if other defaults depend on options; see
         :func:`rt_torchrl.runs.command_line.from_command_line`.
         """
-        return type(self)()
+        usual = type(self)()
+        return dataclasses.replace(usual, twinning=self.suited(usual.twinning))
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Function from an episode's number to the real system's closure; None if the real system does not wear.
