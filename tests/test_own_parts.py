@@ -117,7 +117,7 @@ def test_a_run_refuses_them_before_any_work(tmp_path):
         Run(config, PLANT, baselines={"PD": PD(PLANT)})
     with pytest.raises(ValueError, match="plant=<class .* must be a plant; if this is a class, give an instance"):
         Run(config, LinearQuadratic)
-    with pytest.raises(ValueError, match=r"plant=LinearQuadratic is a class; give a plant, such as LinearQuadratic\(\)"):
+    with pytest.raises(ValueError, match=r"plant=LinearQuadratic is a class; give a plant, such as"):
         check_plant(LinearQuadratic)
     assert not (tmp_path / "run").exists()
 
