@@ -13,7 +13,16 @@ from printed_commands import blocks
 from small_runs import SMALL
 from test_real_system import MILLIMETRES, Rig, connected
 
-from rt_torchrl import DigitalTwin, PlannerConfig, PlantEnv, ReinforcementTwinning, check_plant
+from rt_torchrl import (
+    DigitalTwin,
+    PlannerConfig,
+    PlantEnv,
+    ReinforcementTwinning,
+    Scenario,
+    ShortHorizon,
+    ShortHorizonConfig,
+    check_plant,
+)
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures import figures_of
@@ -232,6 +241,39 @@ def test_incremental_td3_learns_from_episodes_that_end(update):
     other = algorithm(PlantEnv(plant, seed=1), plant, dataclasses.replace(SMALL, learner=learner))
     other.load_state_dict(found.state_dict())
     assert [other.learner.memory.over(one) for one in other.learner.memory.episodes] == [True, True]
+
+
+def test_windows_count_what_an_end_costs():
+    plant = Falling()
+    short = ShortHorizonConfig(window=5, critic_hidden=(8,), discount=0.9, mixing=0.7)
+    generator = torch.Generator().manual_seed(1)
+    planning = PlannerConfig(short_horizon=short)
+    plan = ShortHorizon(DigitalTwin(plant, plant.closure), LinearGain(WEAK), planning, generator=generator)
+    plan.reference = 4.0
+    costs, seen = torch.rand(2, 5, generator=generator).double(), torch.rand(2, 6, 2, generator=generator).double()
+    over = torch.tensor([[False] * 6, [False] * 3 + [True] * 3])
+    end = plant.end_cost / plan.reference
+    costs[1, 3:] = end
+    found = plan._targets(costs, seen, over)
+    torch.testing.assert_close(found[0], plan._targets(costs[:1], seen[:1])[0])
+    v = plan.target(seen[1]).squeeze(-1)
+    last = 0.1 * costs[1, 2] + 0.9 * end  # of the interval that ends it: what follows is known
+    torch.testing.assert_close(found[1, 2:], torch.stack([last, *[torch.tensor(end).double()] * 2]).detach())
+    before = 0.1 * costs[1, 1] + 0.9 * (0.3 * v[2] + 0.7 * last)
+    torch.testing.assert_close(found[1, 1], before.detach())
+
+
+def test_plans_over_short_windows_keep_a_rod_that_would_fall():
+    plant = Falling()
+    short = ShortHorizonConfig(window=10, critic_hidden=(32, 32), policy_rate=2e-2)
+    planning = PlannerConfig(short_horizon=short, iterations=6)
+    policy = LinearGain(WEAK)
+    plan = ShortHorizon(DigitalTwin(plant, plant.closure), policy, planning, generator=torch.Generator().manual_seed(1))
+    start = plan.plan(Scenario(*drawn(plant, 16))).start
+    for seed in range(1, 5):
+        found = plan.plan(Scenario(*drawn(plant, 16, seed)))
+    flown = plan.twin.control(policy, *drawn(plant, 50, 99))
+    assert start > 3.0 and found.best < 0.1 * start and not plant.ended(flown.states).any()
 
 
 def algorithm(env, plant, config=SMALL, closure=None):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,11 @@ from rt_torchrl import (
 )
 from rt_torchrl.baselines.check import require_controller
 from rt_torchrl.plants.discrepancy import Discrepancy
+from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.results_table import next_steps
 from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import SPREAD_OF_IMITATION
+from rt_torchrl.trajectories.engines.compilation import without_warnings_of_libraries
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -139,6 +143,27 @@ def test_a_policy_that_nobody_makes_is_refused():
     with pytest.raises(ValueError, match="policy='affine' does not exist; choose plant or mlp, or override"):
         AnyPolicy().make_policy(PLANT, torch.Generator())
     assert isinstance(AnyPolicy(policy="mlp").make_policy(PLANT, torch.Generator()), nn.Module)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WithController(RunConfig):
+    start: str = "controller"
+
+
+def test_the_command_line_of_an_own_recipe_explores_as_its_start_asks():
+    found = from_command_line(WithController, []).twinning
+    assert found.judged_updates and found.exploration.spread == SPREAD_OF_IMITATION
+    asked = from_command_line(WithController, ["--twinning.exploration.spread", "0.3"]).twinning
+    assert asked.judged_updates and asked.exploration.spread == 0.3
+    random = from_command_line(WithController, ["--start", "random"]).twinning
+    assert random == RunConfig().twinning
+
+
+def test_the_check_hides_the_warnings_of_libraries_alone():
+    with warnings.catch_warnings(record=True) as shown, without_warnings_of_libraries():
+        warnings.warn("`torch.jit.script` is deprecated. Please switch.", FutureWarning, stacklevel=1)
+        warnings.warn("`mine` is deprecated.", FutureWarning, stacklevel=1)
+    assert [str(one.message) for one in shown] == ["`mine` is deprecated."]
 
 
 class WrongNeural(LinearQuadratic):
