@@ -164,7 +164,7 @@ class Own(RunConfig):
     """A configuration in an importable module, without a plant."""
 
 
-def test_a_plant_that_no_recipe_makes_is_given(tmp_path):
+def test_a_plant_that_no_recipe_makes_is_given(tmp_path, unchecked):
     _, parts = leave_run_of(tmp_path, Own())
     with pytest.raises(ValueError, match=r"Own has no method plant\(\).*give load_run the plant"):
         load_run(tmp_path)

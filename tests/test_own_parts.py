@@ -74,7 +74,7 @@ class Clocked(LinearQuadratic):
         return super(LinearQuadratic, self).observe(t, state, exogenous)
 
 
-def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day():
+def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day(unchecked):
     plant = Clocked(horizon=2.0)
     state, exogenous = torch.tensor([[7.0, 5.0]]).double(), torch.tensor([[0.25]]).double()
     seen = plant.observe(torch.tensor([1.0]).double(), state, exogenous)
@@ -113,7 +113,7 @@ def test_a_controller_that_does_not_fit_is_refused_in_words(wrong, message):
         require_controller("first", wrong, PLANT)
 
 
-def test_a_run_refuses_them_before_any_work(tmp_path):
+def test_a_run_refuses_them_before_any_work(tmp_path, unchecked):
     config = RunConfig(log_dir=tmp_path / "run")
     with pytest.raises(ValueError, match="first, an instance of LinearGain, must be a class"):
         Run(config, PLANT, first=LinearGain([[1.0, 1.0]]))
@@ -126,7 +126,7 @@ def test_a_run_refuses_them_before_any_work(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_text_stands_for_a_path():
+def test_a_text_stands_for_a_path(unchecked):
     assert RunConfig(log_dir="runs/mine").log_dir == Path("runs/mine")
     with pytest.raises(ValueError, match="log_dir=7 must be a path"):
         RunConfig(log_dir=7)

@@ -138,7 +138,8 @@ class LoadedRun:
             ValueError: if there is none.
         """
         if role not in self.policies:
-            raise ValueError(f"role={role!r} does not exist in this run; choose {' or '.join(sorted(self.policies))}.")
+            known = " or ".join(sorted(self.policies))
+            raise ValueError(f"role={role!r} does not exist in this run; choose {known}, or run.live.")
         return self.policies[role]
 
 
