@@ -4,7 +4,7 @@
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.disturbance import require_request
 from .plants.integrators import rk4_step
-from .plants.measurement import Component, Measurement, Preview
+from .plants.measurement import Component, Measurement, Phase, Preview
 from .plants.plant import Plant, Transition
 from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
@@ -165,6 +165,7 @@ __all__ = [
     "OperatingLimits",
     "OperatingLimitsConfig",
     "OperationConfig",
+    "Phase",
     "Planner",
     "PlannerConfig",
     "Plant",

@@ -33,6 +33,18 @@ def check_options(config: object, *, infinite: Sequence[str] = ()) -> None:
         _check(name, getattr(config, name), kind, finite=name not in infinite)
 
 
+def with_paths(config: object) -> None:
+    """Make paths of the texts that stand for paths in a configuration, which may be frozen.
+
+    Args:
+        config: an instance of a dataclass, in its ``__post_init__``.
+    """
+    config_class: type = type(config)
+    for name, kind in _kinds(config_class).items():
+        if isinstance(getattr(config, name), str) and Path in (kind, *typing.get_args(kind)):
+            object.__setattr__(config, name, Path(getattr(config, name)))
+
+
 def require_widths(name: str, widths: Sequence[int]) -> None:
     """Refuse a hidden layer without units.
 

@@ -164,11 +164,15 @@ class Own(RunConfig):
     """A configuration in an importable module, without a plant."""
 
 
-def test_a_plant_that_no_recipe_makes_is_given(tmp_path):
+def test_a_plant_that_no_recipe_makes_is_given(tmp_path, unchecked):
     _, parts = leave_run_of(tmp_path, Own())
     with pytest.raises(ValueError, match=r"Own has no method plant\(\).*give load_run the plant"):
         load_run(tmp_path)
+    with pytest.raises(ValueError, match=r"plant=<class .* must be a plant; if this is a class, give an instance"):
+        load_run(tmp_path, plant=LinearQuadratic)
     run = load_run(tmp_path, plant=LinearQuadratic())
+    with pytest.raises(ValueError, match="policy=<function .* must be an nn.Module from observations to actions"):
+        run.simulate(lambda observation: observation[..., :1])
     assert type(run.config) is Own and torch.equal(run.policy("model_free").gain, parts["model_free"].gain)
 
 

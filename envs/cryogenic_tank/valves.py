@@ -28,7 +28,7 @@ class OnOffValve(ClassicalController):
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
         error = state[..., 2:] - self.plant.set_point
         is_open = torch.where(error > self.half_band, 1.0, torch.where(error < -self.half_band, 0.0, memory))
-        return self.plant.command.of_drop(is_open * self.log_gains[0].exp()), is_open
+        return self.plant.command.of_drop(is_open * self.gains[0]), is_open
 
 
 class NarrowOnOff(OnOffValve):
@@ -52,7 +52,7 @@ class RestingOnOff(OnOffValve):
     def act(
         self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 2"]
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 2"]]:
-        opening, rest = self.log_gains.exp().unbind()
+        opening, rest = self.gains.unbind()
         _, was_open = super().act(state, memory[..., :1])
         t = memory[..., 1:]
         is_open = torch.where(t < self.plant.horizon - rest, was_open, 0.0)
@@ -79,7 +79,7 @@ class PIValve(ClassicalController):
     def act(
         self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 1"]
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
-        K_P, K_I = self.log_gains.exp().unbind()
+        K_P, K_I = self.gains.unbind()
         error = state[..., 2:] - self.plant.set_point
         # The contribution of the integral to the drop stays within the range of the valve.
         integral = (memory + K_I * error * self.plant.dt).clamp(0.0, GREATEST_DROP)

@@ -32,7 +32,7 @@ class TrimmedPD(ClassicalController):
     def act(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 0"]
     ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 0"]]:
-        K_Pz, K_Dz, K_Px, K_Dx = self.log_gains.exp().unbind()
+        K_Pz, K_Dz, K_Px, K_Dx = self.gains.unbind()
         e_x, e_z = (self.plant.target - state[..., :2]).unbind(-1)
         v_x, v_z = self.plant.seen_velocity(state).unbind(-1)
         amplitude = self.trim[0] + K_Pz * e_z - K_Dz * v_z

@@ -17,7 +17,8 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 class ClassicalController(nn.Module, ABC):
     r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k)` with a memory m, which a ``policy(observation)`` cannot have.
 
-    The controller keeps the logarithms of its gains, so that a search changes a gain in proportion and never its sign.
+    A subclass defines :meth:`act`, and names its gains and the size of its memory if it has any. The controller keeps
+    the logarithms of its gains, so that a search changes a gain in proportion and never its sign.
 
     Args:
         plant: the plant to control; its actuators limit range and rate.
@@ -29,11 +30,13 @@ class ClassicalController(nn.Module, ABC):
     """
 
     gain_units: dict[str, str] = {}
-    """Unit of each gain, by name."""
+    """Unit of each gain, by name; empty for a law without gains, such as one with a fixed matrix."""
     default_gains: tuple[float, ...] = ()
+    """Values of the gains where none are given, in the order of :attr:`gain_units`."""
     placed_gains: tuple[float, ...] | None = None
     """Gains by a rule of thumb, if a search should start from them instead of the defaults."""
     memory_size: int = 0
+    """Number of entries of the memory, such as an integral or whether a heater is on."""
     low_action: Tensor
     high_action: Tensor
 
@@ -41,8 +44,12 @@ class ClassicalController(nn.Module, ABC):
         super().__init__()
         values = torch.tensor(self.default_gains if gains is None else gains, dtype=torch.float64)
         if len(values) != len(self.gain_units) or not (values.isfinite() & (values > 0)).all():
-            wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.gain_units.items())
-            raise ValueError(f"gains={gains} of {type(self).__name__} must be positive and finite: {wanted}.")
+            wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.gain_units.items()) or "none"
+            given = f"default_gains={self.default_gains}" if gains is None else f"gains={gains}"
+            raise ValueError(
+                f"{given} of {type(self).__name__} must be positive and finite: {wanted}, one for each entry of "
+                "gain_units."
+            )
         self.plant = plant
         self.log_gains = nn.Parameter(values.log(), requires_grad=False)
         low, high = bounds(plant.actions)
@@ -50,8 +57,13 @@ class ClassicalController(nn.Module, ABC):
         self.register_buffer("high_action", high)
         self._engine = Native(compiled=compiled)
 
+    @property
+    def gains(self) -> Float[Tensor, " n_g"]:
+        """The gains in the order and the units of ``gain_units``, for :meth:`act`."""
+        return self.log_gains.exp()
+
     def named_gains(self) -> dict[str, float]:
-        """The gains by name."""
+        """The gains by name, for reports; numbers that :meth:`act` reads could not become machine code."""
         return dict(zip(self.gain_units, self.log_gains.exp().tolist(), strict=True))
 
     def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
@@ -62,7 +74,12 @@ class ClassicalController(nn.Module, ABC):
     def act(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
-        """The command, which :meth:`respond` clamps to the ranges of the actions, and the new memory."""
+        """The command, which :meth:`respond` clamps to the ranges of the actions, and the new memory.
+
+        Args:
+            state: states that sensors read.
+            memory: memory before the interval; it has no columns if :attr:`memory_size` is zero.
+        """
 
     def respond(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]

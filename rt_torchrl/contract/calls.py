@@ -84,12 +84,16 @@ class Calls:
             Method("latch", plant.latch, ("state", "applied"), {"state": (n_s,)}),
         ]
         for closure in (plant.closure, self.closure):
-            field = _under(plant.vector_field, closure)
-            found.append(Method("vector_field", field, now, {"rate": (n_s,)}))
+            found.append(self.field_under(closure, "vector_field"))
             found.append(
                 Method("step", _under(plant.step, closure), _commanded(now), {"state": (n_s,), "applied": (n_a,)})
             )
         return found
+
+    def field_under(self, closure: nn.Module, name: str) -> Method:
+        """The vector field under a closure, by the name that messages blame."""
+        takes = ("t", "state", "applied", "exogenous")
+        return Method(name, _under(self.plant.vector_field, closure), takes, {"rate": (len(self.plant.states),)})
 
     def some(self, count: int) -> Arguments:
         """The arguments at ``count`` times at most, which are spread over the flights, for all episodes."""

@@ -32,6 +32,13 @@ ON_FLIGHTS: dict[str, Check] = {
     "one graph": tracing,
 }
 
+OF_EPISODES = ("merit", "categories", "setpoints")
+ANYWHERE = "It must work for every leading dimension, under forward and reverse differentiation."
+EPISODES = (
+    "It must take any number of episodes and of control intervals: read both from the shapes of its arguments, not "
+    "from n_steps."
+)
+
 
 class ContractReport(NamedTuple):
     """The checks of :func:`check_plant` that a plant has passed; ``print`` shows them in words.
@@ -98,11 +105,13 @@ def check_plant(
     Raises:
         PlantContractError: if the plant violates its contract. Each message names the method, what was found, what is
             expected, and what to change.
-        ValueError: if ``episodes`` or ``steps`` is below 2.
+        ValueError: if ``episodes`` or ``steps`` is below 2, or ``plant`` is a class.
     """
     for argument, value in (("episodes", episodes), ("steps", steps)):
         if value < 2:
             raise ValueError(f"{argument}={value} of the check must be at least 2.")
+    if isinstance(plant, type):
+        raise ValueError(f"plant={plant.__name__} is a class; give a plant, such as {plant.__name__}().")
     plant = _on_cpu(plant)
     found = list(signals(plant)) or list(attempt(draws, plant, seed)) + list(attempt(modules, plant, seed))
     checks = ON_FLIGHTS if traced else {name: check for name, check in ON_FLIGHTS.items() if check is not tracing}
@@ -145,8 +154,7 @@ def attempt(check: Callable[..., Iterable[str]], *arguments: Any) -> Iterator[st
         method, place = _blamed(inspect.trace(), arguments[0])
         yield (
             f"{method}: raised {type(error).__name__} in {place.filename}, line {place.lineno}: "
-            f"{str(error).splitlines()[0] if str(error) else ''}. It must work for every leading dimension, under "
-            "forward and reverse differentiation."
+            f"{str(error).splitlines()[0] if str(error) else ''}. {EPISODES if method in OF_EPISODES else ANYWHERE}"
         )
 
 

@@ -98,7 +98,10 @@ def _ignored_generator(name: str, drawn: Tensor, other: Tensor) -> Iterator[str]
 
 def modules(plant: Plant, seed: int) -> Iterator[str]:
     """Violations in precision and source of the weights of closures and policy, and in the policy's commands."""
+    made: dict[str, Callable[[torch.Generator], nn.Module]]
     made = {"make_closure": plant.make_closure, "make_policy": plant.make_policy}
+    neural = neural_closure_of(plant)
+    made |= {} if neural is None else {"make_neural_closure": neural}
     for name, make in made.items():
         first = make(seeded(seed))
         if not isinstance(first, nn.Module):
@@ -113,6 +116,16 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
         return
     yield from _single_precision("closure", plant.closure)
     yield from _commands(plant, seed)
+
+
+def neural_closure_of(plant: Plant) -> Callable[[torch.Generator], nn.Module] | None:
+    """What makes the neural closure of a plant, a small one; None if the plant defines none."""
+    inner = plant
+    while isinstance(base := getattr(inner, "base", None), Plant):
+        inner = base  # an extension has the closures of its plant
+    if type(inner).make_neural_closure is Plant.make_neural_closure:
+        return None
+    return partial(plant.make_neural_closure, hidden=(4,))
 
 
 def _drawn_weights(make: Callable[[torch.Generator], nn.Module], seed: int) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rt_torchrl.contract.calls import Arguments, Calls, Method
-from rt_torchrl.contract.draws import misshapen, wanted_as
+from rt_torchrl.contract.draws import misshapen, neural_closure_of, seeded, wanted_as
 
 TOLERANCE = 1e-10
 """Greatest difference as a share of a value: vector instructions may round powers and exponentials differently."""
@@ -19,6 +19,9 @@ def methods(calls: Calls) -> Iterator[str]:
     for method in calls.methods():
         found = list(_shapes(method, together)) or list(_purity(method, together)) or list(_rows(method, together))
         yield from found
+    neural = neural_closure_of(calls.plant)
+    if neural is not None:
+        yield from _shapes(calls.field_under(neural(seeded(calls.seed)), "make_neural_closure"), together)
     yield from _judgement(calls)
 
 

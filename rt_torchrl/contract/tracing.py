@@ -9,7 +9,7 @@ from rt_torchrl.contract.calls import Arguments, Calls, Method
 from rt_torchrl.contract.draws import seeded
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.vector_functions import lanes_of_this_machine
-from rt_torchrl.trajectories.engines.compilation import raised_limits
+from rt_torchrl.trajectories.engines.compilation import raised_limits, without_warnings_of_libraries
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise
 from rt_torchrl.trajectories.engines.programs import point_of
@@ -32,7 +32,8 @@ def forward_mode(calls: Calls) -> Iterator[str]:
     drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
     interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
     try:
-        jacobians = linearise(interval, (), state.detach(), drive)
+        with without_warnings_of_libraries():
+            jacobians = linearise(interval, (), state.detach(), drive)
     except Exception as error:
         yield f"step: torch.func.jvp under vmap fails: {_first_line(error)} {_where(error)}Expected {REMEDY}."
         return

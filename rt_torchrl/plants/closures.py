@@ -11,7 +11,10 @@ from rt_torchrl.plants.policies import mlp
 
 
 class PositiveCoefficients(nn.Module):
-    """Base of a closure with a few positive coefficients; a subclass names them and says in ``forward`` what they do.
+    """Base of a closure with a few positive coefficients, which a subclass names.
+
+    By default the closure gives these coefficients whatever the features are. A law that depends on its features, such
+    as a polynomial of the speed, overrides ``forward``.
 
     The trained weights are the logarithms of the coefficients. The coefficients therefore stay positive, and a step
     changes each of them by the same percentage, whatever its size and unit.
@@ -58,6 +61,10 @@ class PositiveCoefficients(nn.Module):
     def coefficients(self) -> Float[Tensor, " n"]:
         """The coefficients in the units of ``names``."""
         return self.log_coefficients.exp()
+
+    def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch n"]:
+        """The coefficients for every row of features, in the order of ``names``."""
+        return self.coefficients.expand(*features.shape[:-1], len(self.names))
 
     def named_coefficients(self) -> dict[str, Tensor]:
         """The coefficients by name."""

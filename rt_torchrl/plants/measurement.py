@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.options import require_number
 from rt_torchrl.plants.signal import Signal
 
 if TYPE_CHECKING:
@@ -21,9 +22,17 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Read(Protocol):
-    """Computes a measurement of a plant from the time, the state and the exogenous input."""
+    """Computes a measurement of a plant from the time, the state and the exogenous input: any such function will do."""
 
-    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor: ...
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        """The value, of the shape of ``state[..., 0]``, or one that is broadcast to it.
+
+        Args:
+            plant: the plant, with its parameters.
+            t: time [s].
+            state: states of the plant.
+            exogenous: exogenous inputs of the interval.
+        """
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,57 @@ class Component:
 
     def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         return (state if self.of == "state" else exogenous)[..., self.index]
+
+
+@dataclass(frozen=True)
+class Named:
+    """Reads the state or the exogenous input of a name.
+
+    Args:
+        name: name of its signal.
+    """
+
+    name: str
+
+    def __call__(self, plant: "Plant", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        for signals, values in ((plant.states, state), (plant.acting_inputs, exogenous)):
+            for place, signal in enumerate(signals):
+                if signal.name == self.name:
+                    return values[..., place]
+        known = ", ".join(signal.name for signal in (*plant.states, *plant.acting_inputs))
+        raise ValueError(
+            f"measurement {self.name!r} of plant {plant.name!r} is none of its states and inputs {known}; give it a "
+            "function read(plant, t, state, exogenous)."
+        )
+
+
+@dataclass(frozen=True)
+class Phase:
+    r"""Reads the phase of something that recurs, such as the time of the day: :math:`\cos 2\pi t/T` or the sine.
+
+    Cosine and sine together tell the phase without a jump.
+
+    Args:
+        of: cosine or sine.
+        period: length T of a turn [s].
+
+    Raises:
+        ValueError: if ``of`` is something else, or the period is not positive and finite.
+    """
+
+    of: Literal["cosine", "sine"]
+    period: float
+
+    def __post_init__(self) -> None:
+        if self.of not in ("cosine", "sine"):
+            raise ValueError(f"of={self.of!r} of a Phase must be cosine or sine.")
+        require_number("period", self.period)
+        if not self.period > 0.0:
+            raise ValueError(f"period={self.period} s of a Phase must be positive.")
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        turn = 2.0 * math.pi / self.period * t
+        return torch.cos(turn) if self.of == "cosine" else torch.sin(turn)
 
 
 @dataclass(frozen=True)
@@ -81,7 +141,7 @@ class Measurement(Signal):
     """A signal that the sensors of a plant give.
 
     Args:
-        read: function that computes the value, in ``unit``.
+        read: function ``read(plant, t, state, exogenous)`` that computes the value, in ``unit``.
         offset: value that a policy observes as zero, in ``unit``.
         scale: change that a policy observes as one, in ``unit``.
 
@@ -102,8 +162,16 @@ class Measurement(Signal):
             )
 
     @classmethod
-    def of(cls, signal: Signal, read: Read, *, offset: float = 0.0, scale: float = 1.0) -> "Measurement":
-        """The measurement of a state or an exogenous input."""
+    def of(cls, signal: Signal, read: Read | None = None, *, offset: float = 0.0, scale: float = 1.0) -> "Measurement":
+        """The measurement of a state or an exogenous input.
+
+        Args:
+            signal: signal of the state or input.
+            read: what reads it; None for the state or input of the signal's name.
+            offset: value that a policy observes as zero, in the signal's unit.
+            scale: change that a policy observes as one, in the signal's unit.
+        """
+        read = Named(signal.name) if read is None else read
         return cls(**dataclasses.asdict(signal), read=read, offset=offset, scale=scale)
 
     @property

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.discrepancy import Discrepancy
 from rt_torchrl.plants.ending import Ending
 from rt_torchrl.plants.episode_length import whole_steps
 from rt_torchrl.plants.integrators import rk4_step
@@ -34,12 +35,12 @@ class Transition(NamedTuple):
     applied: Tensor
 
 
-class Plant(nn.Module, Ending, Merits, ABC):
+class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
     """Physics and control problem of one system; ``envs/`` holds examples.
 
     A subclass declares its signals in the four class attributes (``inputs`` may be empty), and defines
-    :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`discrepancy`, :meth:`draw_initial_state`,
-    :meth:`draw_exogenous` and :meth:`make_closure`. If it declares ``measurements``, of which a policy may observe any
+    :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`draw_initial_state`, :meth:`draw_exogenous` and
+    :meth:`make_closure`. If it declares ``measurements``, of which a policy may observe any
     choice, ``observations`` and :meth:`observe` follow from the choice. Every method is pure and takes any leading
     batch dimensions; the last dimension is that of the signals. A method must work when it is compiled, batched and
     differentiated: it contains no clamp, detach, random number, device choice or Python branch on a tensor.
@@ -209,12 +210,6 @@ class Plant(nn.Module, Ending, Merits, ABC):
     def terminal_cost(self, state: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch"]:
         """Cost Φ_a of the state at the end of an episode, in the unit of L_a times seconds; by default zero."""
         return state.new_zeros(state.shape[:-1])
-
-    @abstractmethod
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
-    ) -> Float[Tensor, "*batch"]:
-        r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`."""
 
     def complete_states(
         self,

@@ -138,7 +138,8 @@ class LoadedRun:
             ValueError: if there is none.
         """
         if role not in self.policies:
-            raise ValueError(f"role={role!r} does not exist in this run; choose {' or '.join(sorted(self.policies))}.")
+            known = " or ".join(sorted(self.policies))
+            raise ValueError(f"role={role!r} does not exist in this run; choose {known}, or run.live.")
         return self.policies[role]
 
 
@@ -207,8 +208,9 @@ def _rebuilt(
     """The configuration and the plant that a run's settings describe; a given plant is taken as it is."""
     if plant is None and not issubclass(config_class, MakesPlant):
         raise ValueError(
-            f"{config_class.__qualname__} has no method plant() that makes the plant from its options; write one, or "
-            "give load_run the plant."
+            f"{config_class.__qualname__} has no method plant() that makes the plant from its options; either "
+            "give load_run the plant, load_run(folder, plant=...), or train with a Config that has such a method, as "
+            "docs/own_plant.md shows."
         )
     options = {key: value for key, value in settings.items() if key not in BESIDE}
     try:
@@ -216,6 +218,8 @@ def _rebuilt(
         plant = plant_of(config) if plant is None else plant
     except (ValueError, TypeError, OSError) as error:
         raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error
+    if not isinstance(plant, Plant):
+        raise ValueError(f"plant={plant!r} must be a plant; if this is a class, give an instance of it.")
     name = settings["plant"]
     if plant.name != name:
         raise ValueError(f"{folder} is a run of plant {name!r}, the recipe is of {plant.name!r}; use the run's recipe.")

@@ -6,7 +6,7 @@ import warnings
 
 import torch
 
-from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.engines.compilation import OF_LIBRARIES, missing_for_compilation
 
 NOISY = ("torchrl", "torch.utils.cpp_extension")
 """Loggers that report the inner work of a library."""
@@ -17,8 +17,7 @@ def quieten_libraries() -> None:
     os.environ.setdefault("RL_LOGGING_LEVEL", "ERROR")  # TorchRL sets its own level when it is loaded, which is later
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Code of PyTorch and TorchRL themselves causes this warning, with new versions of PyTorch.
-    warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*is deprecated", category=FutureWarning)
+    warnings.filterwarnings("ignore", message=OF_LIBRARIES, category=FutureWarning)
 
 
 def require_device(name: str) -> torch.device:

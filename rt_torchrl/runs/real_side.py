@@ -6,6 +6,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.baselines.check import require_controller
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
@@ -85,7 +86,7 @@ def require_simulation(
     """
     if env is not None and (config.noise or config.wear(plant) is not None):
         raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
-    real = [name for name, law in (baselines or {}).items() if issubclass(law, RealController)]
+    real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
     on_the_plant = [name for name in baselines or {} if name not in real]
     if real and (env is None or env.closure is not None):
         raise ValueError(
@@ -99,6 +100,25 @@ def require_simulation(
         )
 
 
+def _acts_on_the_real_system(law: object) -> bool:
+    return isinstance(law, type) and issubclass(law, RealController)
+
+
+def require_controllers(
+    physics: Plant, first: type[ClassicalController] | None, baselines: dict[str, type[Baseline]] | None
+) -> None:
+    """Refuse controllers that are no classes, or whose laws do not fit the plant.
+
+    Raises:
+        ValueError: if there is one; the message names it, and says what is expected.
+    """
+    given: dict[str, object] = {} if first is None else {"first": first}
+    given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
+    for name, law in given.items():
+        if not _acts_on_the_real_system(law):
+            require_controller(name, law, physics)
+
+
 def physics_known(plant: Plant, believed: Plant | None) -> Plant:
     """The physics of the twin of a real system.
 
@@ -107,8 +127,12 @@ def physics_known(plant: Plant, believed: Plant | None) -> Plant:
         believed: physics that the twin is given; None for those of the real system.
 
     Raises:
-        ValueError: if the twin has states that no sensor of the real system reads, or lacks some that one reads.
+        ValueError: if one is no plant, or the twin has states that no sensor of the real system reads, or lacks some
+            that one reads.
     """
+    for name, one in (("plant", plant), ("believed", believed)):
+        if one is not None and not isinstance(one, Plant):
+            raise ValueError(f"{name}={one!r} must be a plant; if this is a class, give an instance of it.")
     physics = believed or plant
     known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
     if known != read:

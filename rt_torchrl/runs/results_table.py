@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 
 SCREEN = 24
@@ -170,26 +172,30 @@ def _change(start: float | None, found: float | None) -> float:
     return abs(found - start) / max(abs(start), abs(found), 1e-300)
 
 
-def next_steps(metrics: dict[str, Any], folder: Path) -> str:
+def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
     Args:
         metrics: content of ``metrics.json``.
         folder: run folder.
+        config: options of the run; where they do not make the plant, the recipes cannot read the run without it.
     """
-    found = metrics["summary"]
+    found, alone = metrics["summary"], config is None or isinstance(config, MakesPlant)
     unseen, live = found["unseen"], found["live"]
     cost = unseen[f"J_a_{live}"]["mean"]
     classical = {name: baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
     known = {name: value for name, value in classical.items() if value is not None}
     best = min(known, key=known.__getitem__, default=None)
-    steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: rt_torchrl.load_run({str(folder)!r})"]
+    call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
+    steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
     if cost is None:
         steps.append("the live policy diverges on unseen episodes: see `reason` in metrics.json, and train longer")
     elif best is not None and cost >= known[best]:
         steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
-    else:
+    elif alone:
         steps.append(f"take the controller away: {call_of('export')} {folder}")
+    else:
+        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)")
     return "\n".join(f"  next: {step}" for step in steps)

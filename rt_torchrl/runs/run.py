@@ -31,7 +31,7 @@ from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, learner_threads, operation_of
 from rt_torchrl.runs.progress import Progress
-from rt_torchrl.runs.real_side import judged_on, physics_known, require_simulation, simulated
+from rt_torchrl.runs.real_side import judged_on, physics_known, require_controllers, require_simulation, simulated
 from rt_torchrl.runs.results_table import next_steps, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
@@ -74,9 +74,9 @@ class Run:
     Raises:
         PlantContractError: before any work, if a plant breaks its contract in a way that is found at once;
             ``check_plant`` also finds what takes seconds to find.
-        ValueError: before any work, if what ``config.start`` names does not exist or fit, the device does not exist,
-            the run folder cannot be written, is in use or holds a run, the run to resume had other options, its
-            checkpoint is damaged or does not fit, or options need a plant in simulation and there is an ``env``.
+        ValueError: before any work, if a controller does not fit the plant, what ``config.start`` names does not exist
+            or fit, the device does not exist, the run folder cannot be written, is in use or holds a run, the run to
+            resume had other options or a damaged checkpoint, or options need a plant in simulation beside an ``env``.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class Run:
         physics = physics_known(plant, believed)
         for one in filter(None, (plant, believed)):
             check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
+        require_controllers(physics, first, baselines)
         self._start = start_of(config, physics, first)
         if threads := learner_threads(config):
             torch.set_num_threads(threads)
@@ -120,9 +121,8 @@ class Run:
             self.unseen = judged_on(plant, real, self.config.unseen, device=device, compiled=compiled)
             self.unseen.physics = physics
             self.unseen.bounds = StateBounds(plant, config.twinning.bounded_states)
-            self.baselines = {
-                name: law(physics, compiled=compiled).to(device) for name, law in (baselines or {}).items()
-            }
+            made = {name: law(physics, compiled=compiled) for name, law in (baselines or {}).items()}
+            self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
             if self._held.resumes():
                 self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
@@ -223,7 +223,7 @@ class Run:
         dashboard.results(options, metrics["summary"], table)
         dashboard.close()
         print(table)
-        print(f"results in {self.folder}\n{next_steps(metrics, self.folder)}")
+        print(f"results in {self.folder}\n{next_steps(metrics, self.folder, self.config)}")
         return metrics
 
     def _all_episodes(self, dashboard: Dashboard, bar: Progress) -> None:

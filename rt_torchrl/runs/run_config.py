@@ -13,7 +13,7 @@ from torch import nn
 from rt_torchrl.evaluation.limits import LimitConfig
 from rt_torchrl.identification.sensor_log import LogConfig
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
-from rt_torchrl.options import check_options, choices, require_widths
+from rt_torchrl.options import check_options, choices, require_widths, with_paths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.callbacks import EarlyStopping
@@ -131,6 +131,7 @@ class RunConfig:
     twinning: TwinningConfig = field(default_factory=TwinningConfig)
 
     def __post_init__(self) -> None:
+        with_paths(self)
         check_options(self)
         known = choices(type(self), "policy")
         if known and self.model_free_policy not in ("same", *known):
@@ -187,6 +188,8 @@ class RunConfig:
 
         Override this method, and the ``Literal`` that declares ``policy``, for policies of your own.
         """
+        if not choices(type(self), "policy") and self.policy not in ("plant", "mlp"):
+            raise ValueError(f"policy={self.policy!r} does not exist; choose plant or mlp, or override make_policy.")
         if self.policy == "mlp":
             return SaturatedMLP(len(plant.observations), plant.actions, hidden=self.hidden, generator=generator)
         return plant.make_policy(generator)
@@ -261,12 +264,13 @@ class RunConfig:
         return dataclasses.replace(twinning, exploration=exploration, judged_updates=True)
 
     def defaults(self) -> "RunConfig":
-        """The defaults of all options, given the closure and the sensors that the options ask for.
+        """The defaults of all options on a command line, given the start, closure and sensors that it asks for.
 
-        Override this method if some defaults depend on other options; see
+        Override this method if other defaults depend on options; see
         :func:`rt_torchrl.runs.command_line.from_command_line`.
         """
-        return type(self)()
+        usual = type(self)()
+        return dataclasses.replace(usual, twinning=self.suited(usual.twinning))
 
     def wear(self, plant: Plant) -> Callable[[int], nn.Module] | None:
         """Function from an episode's number to the real system's closure; None if the real system does not wear.

@@ -42,10 +42,12 @@ def simulate(
         seed: seed of the draws.
 
     Raises:
-        ValueError: if ``on`` is something else, or shapes do not fit the plant.
+        ValueError: if ``on`` is something else, the policy is no module, or shapes do not fit the plant.
     """
     if on not in ("real", "twin"):
         raise ValueError(f"on={on!r} must be real or twin.")
+    if not isinstance(policy, nn.Module | StateFeedback):
+        raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
     plant, closure = (run.plant, true_closure(run)) if on == "real" else (run.physics, run.closure)
     generator = torch.Generator().manual_seed(seed)
     single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))

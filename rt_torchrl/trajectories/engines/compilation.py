@@ -5,6 +5,7 @@ PyTorch's compiler takes seconds to load. The functions below import it, so that
 
 import shutil
 import sysconfig
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
@@ -22,6 +23,16 @@ LIMITS = {
     "specialize_float": True,
 }
 """Settings of the tracer."""
+OF_LIBRARIES = r".*torch\.jit\.script.*is deprecated"
+"""A warning that code of PyTorch and TorchRL themselves causes, with new versions of PyTorch."""
+
+
+@contextmanager
+def without_warnings_of_libraries() -> Iterator[None]:
+    """A context without the warnings that concern the libraries' own code, which a user cannot mend."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=OF_LIBRARIES, category=FutureWarning)
+        yield
 
 
 def raised_limits() -> AbstractContextManager[None]:

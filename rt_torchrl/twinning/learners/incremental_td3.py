@@ -51,6 +51,7 @@ class IncrementalTD3:
     - *Proof.* An update makes a candidate. The policy has its weights in the next real episode, and goes back to the
       earlier ones if this costs much more than the latest episodes of weights that were kept (:class:`Candidate`).
     - *Twin.* A twin that is trusted teaches slopes and adds transitions (:class:`TwinTeacher`).
+    - *Ends.* What comes after an early end is known, so that nothing is bootstrapped there (:class:`EpisodeMemory`).
 
     Sums of several rewards hold for the policy that flew them; ``return_episodes`` says for how many episodes the
     present policy is near enough to it. :class:`RescaledTD3Loss` is the loss.
@@ -66,11 +67,6 @@ class IncrementalTD3:
     """
 
     def __init__(self, plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator):
-        if plant.end_cost is not None:
-            raise ValueError(
-                f"algorithm='incremental_td3' learns from episodes up to their horizon, and those of plant "
-                f"{plant.name!r} may end early; use ddpg or td3."
-            )
         self.config, self.policy, self.generator = config, policy, generator
         device, own = generator.device, config.incremental
         intervals = decision_intervals(config.discount, own.decisions)
@@ -81,7 +77,14 @@ class IncrementalTD3:
                 f"{plant.n_steps} of an episode of plant {plant.name!r}; use fewer, or a longer horizon."
             )
         self.increments = Increments(plant, intervals=intervals, device=device)
-        self.memory = EpisodeMemory(own.episodes, self.increments, intervals=intervals, discount=config.discount)
+        self.memory = EpisodeMemory(
+            own.episodes,
+            self.increments,
+            intervals=intervals,
+            discount=config.discount,
+            horizon=plant.n_steps,
+            end_cost=plant.end_cost,
+        )
         self.batch_size = min(config.batch_size, plant.n_steps)
         self.loss = self._make_loss(plant)
         self.target = SoftUpdate(self.loss, tau=self._target_rate())

@@ -51,9 +51,10 @@ class Lesson:
                 found = teacher.transitions(
                     own.virtual, learner.decisions, reward_scale=reward_scale, generator=learner.generator
                 )
-                found["weight"] = torch.full_like(found["next", "reward"], learner.trust)
-                found["virtual"] = torch.ones_like(found["weight"], dtype=torch.bool)
-                parts.append(found)
+                if found is not None:
+                    found["weight"] = torch.full_like(found["next", "reward"], learner.trust)
+                    found["virtual"] = torch.ones_like(found["weight"], dtype=torch.bool)
+                    parts.append(found)
             except DivergenceError as error:
                 self.refused.append(f"no virtual transitions: {error}")
         if not own.slopes:

@@ -42,7 +42,7 @@ class TwinTeacher:
             \lambda_k = L_s + \pi_s^\top L_a + \gamma(\Phi_s + \Phi_a\pi_s)^\top\lambda_{k+1}
 
         They are taken along the real states, actions and inputs; after each action the policy acts. λ is zero at the
-        end of the episode.
+        end of the episode; the slopes do not see an early end coming.
 
         Args:
             episode: one of the memory's episodes, of n control intervals.
@@ -84,12 +84,18 @@ class TwinTeacher:
             reward_scale: factor on the rewards.
         """
         slopes, weights = self.slopes(episode), self.memory.discounts(self.memory.intervals)
+        if self.memory.over(episode):  # what is commanded after the end changes nothing
+            slopes = torch.cat([slopes, slopes.new_zeros(len(weights), slopes.shape[-1])])
         sums = torch.stack([windows(part, weights)[at] for part in slopes.unbind(-1)], -1)
         return -reward_scale * self.memory.increments.scale * sums
 
     @torch.no_grad()
-    def transitions(self, count: int, decisions: int, *, reward_scale: float, generator: torch.Generator) -> TensorDict:
+    def transitions(
+        self, count: int, decisions: int, *, reward_scale: float, generator: torch.Generator
+    ) -> TensorDict | None:
         """Virtual transitions from real states: the recorded decision, and then the present policy.
+
+        They begin where the real episode went on for as long; where the twin ends early, its end counts.
 
         Args:
             count: number of transitions.
@@ -97,20 +103,23 @@ class TwinTeacher:
             reward_scale: factor on the rewards.
             generator: source of the draws of states.
 
+        Returns:
+            The transitions; None if all real episodes ended too early for one.
+
         Raises:
             DivergenceError: if the twin diverges.
         """
-        memory, m = self.memory, self.memory.intervals
-        share, n = -(-count // len(memory)), decisions * m
+        memory, n = self.memory, decisions * self.memory.intervals
         scales, parts = memory.statistics(), []
-        for episode in memory.episodes:
-            places = memory.places(episode, n)
+        long = [episode for episode in memory.episodes if len(memory.inner_places(episode, n))]
+        for episode in long:
+            share, places = -(-count // len(long)), memory.inner_places(episode, n)
             drawn = torch.randint(len(places), (share,), generator=generator, device=generator.device)
             at = places[drawn]
             now = memory.situation(episode, at, scales) | {"action": memory.taken(episode, at), "place": at}
             now["next"] = self._flown(episode, at, n, scales, reward_scale)
             parts.append(TensorDict(now, batch_size=share, device=at.device))
-        return torch.cat(parts)[:count]
+        return torch.cat(parts)[:count] if parts else None
 
     def _flown(
         self, episode: TensorDict, at: Tensor, n: int, scales: tuple[Tensor, Tensor], reward_scale: float
@@ -125,14 +134,18 @@ class TwinTeacher:
             after = twin.control(self.policy, states[:, -1], exogenous[:, m:], start=start + m * plant.dt)
             states, actions = torch.cat([states, after.states[:, 1:]], 1), torch.cat([actions, after.actions], 1)
         t = plant.dt * ahead.double()
-        rewards = -plant.running_cost(t, states[:, :-1], actions, exogenous) @ memory.discounts(n)
+        costs, over = plant.running_cost(t, states[:, :-1], actions, exogenous), None
+        if plant.end_cost is not None:
+            over = plant.ended(states).cumsum(1) > 0
+            costs = torch.where(over[:, :-1], torch.full_like(costs, plant.end_cost), costs)
+        ended = torch.zeros_like(at, dtype=torch.bool) if over is None else over[:, -1]
+        rewards, discount = memory.closed(-costs @ memory.discounts(n), ended, n)
         end = TensorDict({"state": states[:, -1], "exogenous": episode["exogenous"][at + n]}, batch_size=len(at))
         end["observation"] = plant.observe(plant.dt * (at + n).double(), end["state"], end["exogenous"])
         end["state"] = end["state"][:, :read]  # the critics see what sensors read
         end["reward"] = rewards.unsqueeze(-1)  # its device and length say where the features are computed
         found = memory.situation(end, torch.arange(len(at), device=at.device), scales)
-        discount = torch.full_like(end["reward"], memory.discount**n)
-        return found | {"reward": reward_scale * end["reward"], "discount": discount}
+        return found | {"reward": reward_scale * end["reward"], "discount": discount.unsqueeze(-1)}
 
 
 def jacobian(

@@ -20,7 +20,7 @@ import copy
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
@@ -38,7 +38,9 @@ class ShortHorizon:
 
     A copy of the policy descends, because a policy gets worse before it gets better while the critic is still wrong.
     The copy goes on from episode to episode, whether or not it is good enough yet to take the policy's place. It plans
-    for a process that goes on, without the plant's terminal cost.
+    for a process that goes on, without the plant's terminal cost. Where an episode ends early, v is known to be L_e
+    from there on, and windows are taken from what comes before. The gradient of a window does not see its own end, but
+    the critic at the end of earlier windows does.
 
     Args:
         twin: twin on which the windows are flown.
@@ -47,7 +49,7 @@ class ShortHorizon:
         generator: source of the critic's initial weights.
 
     Raises:
-        ValueError: if a window is longer than an episode, or episodes of the plant may end early.
+        ValueError: if a window is longer than an episode.
     """
 
     gradient_limit = 1.0
@@ -61,11 +63,6 @@ class ShortHorizon:
             raise ValueError(
                 f"window={short.window} exceeds the {twin.plant.n_steps} control intervals of an episode of plant "
                 f"{twin.plant.name!r}; 0 plans over whole episodes."
-            )
-        if twin.plant.end_cost is not None:
-            raise ValueError(
-                f"window={short.window} plans for a process that goes on, and episodes of plant {twin.plant.name!r} "
-                "may end early; 0 plans over whole episodes."
             )
         self.twin, self.policy, self.iterations, self.config = twin, policy, config.iterations, short
         n_o = len(twin.plant.observations)
@@ -110,12 +107,18 @@ class ShortHorizon:
         self.reference = self.reference or control_cost(plant, flown).mean().item() or 1.0
         inputs = exogenous[:, : count * n].unflatten(1, (count, n))
         rows, norms = torch.arange(batch, device=exogenous.device), []
+        over = self._over(flown.states[:, : count * n : n])
+        begun = torch.full_like(rows, count) if over is None else (~over).sum(1)  # windows before an early end
         for shift in range(count):
             safe_point()
-            phase = (rows + shift) % count
+            phase = (rows + shift) % begun
             start = plant.dt * n * phase.double()
             norms.append(self._window(flown.states[rows, phase * n], inputs[rows, phase], start))
         return sum(norms) / len(norms)
+
+    def _over(self, states: Float[Tensor, "batch m n_s"]) -> Bool[Tensor, "batch m"] | None:
+        """Whether an episode has ended early by each of its states, in which it then stays; None if none ends early."""
+        return None if self.twin.plant.end_cost is None else self.twin.plant.ended(states)
 
     def _window(
         self,
@@ -131,24 +134,49 @@ class ShortHorizon:
         costs = plant.running_cost(t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
         # There is no input after the last interval; the last input takes its place.
         seen = plant.observe(t, flown.states, torch.cat([inputs, inputs[:, -1:]], 1))
-        norm = self._improve_policy(costs, seen)
-        self._improve_critic(costs.detach(), seen.detach())
+        over = self._over(flown.states)
+        if over is not None:
+            costs = torch.where(over[:, :-1], self._end_value(), costs)
+        norm = self._improve_policy(costs, seen, over)
+        self._improve_critic(costs.detach(), seen.detach(), over)
         return norm
 
-    def _improve_policy(self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"]) -> float:
+    def _end_value(self) -> float:
+        """The value v of an episode that has ended."""
+        return (self.twin.plant.end_cost or 0.0) / self.reference
+
+    def _values(
+        self, seen: Float[Tensor, "*batch n_o"], over: Bool[Tensor, "*batch"] | None
+    ) -> Float[Tensor, "*batch"]:
+        """What the slow critic estimates, or the value of an end."""
+        found: Tensor = self.target(seen).squeeze(-1)
+        return found if over is None else torch.where(over, self._end_value(), found)
+
+    def _improve_policy(
+        self,
+        costs: Float[Tensor, "batch n"],
+        seen: Float[Tensor, "batch m n_o"],
+        over: Bool[Tensor, "batch m"] | None = None,
+    ) -> float:
         gamma, n = self.config.discount, costs.shape[1]
         weights = (1.0 - gamma) * gamma ** torch.arange(n, dtype=costs.dtype, device=costs.device)
-        J_w = (costs * weights).sum(-1) + gamma**n * self.target(seen[:, -1]).squeeze(-1)
+        J_w = (costs * weights).sum(-1) + gamma**n * self._values(seen[:, -1], None if over is None else over[:, -1])
         self._optimiser.zero_grad(set_to_none=True)
         J_w.mean().backward()
         norm = nn.utils.clip_grad_norm_(self.learner.parameters(), self.gradient_limit)
         self._optimiser.step()
         return norm.item()
 
-    def _improve_critic(self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"]) -> None:
-        targets = self._targets(costs, seen)
+    def _improve_critic(
+        self,
+        costs: Float[Tensor, "batch n"],
+        seen: Float[Tensor, "batch m n_o"],
+        over: Bool[Tensor, "batch m"] | None = None,
+    ) -> None:
+        targets = self._targets(costs, seen, over)
         for _ in range(self.config.critic_iterations):
-            loss = (self.critic(seen[:, :-1]).squeeze(-1) - targets).square().mean()
+            errors = self.critic(seen[:, :-1]).squeeze(-1) - targets
+            loss = (errors if over is None else errors[~over[:, :-1]]).square().mean()
             self._critic_optimiser.zero_grad(set_to_none=True)
             loss.backward()
             self._critic_optimiser.step()
@@ -157,10 +185,15 @@ class ShortHorizon:
                 slow.lerp_(fast, self.config.target_rate)
 
     @torch.no_grad()
-    def _targets(self, costs: Float[Tensor, "batch n"], seen: Float[Tensor, "batch m n_o"]) -> Float[Tensor, "batch n"]:
+    def _targets(
+        self,
+        costs: Float[Tensor, "batch n"],
+        seen: Float[Tensor, "batch m n_o"],
+        over: Bool[Tensor, "batch m"] | None = None,
+    ) -> Float[Tensor, "batch n"]:
         """The critic's targets (1 − γ)L_k + γ((1 − λ)v(e_{k+1}) + λ·target_{k+1}), computed from the last interval."""
         gamma, mixing = self.config.discount, self.config.mixing
-        values = self.target(seen).squeeze(-1)
+        values = self._values(seen, over)
         following, found = values[:, -1], []
         for cost, value in zip(costs.flip(1).unbind(1), values[:, 1:].flip(1).unbind(1), strict=True):
             following = (1.0 - gamma) * cost + gamma * ((1.0 - mixing) * value + mixing * following)

@@ -1,0 +1,204 @@
+"""What a newcomer writes for a plant of their own: what the library gives, and what it says where it does not fit."""
+
+import dataclasses
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from test_classical import PD
+from torch import nn
+
+from rt_torchrl import (
+    BoundedPerceptron,
+    Measurement,
+    Phase,
+    PlantContractError,
+    PositiveCoefficients,
+    RunConfig,
+    Signal,
+    check_plant,
+)
+from rt_torchrl.baselines.check import require_controller
+from rt_torchrl.plants.discrepancy import Discrepancy
+from rt_torchrl.runs.command_line import from_command_line
+from rt_torchrl.runs.results_table import next_steps
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import SPREAD_OF_IMITATION
+from rt_torchrl.trajectories.engines.compilation import without_warnings_of_libraries
+
+PLANT = LinearQuadratic(horizon=2.0)
+
+
+class Losses(PositiveCoefficients):
+    names = {"wall": "W/K", "window": "W/K"}
+    true_coefficients = (40.0, 35.0)
+
+
+def test_coefficients_are_the_same_for_all_features_by_default():
+    found = Losses.true()(torch.zeros(3, 4, 5, dtype=torch.float64))
+    torch.testing.assert_close(found, torch.tensor([40.0, 35.0]).double().expand(3, 4, 2))
+
+
+class Turning(Discrepancy):
+    name = "turning"
+    states = (
+        Signal(symbol="x", name="position", unit="m"),
+        Signal(symbol="a", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
+    )
+    state_sizes = (2.0, 0.5)
+
+
+def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way():
+    one, other = torch.tensor([[1.0, 3.0]]).double(), torch.tensor([[5.0, -3.0]]).double()
+    turned = 2.0 * math.pi - 6.0
+    expected = 0.5 * ((4.0 / 2.0) ** 2 + (turned / 0.5) ** 2)
+    assert Turning().discrepancy(one, other).tolist() == pytest.approx([expected], rel=1e-12)
+    Turning.states = Turning.states[:1]
+    with pytest.raises(ValueError, match=r"state_sizes=\(2.0, 0.5\) of plant 'turning'.*position \[m\]"):
+        Turning().discrepancy(one[:, :1], other[:, :1])
+
+
+class Clocked(LinearQuadratic):
+    measurements = (
+        Measurement.of(LinearQuadratic.states[1], offset=1.0, scale=2.0),
+        Measurement.of(LinearQuadratic.inputs[0]),
+        Measurement(symbol="c", name="day", unit="-", read=Phase("cosine", 4.0)),
+        Measurement(symbol="s", name="night", unit="-", read=Phase("sine", 4.0)),
+    )
+
+    def observe(self, t, state, exogenous):
+        return super(LinearQuadratic, self).observe(t, state, exogenous)
+
+
+def test_measurements_read_the_signal_of_their_name_and_the_phase_of_the_day(unchecked):
+    plant = Clocked(horizon=2.0)
+    state, exogenous = torch.tensor([[7.0, 5.0]]).double(), torch.tensor([[0.25]]).double()
+    seen = plant.observe(torch.tensor([1.0]).double(), state, exogenous)
+    torch.testing.assert_close(seen, torch.tensor([[2.0, 0.25, 0.0, 1.0]]).double(), rtol=0, atol=1e-15)
+    alien = dataclasses.replace(Clocked.states[0], name="pressure")
+    with pytest.raises(ValueError, match="'pressure' of plant .* is none of its states and inputs"):
+        Measurement.of(alien).observed(plant, torch.zeros(()), state, exogenous)
+    for of, period, wrong in (("tangent", 4.0, "cosine or sine"), ("sine", 0.0, "must be positive")):
+        with pytest.raises(ValueError, match=wrong):
+            Phase(of, period)
+
+
+def law(**own):
+    """A PD law with other methods."""
+    return type("Mine", (PD,), own)
+
+
+WRONG_LAWS: list[tuple[Any, str]] = [
+    (PD(PLANT), "must be a class derived from ClassicalController; give its class, PD"),
+    (LinearGain, "must be a class derived from ClassicalController; give a subclass of it"),
+    (law(act=lambda self, state, memory: state[:, :1]), "first: Mine.act returns Tensor; give both"),
+    (law(act=lambda self, state, memory: (state[:, 0], memory)), r"returns a command, \(3,\).*A column is state"),
+    (law(act=lambda self, state, memory: (state[:, :1].float(), memory)), r"command, \(3, 1\) in torch.float32"),
+    (law(act=lambda self, state, memory: (state[:, :1] / 0.0, memory)), "command, numbers that are not finite"),
+    (law(act=lambda self, state, memory: (state[:, :1], state)), r"returns a memory, \(3, 2\).*memory_size=1"),
+    (law(memory_size=0, act=lambda self, state, memory: (state[:, :1], memory[:, [0]])), "as memory_size=0 says"),
+    (law(first_memory=lambda self, state: state), r"first_memory returns \(3, 2\).*memory_size=1"),
+    (law(default_gains=()), r"default_gains=\(\) of Mine must be .*K_1 .*, one for each entry of gain_units"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "message"), WRONG_LAWS)
+def test_a_controller_that_does_not_fit_is_refused_in_words(wrong, message):
+    require_controller("first", PD, PLANT)
+    with pytest.raises(ValueError, match=message):
+        require_controller("first", wrong, PLANT)
+
+
+def test_a_run_refuses_them_before_any_work(tmp_path, unchecked):
+    config = RunConfig(log_dir=tmp_path / "run")
+    with pytest.raises(ValueError, match="first, an instance of LinearGain, must be a class"):
+        Run(config, PLANT, first=LinearGain([[1.0, 1.0]]))
+    with pytest.raises(ValueError, match=r"baselines\['PD'\], an instance of PD, must be .*give its class, PD"):
+        Run(config, PLANT, baselines={"PD": PD(PLANT)})
+    with pytest.raises(ValueError, match="plant=<class .* must be a plant; if this is a class, give an instance"):
+        Run(config, LinearQuadratic)
+    with pytest.raises(ValueError, match=r"plant=LinearQuadratic is a class; give a plant, such as"):
+        check_plant(LinearQuadratic)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_text_stands_for_a_path(unchecked):
+    assert RunConfig(log_dir="runs/mine").log_dir == Path("runs/mine")
+    with pytest.raises(ValueError, match="log_dir=7 must be a path"):
+        RunConfig(log_dir=7)
+    with pytest.raises(ValueError, match="log_dir='' is the current folder"):
+        RunConfig(log_dir="")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AnyPolicy(RunConfig):
+    policy: str = "affine"
+
+
+def test_a_policy_that_nobody_makes_is_refused():
+    with pytest.raises(ValueError, match="policy='affine' does not exist; choose plant or mlp, or override"):
+        AnyPolicy().make_policy(PLANT, torch.Generator())
+    assert isinstance(AnyPolicy(policy="mlp").make_policy(PLANT, torch.Generator()), nn.Module)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WithController(RunConfig):
+    start: str = "controller"
+
+
+def test_the_command_line_of_an_own_recipe_explores_as_its_start_asks():
+    found = from_command_line(WithController, []).twinning
+    assert found.judged_updates and found.exploration.spread == SPREAD_OF_IMITATION
+    asked = from_command_line(WithController, ["--twinning.exploration.spread", "0.3"]).twinning
+    assert asked.judged_updates and asked.exploration.spread == 0.3
+    random = from_command_line(WithController, ["--start", "random"]).twinning
+    assert random == RunConfig().twinning
+
+
+def test_the_check_hides_the_warnings_of_libraries_alone():
+    with warnings.catch_warnings(record=True) as shown, without_warnings_of_libraries():
+        warnings.warn("`torch.jit.script` is deprecated. Please switch.", FutureWarning, stacklevel=1)
+        warnings.warn("`mine` is deprecated.", FutureWarning, stacklevel=1)
+    assert [str(one.message) for one in shown] == ["`mine` is deprecated."]
+
+
+class WrongNeural(LinearQuadratic):
+    def make_neural_closure(self, generator, hidden):
+        return BoundedPerceptron([(-1.0, 1.0)] * 7, [0.1], hidden=hidden, generator=generator)
+
+
+class FixedMerit(LinearQuadratic):
+    def merit(self, states, applied, exogenous):
+        return {"work [J]": (torch.zeros(self.n_steps, dtype=states.dtype) + applied[..., 0]).mean(-1)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"), [(WrongNeural, "make_neural_closure|vector_field"), (FixedMerit, "merit: .*not from n_steps")]
+)
+def test_the_check_finds_what_a_training_would_find_late(kind, message):
+    check_plant(PLANT, steps=5, traced=False)
+    with pytest.raises(PlantContractError, match=message):
+        check_plant(kind(horizon=2.0), steps=5, traced=False)
+
+
+class Twins(LinearQuadratic):
+    def make_neural_closure(self, generator, hidden):
+        return LinearClosure(self.true_closure)
+
+
+def test_a_neural_closure_that_fits_passes():
+    assert check_plant(Twins(horizon=2.0), steps=5, traced=False).plant == Twins.name
+
+
+def test_the_next_step_of_a_plant_without_a_recipe_is_one_that_works(tmp_path):
+    metrics = {
+        "summary": {"unseen": {"J_a_model_based": {"mean": 1.0}, "baselines": {}}}
+        | {"live": "model_based", "better": "model_based"}
+    }
+    alone, made = (next_steps(metrics, tmp_path, config) for config in (RunConfig(), None))
+    assert "plant=...)" in alone and "export_controller(run.policy('model_based')" in alone
+    assert "recipes/export.py" in made and "plant=" not in made
