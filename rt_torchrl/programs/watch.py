@@ -52,18 +52,20 @@ class Watch:
 
     def note_numbers(self, x: np.ndarray) -> None:
         """Note an array, whose numbers must be the same."""
+        x = x.transpose(sorted(range(x.ndim), key=x.strides.__getitem__, reverse=True))
         same = bytearray(x.tobytes()).__eq__  # which takes no copy, but needs numbers side by side
         self.note_values(x, same if same(x) is True else np.ndarray.tobytes)
 
     def note_tensor(self, x: Tensor, *, constant: bool) -> None:
         """Note a tensor, whose memory must be the same, and its numbers if it is constant."""
+        now = x.detach()
         try:
-            numbers = x.detach().numpy()
+            numbers = now.numpy()
         except (RuntimeError, TypeError):  # on another device, or in a layout of its own
             self.complete = False
             return
-        self.note_attributes(x, "dtype", "requires_grad")
-        self.note_values(x, Tensor.data_ptr, Tensor.size, Tensor.stride)
+        self.note_attributes(x, "requires_grad")
+        self.note_values(x, now.is_set_to)  # of the same memory, shape and strides
         if constant:
             self.note_numbers(numbers)
 
