@@ -165,7 +165,7 @@ def test_costs(plant):
     task = Task(plant, batch=5, n=6)
     costed = CostInterval(task.interval)
     state = torch.cat([task.state, task.state.new_zeros(5, 1)], -1)
-    exact = marched(costed, state, *task.drive)[-1, :, -1]
+    exact = marched(costed, state, *task.drive)[-1, :, -1] / 6.0
     wanted = [exact.detach(), *_gradients(exact, task.leaves, torch.arange(1.0, 6.0).double())]
     assert_equal(costs(task, NATIVE), wanted)
 

@@ -128,8 +128,8 @@ class Rollout:
             if (
                 getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
             ):  # the sum holds the change from it
-                found = found + final_cost(self.plant, initial_state) / self.plant.dt
-            return found / exogenous.shape[1]
+                found = found + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
+            return found
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
 
     def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:

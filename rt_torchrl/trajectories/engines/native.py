@@ -75,7 +75,7 @@ class Native(GradientEngine):
         return ends
 
     def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
-        """Sums of the running cost over all intervals, ``batch``; None if the interval cannot become a program.
+        """Means of the running cost over all intervals, ``batch``; None if the interval cannot become a program.
 
         Where a gradient is wanted, it is computed in the same sweep.
         """
@@ -182,8 +182,8 @@ class _Gradients:
             by_drive = torch.from_numpy(self._by_drive * factor[:, None])
             by_t, *rest = by_drive.split([signal.shape[-1] for signal in self._task.drive], -1)
             along = [by_t.squeeze(-1).sum_to_size(self._task.leaves[1].shape), *rest]
-        by_state, by_weights = (part[0] * factor[:, None] for part in (self._by_state, self._by_weights))
-        return [torch.from_numpy(by_state), *along, *self._task.weights.split(by_weights.sum(0))]
+        by_state = torch.from_numpy(self._by_state[0] * factor[:, None])
+        return [by_state, *along, *self._task.weights.split(np.einsum("i,ij->j", factor, self._by_weights[0]))]
 
 
 class _EndStates(torch.autograd.Function):
@@ -220,7 +220,7 @@ class _EndStates(torch.autograd.Function):
 
 
 class _Costs(torch.autograd.Function):
-    """Maps (s_0, t, z, a, w) to the last signal of s_n of each realisation, and computes its gradients at once."""
+    """Maps (s_0, t, z, a, w) to the last signal of s_n by n of each realisation, and computes its gradients at once."""
 
     @staticmethod
     def forward(ctx: Any, task: _Task, enabled: bool, *leaves: Tensor) -> Tensor:
@@ -245,9 +245,10 @@ class _Costs(torch.autograd.Function):
                 gradients.sweep(group, way_back(), last=1.0)
 
         for_each_group(task.batch, task.lanes, work)
-        return torch.from_numpy(costs)
+        ctx.n = task.n
+        return torch.from_numpy(costs / task.n)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, *ctx.gradients.weighed(gradient.numpy())
+        return None, None, *ctx.gradients.weighed(gradient.numpy() / ctx.n)
