@@ -153,12 +153,11 @@ class LaneWriter:
         lane = self.emit(f"call <{n} x i64> @llvm.smin.v{n}i64(<{n} x i64> {lane}, <{n} x i64> {count})")
         for j in range(sizes["x"]):
             at = [self.emit(f"getelementptr i64, ptr %x, i64 {3 * j + i}") for i in range(3)]
-            start, across, along = [self.emit(f"load i64, ptr {x}, !invariant.load !{{}}") for x in at]
+            kinds = zip(("ptr", "i64", "i64"), at, strict=True)
+            start, across, along = [self.emit(f"load {kind}, ptr {x}, !invariant.load !{{}}") for kind, x in kinds]
+            here = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
             distance = self.emit(f"mul <{n} x i64> {lane}, {self._same(across)}")
-            first = self.emit(f"inttoptr i64 {start} to ptr")
-            places = self.emit(f"getelementptr i8, ptr {first}, <{n} x i64> {distance}")
-            moved = self.emit(f"mul i64 {row}, {along}")
-            found["x", j] = self._gathered(self.emit(f"getelementptr i8, <{n} x ptr> {places}, i64 {moved}"))
+            found["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {here}, <{n} x i64> {distance}"))
         return found
 
     def _same(self, index: str) -> str:

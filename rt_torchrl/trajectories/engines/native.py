@@ -81,13 +81,13 @@ class Native(GradientEngine):
         """
         if self._costed is None or self._costed.interval is not interval:
             self._costed = CostInterval(interval)
-        task = self._task(self._costed, initial_state, drive, sums=1)
+        task = self._task(self._costed, initial_state, drive)
         enabled = torch.is_grad_enabled()
         costs: Tensor | None = None if task is None else _Costs.apply(task, enabled, *task.leaves)
         return costs
 
-    def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive, *, sums: int = 0) -> "_Task | None":
-        found = programs_of(interval, initial_state, drive, sums=sums)
+    def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":
+        found = programs_of(interval, initial_state, drive)
         return found and _Task(*found, initial_state, drive, self.memory)
 
 

@@ -30,24 +30,16 @@ fingerprint knows by their address."""
 _lock = threading.RLock()
 
 
-def programs_of(
-    interval: nn.Module, initial_state: Tensor, drive: Drive, *, sums: int = 0
-) -> tuple[Programs, Weights] | None:
+def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[Programs, Weights] | None:
     """The programs of an interval with its weights; None where there are none.
 
     There are none for an interval that is not on the CPU or, with one warning, cannot become a program. Where a
     gradient is wanted, the sweep is prepared too: later the interval may be another one.
-
-    Args:
-        interval: the interval.
-        initial_state: initial states.
-        drive: drive of all intervals.
-        sums: number of further states, which begin with zero.
     """
     if initial_state.device.type != "cpu":
         return None
     with _lock:
-        (held, weights), lanes = _known_as(interval), lanes_of_this_machine()
+        (held, weights), lanes, sums = _known_as(interval), lanes_of_this_machine(), getattr(interval, "sums", 0)
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (held.digest, lanes, *widths)
         found, alive = _kept.get(key, (None, held.alive))
