@@ -104,11 +104,13 @@ class LaneWriter:
         element, known = ("double", ", !invariant.load !{}") if shared else (self.vector, "")
         place = self.emit(f"getelementptr {element}, ptr {array}, i64 {index}")
         found = self.emit(f"load {element}, ptr {place}, {WIDTH}{known}")
-        if not shared:
-            return found
-        one = self.emit(f"insertelement {self.vector} poison, double {found}, i32 0")
-        zeros = f"<{self.lanes.number} x i32> zeroinitializer"
-        return self.emit(f"shufflevector {self.vector} {one}, {self.vector} poison, {zeros}")
+        return self._in_all("double", found) if shared else found
+
+    def _in_all(self, kind: str, number: str) -> str:
+        """A number in every lane."""
+        n = self.lanes.number
+        one = self.emit(f"insertelement <{n} x {kind}> poison, {kind} {number}, i32 0")
+        return self.emit(f"shufflevector <{n} x {kind}> {one}, <{n} x {kind}> poison, <{n} x i32> zeroinitializer")
 
     def store(self, array: str, index: str, operand: str) -> None:
         place = self.emit(f"getelementptr {self.vector}, ptr {array}, i64 {index}")
@@ -147,24 +149,18 @@ class LaneWriter:
     def inputs(self, sizes: dict[str, int], k: str) -> dict[tuple[str, int], str]:
         """Drive and state of interval k, see :func:`march_text`."""
         n, found = self.lanes.number, {("s", j): x for j, x in enumerate(self.row("%s", sizes["s"], k))}
-        count, row = self._same("%last"), self.emit(f"add nsw i64 {k}, %row")
+        count, row = self._in_all("i64", "%last"), self.emit(f"add nsw i64 {k}, %row")
         lanes = f"<{n} x i64> <{', '.join(f'i64 {i}' for i in range(n))}>"
-        lane = self.emit(f"add {lanes}, {self._same('%first')}")
+        lane = self.emit(f"add {lanes}, {self._in_all('i64', '%first')}")
         lane = self.emit(f"call <{n} x i64> @llvm.smin.v{n}i64(<{n} x i64> {lane}, <{n} x i64> {count})")
         for j in range(sizes["x"]):
             at = [self.emit(f"getelementptr i64, ptr %x, i64 {3 * j + i}") for i in range(3)]
             kinds = zip(("ptr", "i64", "i64"), at, strict=True)
             start, across, along = [self.emit(f"load {kind}, ptr {x}, !invariant.load !{{}}") for kind, x in kinds]
             here = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
-            distance = self.emit(f"mul <{n} x i64> {lane}, {self._same(across)}")
+            distance = self.emit(f"mul <{n} x i64> {lane}, {self._in_all('i64', across)}")
             found["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {here}, <{n} x i64> {distance}"))
         return found
-
-    def _same(self, index: str) -> str:
-        """An index in every lane."""
-        n = self.lanes.number
-        one = self.emit(f"insertelement <{n} x i64> poison, i64 {index}, i32 0")
-        return self.emit(f"shufflevector <{n} x i64> {one}, <{n} x i64> poison, <{n} x i32> zeroinitializer")
 
     def row(self, array: str, count: int, row: str) -> list[str]:
         """The operands in a row of an array of lanes."""
