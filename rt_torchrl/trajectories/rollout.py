@@ -140,8 +140,9 @@ class Rollout:
         """
         given = initial_state, exogenous, command
         stamps = None if isinstance(start, Tensor) else (start, self.plant.dt, *map(_stamp, given))
-        if self._driven is not None and self._driven[0] == stamps:
-            return self._driven[1]
+        held = self._driven
+        if held is not None and held[0] == stamps:
+            return held[1]
         drive, self._driven = self._checked_drive(initial_state, exogenous, command, start), None
         if stamps is not None and all(map(_repeatable, given)):
             self._driven = stamps, drive, given
