@@ -125,9 +125,8 @@ class Rollout:
         summed = self.plant.end_cost is None or self.interval.policy is not None
         found = self._engine.costs(self.interval, initial_state, drive) if summed else None
         if found is not None and all_finite(found):
-            if (
-                getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
-            ):  # the sum holds the change from it
+            charged = getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
+            if charged:  # the sum holds the change from the first state's
                 found = found + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
             return found
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
