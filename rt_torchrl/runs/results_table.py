@@ -170,12 +170,13 @@ def _change(start: float | None, found: float | None) -> float:
     return abs(found - start) / max(abs(start), abs(found), 1e-300)
 
 
-def next_steps(metrics: dict[str, Any], folder: Path) -> str:
+def next_steps(metrics: dict[str, Any], folder: Path, planner: str | None = None) -> str:
     """What to do with the run, from what its results say: one line for each thing.
 
     Args:
         metrics: content of ``metrics.json``.
         folder: run folder.
+        planner: method of the planner; with receding_horizon the model-based policy cannot be exported.
     """
     found = metrics["summary"]
     unseen, live = found["unseen"], found["live"]
@@ -190,6 +191,10 @@ def next_steps(metrics: dict[str, Any], folder: Path) -> str:
         steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
+    elif live == "model_based" and planner == "receding_horizon":
+        steps.append(f"let model predictive control act: {call_of('real_time')} {folder}")
+        steps.append(f"take the model that it plans on away: {call_of('export')} {folder} --what twin")
     else:
-        steps.append(f"take the controller away: {call_of('export')} {folder}")
+        role = "" if live == "model_based" else " --role model_free"
+        steps.append(f"take the controller away: {call_of('export')} {folder}{role}")
     return "\n".join(f"  next: {step}" for step in steps)

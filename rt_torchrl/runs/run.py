@@ -223,7 +223,7 @@ class Run:
         dashboard.results(options, metrics["summary"], table)
         dashboard.close()
         print(table)
-        print(f"results in {self.folder}\n{next_steps(metrics, self.folder)}")
+        print(f"results in {self.folder}\n{next_steps(metrics, self.folder, self.config.twinning.planner.method)}")
         return metrics
 
     def _all_episodes(self, dashboard: Dashboard, bar: Progress) -> None:
