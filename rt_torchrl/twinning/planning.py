@@ -103,8 +103,8 @@ class Planning:
         if self.config.approach and episode == self.config.approach_at:
             found = self._approached(found, planned_on, judged_on)
         for _ in range(self.config.rounds - 1):
-            drawn = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
-            further = self._from_the_present(*drawn, judgement)
+            planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
+            further = self._from_the_present(planned_on, judged_on, judgement)
             found = merged(found, further) if further["plan_accepted"] else found
         constraints = self.virtual.constraints
         return merged(found, findings(**constraints.report())) if constraints else found
