@@ -90,10 +90,10 @@ def limits(entries: dict[str, list[Entry]], known: dict[str, list[Entry]]) -> Fi
         bars = ax.barh(range(len(rows)), ratios, color=[colours[entry.name] for entry in rows], height=0.7)
         ax.bar_label(bars, [f"{ratio:.3g}" for ratio in ratios], padding=3, fontsize=8)
         ax.set_yticks(range(len(rows)), [shown(entry.name) for entry in rows])
-        ax.axvline(1.0, **REFERENCE_LINE)
         if max(ratios) > WIDEST_LINEAR:
             ax.set_xscale("log")
         ax.margins(x=0.15)
+        ax.set_xlim(left=1.0)  # the limit itself
         caption(ax, f"{shown(plant)}: $J_a$ over the limit, on its {best.costs.shape[1]} episodes")
     return figure
 
