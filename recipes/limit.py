@@ -187,9 +187,10 @@ def row(name: str, contender: Contender, best: Contender) -> str:
 
 def evidence_of(best: Contender) -> str:
     """What says that the clairvoyant optimum is one, for the terminal."""
-    starts = ", ".join(f"{name} {share:.1e}" for name, share in best.details["above_the_best"].items())
-    gradient = best.details["projected_gradient"]
-    return f"clairvoyant optimum: projected gradient {gradient:.2g}\nstarts above it: {starts}"
+    gradient, first = best.details["projected_gradient"], best.details["above_the_best_at_first"]
+    starts = [f"{name} {share:.1e} ({first[name]:.1e})" for name, share in best.details["above_the_best"].items()]
+    above = f"starts above it, in brackets after the first of two descents: {', '.join(starts)}"
+    return f"clairvoyant optimum: projected gradient {gradient:.2g}\n{above}"
 
 
 if __name__ == "__main__":

@@ -292,6 +292,8 @@ def draw(config: Config, results: Results) -> list["CaptionedFigure"]:
     folder = config.kept / place
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
+    if config.limit_episodes:
+        drawn["limits"] = charts.limits(results.entries, results.limits)
     if config.variant_seeds:
         drawn["variants"] = charts.variants(results.entries, results.variants)
         drawn["following"] = charts.following(results.entries, results.variants)

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5
@@ -138,6 +141,35 @@ def test_two_equal_components_stay_equal_and_samples_differ():
     # The spectrum is singular: rounding is its root's, 1e-8 of the deviation.
     torch.testing.assert_close(drawn[..., 0], drawn[..., 1], rtol=0, atol=1e-6)
     assert not torch.equal(drawn[0], drawn[1])
+
+
+@pytest.mark.parametrize("n", [299, 300])
+def test_redrawn_large_scales_keep_means_spectra_and_cross_spectra(n):
+    """The small scale of a seed is the same either way, so that a difference is that of the large scales."""
+    t = DT * np.arange(n)
+    slow = np.stack([11.0 + 2.0 * np.sin(t / 20.0), 3.0 + np.cos(t / 20.0) + 0.5 * np.sin(t / 7.0)], -1)
+    found = process(slow + bivariate(n, 0.0, 0, 0.5) * 0.1, FREE * 2)
+    met, redrawn = (found.sample(200, seeded(1), redrawn=redrawn) for redrawn in (False, True))
+    large = found.mean + (redrawn - met)
+    spectra, expected = torch.fft.rfft(large, dim=1), torch.fft.rfft(found.mean, dim=0)
+    torch.testing.assert_close(spectra.abs(), expected.abs().expand(200, -1, -1), rtol=1e-9, atol=1e-9)
+    cross = (spectra[..., 0] * spectra[..., 1].conj())[:, : (n + 1) // 2]
+    torch.testing.assert_close(cross, (expected[:, 0] * expected[:, 1].conj())[: (n + 1) // 2].expand_as(cross))
+    # At any time the mean over draws is that over time, but for the standard error of 200 draws, five of them.
+    assert (large.mean(0) - found.mean.mean(0)).abs().max() < 5 * found.mean.std(0).max() / math.sqrt(200)
+
+
+def test_virtual_episodes_have_new_large_scales_where_they_are_asked_for():
+    plant, draws = WindTurbine(horizon=60.0), {}
+    record = 11.0 + torch.sin(torch.arange(plant.n_steps, dtype=torch.float64) * (2.0 * torch.pi / 40.0))
+    for which in ("met", "redrawn"):
+        config = ExogenousConfig(large_scale=which)
+        virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), config, 1, generator=seeded())
+        virtual.processes.append(ExogenousProcess(record[:, None], dt=plant.dt, signals=plant.inputs))
+        draws[which] = virtual.draw(50).exogenous[..., 0]
+    errors = {which: (found - record).square().mean().item() for which, found in draws.items()}
+    # Two sines of random phases differ by the sum of their mean squares, half each.
+    assert errors["met"] < 0.01 and errors["redrawn"] == pytest.approx(1.0, abs=0.3)
 
 
 def test_seed_fixes_the_samples():

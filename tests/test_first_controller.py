@@ -24,12 +24,13 @@ from rt_torchrl.twinning.starts import FirstController
 GAINS = (0.4, 0.3)
 
 
-def twinning(*, gains=GAINS, iterations=0, model_free=None, approach=0, approach_at=3, **options):
+def twinning(*, gains=GAINS, iterations=0, model_free=None, approach=0, approach_at=3, rounds=1, **options):
     plant = LinearQuadratic(horizon=2.0)
     generator = torch.Generator().manual_seed(3)
     learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
     descent = DescentConfig(optimiser="lbfgs", rate=1.0)
-    planner = PlannerConfig(iterations=iterations, descent=descent, approach=approach, approach_at=approach_at)
+    further = {"approach": approach, "approach_at": approach_at, "rounds": rounds}
+    planner = PlannerConfig(iterations=iterations, descent=descent, **further)
     assimilation = AssimilationConfig(iterations=3, descent=DescentConfig(rate=0.02))
     parts = {"learner": learner, "planner": planner, "assimilation": assimilation}
     return ReinforcementTwinning(
@@ -160,6 +161,32 @@ def test_an_approach_by_small_steps_stays_where_it_costs_less():
         report = found.plan()
         assert ("approached" in report) == kept
         assert torch.equal(found.policies["model_based"].gain, before) != kept
+
+
+def test_rounds_of_plans_have_draws_of_their_own(monkeypatch):
+    """One gradient is taken in each, so that three rounds go on where one ends."""
+    costs, fresh = {}, None
+    for rounds in (1, 3):
+        found, seen = twinning(iterations=2, rounds=rounds), []
+        flight = found.flights.fly(found.policies["model_based"], strength=0.0, whole=True)
+        found.keep(flight)
+        found.virtual.learn(flight.record)
+        plan = found.planner.plan
+        monkeypatch.setattr(
+            found.planner, "plan", lambda episodes, plan=plan, seen=seen: seen.append(episodes) or plan(episodes)
+        )
+        assert found.plan()["plan_accepted"] == 1.0
+        assert len({tuple(one.exogenous.flatten().tolist()) for one in seen}) == len(seen) == rounds
+        assert {len(one.initial_state) for one in seen} == {4}
+        fresh = fresh or found.virtual.draw(50)
+        costs[rounds] = found.virtual.cost(found.policies["model_based"], fresh).item()
+    assert costs[3] < costs[1]
+
+
+@pytest.mark.parametrize("options", [{"rounds": 0}, {"rounds": 2, "method": "receding_horizon"}])
+def test_wrong_rounds_are_refused(options):
+    with pytest.raises(ValueError, match=f"rounds={options['rounds']}"):
+        PlannerConfig(**options)
 
 
 WINDOW = {"approach": 5, "short_horizon": ShortHorizonConfig(window=5)}

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 
 import pytest
 from linear_quadratic import LinearQuadratic
@@ -16,6 +17,8 @@ from rt_torchrl.runs.results_table import SCREEN, next_steps, results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.planners.planner import PlannerConfig
 
 TURBINE = config_class_of(RECIPES / "wind_turbine.py")
 
@@ -150,14 +153,19 @@ def test_the_next_step_follows_from_the_results(stopped, tmp_path):
     live = metrics["summary"]["live"]
     cost = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
 
-    def said(better, controller):
+    def said(better, controller, planner=None, **summary):
         unseen = metrics["summary"]["unseen"] | {"baselines": {"PI": {"J_a": {"mean": controller}}}}
-        return next_steps({"summary": metrics["summary"] | {"unseen": unseen, "better": better}}, tmp_path)
+        found = metrics["summary"] | {"unseen": unseen, "better": better} | summary
+        config = TURBINE(twinning=TwinningConfig(planner=PlannerConfig(method=planner)))
+        return next_steps({"summary": found}, tmp_path, config)
 
     other = {"model_based": "model_free", "model_free": "model_based"}[live]
     assert "recipes/export.py" in said(live, 2.0 * cost)
     assert "PI is better than the live policy" in said(live, 0.5 * cost)
     assert f"({other.replace('_', '-')}): export that role" in said(other, 2.0 * cost)
+    assert said("model_free", math.inf, live="model_free").endswith("--role model_free")
+    planned = said("model_based", math.inf, "receding_horizon", live="model_based")
+    assert "recipes/real_time.py" in planned and planned.endswith("--what twin")
 
 
 def test_a_small_run_ends_early_by_its_option(tmp_path, monkeypatch):

@@ -42,6 +42,17 @@ class PricedEnd(LinearQuadratic):
         return self.price * state.square().sum(-1)
 
 
+class TwoWays(LinearQuadratic):
+    """Each force has two minima, −1.5 and 1, of which the second one is worse and shallow.
+
+    Its slope is (a + 1.5)(a − 0.8)(a − 1).
+    """
+
+    def running_cost(self, t, state, action, exogenous):
+        a = action[..., 0]
+        return a**4 / 4 - 0.1 * a**3 - 0.95 * a**2 + 1.2 * a + 2.334375
+
+
 def quadratic_program(plant, s_0, z):
     """The optimal actions of an episode as a bounded least-squares problem, and their J_a."""
     A, B, D, Q, R = matrices(plant)
@@ -82,6 +93,17 @@ def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program(kind):
     assert set(found.start_costs) == set(starts) and found.excess == 0.0
     assert found.gradient.max() < 1e-5
     torch.testing.assert_close(found.costs, control_cost(plant, found.flown))
+
+
+def test_the_second_descent_leaves_a_shallow_minimum():
+    plant = TwoWays(horizon=2.0)
+    state, exogenous = episodes(plant, 2)
+    both = torch.where(torch.arange(plant.n_steps) % 2 == 0, -1.5, 1.0).double()[:, None].expand(2, -1, -1)
+    found = clairvoyant(plant, state, exogenous, {"both": both})
+    shallow = 1 / 4 - 0.1 - 0.95 + 1.2 + 2.334375
+    torch.testing.assert_close(found.first_costs["both"], torch.full((2,), shallow / 2).double(), rtol=1e-6, atol=0)
+    assert found.costs.max() < 1e-6 * shallow
+    assert found.spread(first=True)["both"] > found.spread()["both"] == 0.0
 
 
 def test_held_commands_cost_more_than_free_ones_and_change_only_between_blocks():
@@ -133,6 +155,7 @@ def test_rate_limits_leave_starts_that_agree():
     starts |= constant_starts(plant, 2, plant.n_steps)
     found = clairvoyant(plant, state, exogenous, starts)
     assert max(found.spread().values()) < 1e-3 and found.excess < 1e-3
+    assert all((found.start_costs[name] <= found.first_costs[name]).all() for name in starts)
     assert found.costs.mean() < 0.5 * control_cost(plant, JonkmanController(plant).fly(state, exogenous)).mean()
 
 

@@ -88,7 +88,7 @@ def test_the_report_is_written_from_what_is_kept(tmp_path):
     assert all(task.done() for task in study.ordered_tasks(config))
     page = study.write(config)
     text = (page.parent / "README.md").read_text()
-    study_figures = ["learning", "robustness", "variants", "following", "flapping_wing_episode-line"]
+    study_figures = ["learning", "robustness", "limits", "variants", "following", "flapping_wing_episode-line"]
     shown = [part.split(")")[0] for part in text.split("](figures/")[1:]]
     assert shown == [f"{name}.png" for name in [*study_figures, *(f"flapping_wing_{name}" for name in names)]]
     assert page.read_text().count("data:image/png;base64,") == len(shown)

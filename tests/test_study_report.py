@@ -81,6 +81,18 @@ def test_the_figures_show_every_arm_and_yardstick(tmp_path):
     assert np.allclose(following.lines[1].get_ydata(), [0.05, 0.0105, 0.01])
 
 
+def test_a_figure_shows_how_far_from_the_limit_everything_is(tmp_path):
+    found = results(tmp_path)
+    (ax,) = charts.limits(found.entries, found.limits).axes
+    drawn = dict(zip([label.get_text() for label in ax.get_yticklabels()], ax.patches, strict=True))
+    twinning, best = found.entries["flapping_wing"][0], found.limits["flapping_wing"][0]
+    assert drawn["mpc"].get_width() == pytest.approx(1.5) and "limit" not in drawn
+    assert drawn["twinning"].get_width() == pytest.approx(twinning.costs[:, :8].mean() / best.costs.mean())
+    assert set(drawn) == {"mpc", *(entry.name.replace("_", " ") for entry in found.entries["flapping_wing"])}
+    said = captions.limits(found)
+    assert f"the limit is {best.mean:.4g}; mpc is nearest, 1.500" in said
+
+
 def test_captions_say_what_is_seen(tmp_path):
     found = results(tmp_path)
     curves = captions.learning(found)

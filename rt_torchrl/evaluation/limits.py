@@ -159,6 +159,7 @@ def evidence(found: Clairvoyant) -> dict[str, Any]:
         "projected_gradient": found.gradient.max().item(),
         "excess": found.excess,
         "above_the_best": found.spread(),
+        "above_the_best_at_first": found.spread(first=True),
         "gradients": found.gradients,
     }
 

@@ -194,8 +194,21 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
         steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
-    elif alone:
-        steps.append(f"take the controller away: {call_of('export')} {folder}")
     else:
-        steps.append(f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)")
+        steps += _taking_away(live, folder, None if config is None else config.twinning.planner.method, alone=alone)
     return "\n".join(f"  next: {step}" for step in steps)
+
+
+def _taking_away(live: str, folder: Path, planner: str | None, *, alone: bool) -> list[str]:
+    """What to do with the live policy; model predictive control acts from here, and its model can be exported."""
+    if not alone and live == "model_based" and planner == "receding_horizon":
+        return ["take the model that is planned on away: rt_torchrl.export_twin(run.closure, 'it.c', plant)"]
+    if not alone:
+        return [f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)"]
+    if live == "model_based" and planner == "receding_horizon":
+        return [
+            f"let model predictive control act: {call_of('real_time')} {folder}",
+            f"take the model that it plans on away: {call_of('export')} {folder} --what twin",
+        ]
+    role = "" if live == "model_based" else " --role model_free"
+    return [f"take the controller away: {call_of('export')} {folder}{role}"]

@@ -60,6 +60,20 @@ def robustness(results: Results) -> str:
     return " ".join(lines)
 
 
+def limits(results: Results) -> str:
+    """Caption of the ratios to the limit: it gives the limit, and who comes nearest."""
+    lines = ["Mean cost over that of the clairvoyant optimum, whose commands know all disturbances, on its episodes."]
+    for plant, found in entries_by_name(results):
+        others = named(results.limits[plant])
+        best = others.pop("limit")
+        ratios = {name: entry.over(best) for name, entry in (found | others).items()}
+        nearest = min(ratios, key=ratios.__getitem__)
+        lines.append(
+            f"{title(plant)}: the limit is {best.mean:.4g}; {shown(nearest)} is nearest, {ratios[nearest]:.3f}."
+        )
+    return " ".join(lines)
+
+
 def variants(results: Results) -> str:
     """Caption of the figure of noise and model error: it says where twinning suffers most."""
     lines = ["Cost of every arm under sensor noise and model error over twinning's nominal cost; each point is a seed."]
@@ -108,7 +122,7 @@ def episode_line(found: dict[str, Any]) -> str:
 
 LINES: dict[str, Callable[[dict[str, Any]], str]] = {"gain-line": gain_line, "episode-line": episode_line}
 STUDY: dict[str, Callable[[Results], str]] = {
-    function.__name__: function for function in (learning, robustness, variants, following)
+    function.__name__: function for function in (learning, robustness, limits, variants, following)
 }
 
 

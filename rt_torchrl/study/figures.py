@@ -73,6 +73,31 @@ def robustness(entries: dict[str, list[Entry]]) -> Figure:
     return figure
 
 
+def limits(entries: dict[str, list[Entry]], known: dict[str, list[Entry]]) -> Figure:
+    """J_a over the clairvoyant optimum on the same episodes: a bar for every arm, controller and predictive control.
+
+    Args:
+        entries: entries of each plant.
+        known: entries ``limit`` and ``mpc`` of each plant, on the first of the unseen episodes.
+    """
+    height = 1.0 + 0.32 * max(len(found) + len(known[plant]) for plant, found in entries.items())
+    size = (max(7.5, 5.2 * len(entries)), max(3.0, height))
+    figure, axes = panels(1, len(entries), title="How far from the best possible: cost over the limit", size=size)
+    for ax, (plant, found) in zip(axes.flat, entries.items(), strict=True):
+        best, colours = named(known[plant])["limit"], _colours([*found, *known[plant]])
+        rows = sorted((entry for entry in (*found, *known[plant]) if entry is not best), key=lambda e: -e.over(best))
+        ratios = [entry.over(best) for entry in rows]
+        bars = ax.barh(range(len(rows)), ratios, color=[colours[entry.name] for entry in rows], height=0.7)
+        ax.bar_label(bars, [f"{ratio:.3g}" for ratio in ratios], padding=3, fontsize=8)
+        ax.set_yticks(range(len(rows)), [shown(entry.name) for entry in rows])
+        if max(ratios) > WIDEST_LINEAR:
+            ax.set_xscale("log")
+        ax.margins(x=0.15)
+        ax.set_xlim(left=1.0)  # the limit itself
+        caption(ax, f"{shown(plant)}: $J_a$ over the limit, on its {best.costs.shape[1]} episodes")
+    return figure
+
+
 def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[Entry]]]) -> Figure:
     """Mean J_a of every arm under sensor noise and model error over twinning's nominal mean, a point for every seed.
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,12 +24,16 @@ class ExogenousConfig:
             large scale.
         penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
         tube: half-width ε of the regression's tube, in standard deviations of the record.
+        large_scale: large scale of the inputs that steps 5 and 6 draw: met for those of the real episodes, as in the
+            paper, or redrawn for new ones with their spectra at random phases. A policy with hundreds of weights fits
+            itself to a few winds that were met. Redrawn inputs have no events at fixed times, such as a step.
     """
 
     knots: int = 300
     kernel_width: float = 2.0
     penalty: float = 10.0
     tube: float = 0.05
+    large_scale: Literal["met", "redrawn"] = "met"
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -49,7 +54,12 @@ class ExogenousProcess:
     .. math:: \Gamma_{kl}(h) = \mathrm E\,\varepsilon_k(t + h)\,\varepsilon_l(t)
 
     are the sample covariances times a Parzen window, which keeps them positive semi-definite. Circulant embedding
-    samples them exactly. The large scales themselves do not vary between realisations.
+    samples them exactly. The large scales themselves do not vary between realisations, unless they are redrawn: then
+    they have other phases, which are uniform and the same for all components,
+
+    .. math:: \tilde d'_k(t) = \sum_f |\hat d_k(f)|\,e^{i(\arg \hat d_k(f) + \varphi_f)}\,e^{2\pi i f t}
+
+    so that means, spectra and cross-spectra stay as they are.
 
     Args:
         record: exogenous input z at every control interval.
@@ -60,7 +70,8 @@ class ExogenousProcess:
     Raises:
         ValueError: if the record holds NaN, or fewer samples than a regression needs.
 
-    Source of the sampling: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088.
+    Sources: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088, of the sampling; Prichard and Theiler, Phys. Rev.
+    Lett. 73 (1994) 951, of the random phases.
     """
 
     def __init__(
@@ -103,8 +114,16 @@ class ExogenousProcess:
         process._low, process._high = bounds(signals, dtype=process.mean.dtype, device=process.mean.device)
         return process
 
-    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
-        """Realisations of the input, within the physical ranges of the signals."""
+    def sample(
+        self, count: int, generator: torch.Generator, *, redrawn: bool = False
+    ) -> Float[Tensor, "{count} n n_z"]:
+        """Realisations of the input, within the physical ranges of the signals.
+
+        Args:
+            count: number of realisations.
+            generator: source of the draws.
+            redrawn: whether each has a large scale of its own, with the spectrum of the record's.
+        """
         n, n_z = self.mean.shape
         shape = (count, 2 * n, n_z)
         noise = torch.complex(
@@ -112,17 +131,27 @@ class ExogenousProcess:
         )
         coloured = (self._root * noise.unsqueeze(-2)).sum(-1)
         small = torch.fft.fft(coloured, dim=1).real[:, :n]
-        return (self.mean + small).clamp(self._low, self._high)
+        large = self._redrawn(count, generator) if redrawn else self.mean
+        return (large + small).clamp(self._low, self._high)
+
+    def _redrawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
+        """Large scales at random phases, of which the mean and the Nyquist frequency have none."""
+        n, spectrum = len(self.mean), torch.fft.rfft(self.mean, dim=0)
+        turns = torch.rand(count, len(spectrum), 1, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
+        turns[:, 0] = 0.0
+        if n % 2 == 0:
+            turns[:, -1] = 0.0
+        return torch.fft.irfft(spectrum * torch.polar(torch.ones_like(turns), 2.0 * torch.pi * turns), n, dim=1)
 
 
 def sample_experience(
-    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator
+    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator, *, redrawn: bool = False
 ) -> Float[Tensor, "{count} n n_z"]:
     """Realisations from the processes of several episodes, in random order; each is drawn once before any is again."""
     rounds = -(-count // len(processes))
     order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
     chosen = torch.cat(order)[:count].tolist()
-    return torch.cat([processes[k].sample(1, generator) for k in chosen])
+    return torch.cat([processes[k].sample(1, generator, redrawn=redrawn) for k in chosen])
 
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:

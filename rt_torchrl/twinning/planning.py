@@ -85,8 +85,8 @@ class Planning:
 
         Args:
             episode: number of the real episode, from 1.
-            planned_on: virtual episodes of the plan.
-            judged_on: virtual episodes on which it is judged.
+            planned_on: virtual episodes of the plan; further rounds draw as many.
+            judged_on: virtual episodes on which it is judged; further rounds draw as many.
             judgement: how it is judged.
 
         Raises:
@@ -102,6 +102,10 @@ class Planning:
             found = found if other is None else other
         if self.config.approach and episode == self.config.approach_at:
             found = self._approached(found, planned_on, judged_on)
+        for _ in range(self.config.rounds - 1):
+            planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
+            further = self._from_the_present(planned_on, judged_on, judgement)
+            found = merged(found, further) if further["plan_accepted"] else found
         constraints = self.virtual.constraints
         return merged(found, findings(**constraints.report())) if constraints else found
 

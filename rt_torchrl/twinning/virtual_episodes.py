@@ -86,9 +86,10 @@ class VirtualEpisodes:
         optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
         one wind of twenty.
         """
-        plant = self.twin.plant
+        plant, redrawn = self.twin.plant, self.config.large_scale == "redrawn"
         initial_state = plant.draw_initial_state(count, self.generator)
-        return Scenario(initial_state, plant.with_previews(sample_experience(self.processes, count, self.generator)))
+        exogenous = sample_experience(self.processes, count, self.generator, redrawn=redrawn)
+        return Scenario(initial_state, plant.with_previews(exogenous))
 
     @torch.no_grad()
     def cost(self, policy: nn.Module, episodes: Scenario) -> Tensor:

@@ -99,6 +99,9 @@ class PlannerConfig:
         realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
             algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
             plan made on one of them says little about the others.
+        rounds: number of plans that follow each other in step 5, each on virtual episodes that are drawn anew. A policy
+            with hundreds of weights fits itself to those of a single plan of many gradients, and one of them under
+            which the gradient explodes ends that plan.
         approach: number of gradients of Adam with small steps that lead to two more plans, one from the present weights
             and one from those before the imitation of a controller; each stays if it costs less on other virtual
             episodes; 0 for none. A descent from the imitation of a controller may end in a minimum beside that
@@ -115,6 +118,7 @@ class PlannerConfig:
     method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
     iterations: int = 10
     realisations: int | None = None
+    rounds: int = 1
     approach: int = 0
     approach_at: int = 3
     experience: int = 100
@@ -137,6 +141,11 @@ class PlannerConfig:
             )
         if self.iterations < 0:
             raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
+        if self.rounds < 1 or (self.rounds > 1 and self.method == "receding_horizon"):
+            raise ValueError(
+                f"rounds={self.rounds} of the planning must be at least 1, and 1 with method receding_horizon, which "
+                "plans while it acts."
+            )
         if self.approach < 0 or self.approach_at < 1:
             raise ValueError(
                 f"approach={self.approach} of the planning must not be negative, and approach_at={self.approach_at} "
