@@ -149,3 +149,9 @@ class Blind(PlantEnv):
     def _step(self, tensordict):
         found = super()._step(tensordict)
         return found.set("observation", found["observation"] * torch.nan) if self._step_count >= 4 else found
+
+
+def test_a_layer_that_has_flown_nothing_has_an_empty_report():
+    """A check of a protocol reads it before the first episode, in some processes."""
+    layer = SafetyLayer(PlantEnv(LinearQuadratic(horizon=HORIZON), seed=4), SafetyConfig(interval=0.1), fallback=(0.0,))
+    assert not layer.reports and not layer.report.events and not layer.report.counts

@@ -126,8 +126,11 @@ class SafetyLayer(AroundSystem):
 
     @property
     def report(self) -> SafetyReport:
-        """Report of the present episode; between two episodes, that of the last one."""
-        return self.reports[-1]
+        """Report of the present episode; between two episodes, that of the last one, and before the first an empty one.
+
+        A check of a protocol with a ``report`` reads it at any time.
+        """
+        return self.reports[-1] if self.reports else SafetyReport()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if self._unwritten is not None:
