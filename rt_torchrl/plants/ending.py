@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rt_torchrl.plants.innermost import innermost
+
 if TYPE_CHECKING:
     from rt_torchrl.plants.plant import Plant
 
@@ -40,10 +42,8 @@ def require_end_cost(plant: "Plant") -> None:
     Raises:
         ValueError: if there is no finite ``end_cost``.
     """
-    inner: Ending = plant
-    while isinstance(base := getattr(inner, "base", None), Ending):
-        inner = base  # an extension ends where its plant does
-    if type(inner).ended is not Ending.ended and plant.end_cost is None:
+    # An extension ends where its plant does.
+    if type(innermost(plant)).ended is not Ending.ended and plant.end_cost is None:
         raise ValueError(
             f"plant {plant.name!r} defines ended() and no end_cost; set it to the cost of each moment after an early "
             "end, greater than the running cost of a bad episode."
@@ -69,3 +69,21 @@ def final_cost(plant: "Plant", state: Float[Tensor, "*batch n_s"]) -> Float[Tens
     """Φ_a of the last state of an episode, or zero if the episode had ended in it."""
     terminal = plant.terminal_cost(state)
     return terminal if plant.end_cost is None else torch.where(plant.ended(state), torch.zeros_like(terminal), terminal)
+
+
+def flight_costs(
+    plant: "Plant",
+    t: Tensor,
+    states: Float[Tensor, "*batch m n_s"],
+    applied: Float[Tensor, "*batch n n_a"],
+    exogenous: Float[Tensor, "*batch n n_z"],
+) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
+    """L_a in each interval of a flight, or L_e from its early end on, and whether it has ended by its last state.
+
+    A flight under recorded actions may leave the state again in which it ended, unlike one of :func:`held`.
+    """
+    running = plant.running_cost(t, states[..., :-1, :], applied, exogenous)
+    if plant.end_cost is None:
+        return running, torch.zeros_like(states[..., 0, 0], dtype=torch.bool)
+    over = plant.ended(states).cumsum(-1) > 0
+    return torch.where(over[..., :-1], torch.full_like(running, plant.end_cost), running), over[..., -1]

@@ -31,3 +31,13 @@ def plant_of(config: RunConfig) -> Plant:
 def physics_of(config: RunConfig) -> Plant:
     """The physics of the twin, by which policies and controllers are made: what is believed, or the real system's."""
     return config.believed() or plant_of(config)
+
+
+def require_plant(argument: str, given: object) -> None:
+    """Refuse what is no plant, such as a class of plants.
+
+    Raises:
+        ValueError: if it is none; the message names the argument.
+    """
+    if not isinstance(given, Plant):
+        raise ValueError(f"{argument}={given!r} must be a plant; if this is a class, give an instance of it.")

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs import what_if
 from rt_torchrl.runs.command_line import load_recipe
-from rt_torchrl.runs.configured_plant import MakesPlant, plant_of
+from rt_torchrl.runs.configured_plant import MakesPlant, plant_of, require_plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
 from rt_torchrl.runs.tensor_file import load_tensors
@@ -218,8 +218,7 @@ def _rebuilt(
         plant = plant_of(config) if plant is None else plant
     except (ValueError, TypeError, OSError) as error:
         raise ValueError(f"{folder / 'config.json'} cannot be carried out: {error}") from error
-    if not isinstance(plant, Plant):
-        raise ValueError(f"plant={plant!r} must be a plant; if this is a class, give an instance of it.")
+    require_plant("plant", plant)
     name = settings["plant"]
     if plant.name != name:
         raise ValueError(f"{folder} is a run of plant {name!r}, the recipe is of {plant.name!r}; use the run's recipe.")

@@ -12,6 +12,7 @@ from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.runs.configured_plant import require_plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
@@ -130,9 +131,9 @@ def physics_known(plant: Plant, believed: Plant | None) -> Plant:
         ValueError: if one is no plant, or the twin has states that no sensor of the real system reads, or lacks some
             that one reads.
     """
-    for name, one in (("plant", plant), ("believed", believed)):
-        if one is not None and not isinstance(one, Plant):
-            raise ValueError(f"{name}={one!r} must be a plant; if this is a class, give an instance of it.")
+    require_plant("plant", plant)
+    if believed is not None:
+        require_plant("believed", believed)
     physics = believed or plant
     known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
     if known != read:

@@ -201,11 +201,12 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
 
 def _taking_away(live: str, folder: Path, planner: str | None, *, alone: bool) -> list[str]:
     """What to do with the live policy; model predictive control acts from here, and its model can be exported."""
-    if not alone and live == "model_based" and planner == "receding_horizon":
-        return ["take the model that is planned on away: rt_torchrl.export_twin(run.closure, 'it.c', plant)"]
+    planned = live == "model_based" and planner == "receding_horizon"
     if not alone:
-        return [f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)"]
-    if live == "model_based" and planner == "receding_horizon":
+        model = "take the model that is planned on away: rt_torchrl.export_twin(run.closure, 'it.c', plant)"
+        law = f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)"
+        return [model if planned else law]
+    if planned:
         return [
             f"let model predictive control act: {call_of('real_time')} {folder}",
             f"take the model that it plans on away: {call_of('export')} {folder} --what twin",

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.plants.ending import flight_costs
 from rt_torchrl.plants.plant import Plant
 
 
@@ -102,13 +103,9 @@ def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"
     n = actions.shape[-2]
     clock = plant.dt * torch.arange(n, dtype=torch.float64, device=states.device)
     t = (start.unsqueeze(-1) if isinstance(start, Tensor) else start) + clock
-    running = plant.running_cost(t, states[..., :-1, :], actions, exogenous)
-    if plant.end_cost is None:
-        return running.mean(-1) + plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
-    over = plant.ended(states).cumsum(-1) > 0  # a trajectory may leave the state again in which it ended
-    running = torch.where(over[..., :-1], torch.full_like(running, plant.end_cost), running).mean(-1)
+    costs, ended = flight_costs(plant, t, states, actions, exogenous)
     last = plant.terminal_cost(states[..., -1, :]) / (n * plant.dt)
-    return running + torch.where(over[..., -1], torch.zeros_like(last), last)
+    return costs.mean(-1) + torch.where(ended, torch.zeros_like(last), last)
 
 
 def continued(inputs: Float[Tensor, "n_e n_z"], n: int) -> Float[Tensor, "n n_z"]:

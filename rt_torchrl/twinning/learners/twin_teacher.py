@@ -6,6 +6,7 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from rt_torchrl.plants.ending import flight_costs
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
@@ -134,11 +135,7 @@ class TwinTeacher:
             after = twin.control(self.policy, states[:, -1], exogenous[:, m:], start=start + m * plant.dt)
             states, actions = torch.cat([states, after.states[:, 1:]], 1), torch.cat([actions, after.actions], 1)
         t = plant.dt * ahead.double()
-        costs, over = plant.running_cost(t, states[:, :-1], actions, exogenous), None
-        if plant.end_cost is not None:
-            over = plant.ended(states).cumsum(1) > 0
-            costs = torch.where(over[:, :-1], torch.full_like(costs, plant.end_cost), costs)
-        ended = torch.zeros_like(at, dtype=torch.bool) if over is None else over[:, -1]
+        costs, ended = flight_costs(plant, t, states, actions, exogenous)
         rewards, discount = memory.closed(-costs @ memory.discounts(n), ended, n)
         end = TensorDict({"state": states[:, -1], "exogenous": episode["exogenous"][at + n]}, batch_size=len(at))
         end["observation"] = plant.observe(plant.dt * (at + n).double(), end["state"], end["exogenous"])

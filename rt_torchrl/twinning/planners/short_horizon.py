@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.plants.ending import cost_rate
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -131,12 +132,10 @@ class ShortHorizon:
         flown = self.twin.control(self.learner, state, inputs, start=start)
         clock = plant.dt * torch.arange(inputs.shape[1] + 1, dtype=torch.float64, device=inputs.device)
         t = start.unsqueeze(-1) + clock
-        costs = plant.running_cost(t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
+        costs = cost_rate(plant, t[:, :-1], flown.states[:, :-1], flown.actions, inputs) / self.reference
         # There is no input after the last interval; the last input takes its place.
         seen = plant.observe(t, flown.states, torch.cat([inputs, inputs[:, -1:]], 1))
         over = self._over(flown.states)
-        if over is not None:
-            costs = torch.where(over[:, :-1], self._end_value(), costs)
         norm = self._improve_policy(costs, seen, over)
         self._improve_critic(costs.detach(), seen.detach(), over)
         return norm
