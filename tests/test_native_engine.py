@@ -141,6 +141,16 @@ def test_a_start_for_each_realisation():
     assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
 
 
+def test_a_drive_in_any_memory_layout():
+    """One row for all realisations, every second interval, and the batch first."""
+    task = Task(driver="commands", batch=11, n=6)
+    t, z, a = (x.detach() for x in task.drive)
+    z, a = z[:1, :1].expand(6, 11, -1), a.transpose(0, 1).contiguous().transpose(0, 1)
+    t = torch.stack([t, t + 1.0], 1).flatten(0, 1)[::2]
+    task.drive = Drive(t.requires_grad_(), z.requires_grad_(), a.requires_grad_())
+    assert_equal(task.gradients(NATIVE), task.gradients(AUTOGRAD))
+
+
 def test_pieces_and_threads_give_the_same():
     task, threads = Task(batch=21, n=9000), torch.get_num_threads()
     whole = [task.gradients(NATIVE), costs(task, NATIVE)]
@@ -165,7 +175,7 @@ def test_costs(plant):
     task = Task(plant, batch=5, n=6)
     costed = CostInterval(task.interval)
     state = torch.cat([task.state, task.state.new_zeros(5, 1)], -1)
-    exact = marched(costed, state, *task.drive)[-1, :, -1]
+    exact = marched(costed, state, *task.drive)[-1, :, -1] / 6.0
     wanted = [exact.detach(), *_gradients(exact, task.leaves, torch.arange(1.0, 6.0).double())]
     assert_equal(costs(task, NATIVE), wanted)
 

@@ -183,6 +183,27 @@ def test_wrong_arguments_are_refused(request_, message, unchecked):
         request_()
 
 
+def test_tensors_that_come_again_are_read_anew(unchecked):
+    """A rollout holds the drive of its last call, but no numbers of it."""
+    plant = LinearQuadratic(horizon=1.0)
+    (state, exogenous, command), closure = drawn(plant, 3), LinearClosure(torch.zeros(2, 2))
+    native, exact = (Rollout(plant, closure, engine=engine) for engine in ("native", "autograd"))
+    for change in (lambda: None, lambda: command.numpy().__imul__(2.0), lambda: exogenous.add_(1.0), state.neg_):
+        change()
+        for _ in range(2):
+            costs = native.costs(state, exogenous, command)
+            torch.testing.assert_close(costs, exact.costs(state, exogenous, command), rtol=1e-12, atol=1e-12)
+    command.data = command.roll(1, 0)
+    torch.testing.assert_close(native.costs(state, exogenous, command), exact.costs(state, exogenous, command))
+    commands = command.requires_grad_()
+    assert torch.autograd.grad(native.costs(state, exogenous, commands).sum(), commands)[0].abs().max() > 0.0
+    exogenous[0, 0, 0] = math.nan
+    with pytest.raises(ValueError, match="exogenous holds NaN"):
+        native.costs(state, exogenous, command)
+    with pytest.raises(ValueError, match="exogenous has shape"):
+        native.costs(state, exogenous[:2], command)
+
+
 def test_single_precision_states_are_refused():
     plant = LinearQuadratic()
     with pytest.raises(ValueError, match=r"initial_state has shape \(1, 2\) and dtype torch\.float32.*torch\.float64"):

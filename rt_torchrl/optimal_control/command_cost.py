@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.engines.groups import Group
+from rt_torchrl.trajectories.engines.groups import Group, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.engines.programs import programs_of
 from rt_torchrl.trajectories.engines.traced_interval import Programs
@@ -173,6 +173,8 @@ class CommandCost:
             self._x = np.empty((len(groups), n, n_x, lanes))
             self._states = np.empty((len(groups), n + 1, n_s, lanes))
             self._by_drive = np.empty((n, n_x, lanes))
+            signals = (signals_of([torch.from_numpy(x.transpose(0, 2, 1))]) for x in self._x)
+            self._driven = [(each, 0, lanes - 1, 0) for each in signals]
             self._costate, self._nothing = np.empty((n_s, lanes)), np.zeros((1, n_s, lanes))
             self._first_block = np.arange(0, n, self.hold)
         self._groups, first = groups, 1 + self._drive.exogenous.shape[-1]
@@ -207,7 +209,8 @@ class CommandCost:
         x, states, n, n_a = self._x[k], self._states[k], self.n, unit.shape[-1]
         lanes = np.repeat(group.gather(unit.transpose(1, 0, 2)), self.hold, 0)[:n]
         x[:, -n_a:] = lanes
-        programs.march(x, states, self._weights, n)
+        driven = self._driven[k]
+        programs.march(*driven, states, self._weights, n)
         self._costate[:] = 0.0
         self._costate[-1] = 1.0
         costs[group.first : group.last] = states[-1, -1, : group.live]
@@ -215,7 +218,7 @@ class CommandCost:
             costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
         by_weights = np.zeros((0, group.lanes))
         arrays = (self._costate, self._weights, self._by_drive, by_weights)
-        programs.sweeps[True](x, states, self._nothing, 0, *arrays, n)
+        programs.sweeps[True](*driven, states, self._nothing, 0, *arrays, n)
         by_blocks = np.add.reduceat(self._by_drive[:, -n_a:], self._first_block, 0)
         gradient[group.first : group.last] = by_blocks[:, :, : group.live].transpose(2, 0, 1)
 

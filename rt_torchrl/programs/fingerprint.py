@@ -73,7 +73,7 @@ class _Reader:
         found = [self._read(obj) for obj in self._met]  # which grows meanwhile
         count = len(found)
         for held, name in read_by(*self._functions):
-            self.watch.note_global(held, name)
+            self.watch.note_attributes(held, name)
             x = held.get(name)
             found.append([self._mention(x)] if isinstance(x, DATA) else self._address(x))
         return [*found, *map(self._read, islice(self._met, count, None))]
@@ -103,7 +103,7 @@ class _Reader:
             return self._of_tensor(obj)
         if type(obj) is np.ndarray and not obj.dtype.hasobject:
             self.watch.note_attributes(obj, "dtype")
-            self.watch.note_values(obj, np.shape)
+            self.watch.note_value(obj, np.shape)
             self.watch.note_numbers(obj)
             return [obj.shape, str(obj.dtype), _digest(obj)]
         return self._of_parts(obj)

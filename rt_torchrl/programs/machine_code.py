@@ -12,6 +12,7 @@ from rt_torchrl.programs.vector_functions import Lanes, symbol
 PURE = "memory(none) nounwind willreturn speculatable"
 """Attributes of mathematical functions, by which LLVM computes once what is the same in all steps."""
 WIDTH = "align 8"  # torch aligns rows to doubles
+DRIVE = "ptr noalias %x, i64 %first, i64 %last, i64 %row"
 STACK = 2**17
 """Bytes of arrays that lie on the stack, which is 512 KiB in the threads of some systems; others are allocated."""
 SMALL = 8
@@ -103,11 +104,13 @@ class LaneWriter:
         element, known = ("double", ", !invariant.load !{}") if shared else (self.vector, "")
         place = self.emit(f"getelementptr {element}, ptr {array}, i64 {index}")
         found = self.emit(f"load {element}, ptr {place}, {WIDTH}{known}")
-        if not shared:
-            return found
-        one = self.emit(f"insertelement {self.vector} poison, double {found}, i32 0")
-        zeros = f"<{self.lanes.number} x i32> zeroinitializer"
-        return self.emit(f"shufflevector {self.vector} {one}, {self.vector} poison, {zeros}")
+        return self._in_all("double", found) if shared else found
+
+    def _in_all(self, kind: str, number: str) -> str:
+        """A number in every lane."""
+        n = self.lanes.number
+        one = self.emit(f"insertelement <{n} x {kind}> poison, {kind} {number}, i32 0")
+        return self.emit(f"shufflevector <{n} x {kind}> {one}, <{n} x {kind}> poison, <{n} x i32> zeroinitializer")
 
     def store(self, array: str, index: str, operand: str) -> None:
         place = self.emit(f"getelementptr {self.vector}, ptr {array}, i64 {index}")
@@ -118,7 +121,10 @@ class LaneWriter:
         short = self.emit(f"fptosi {self.vector} {place} to <{n} x i32>")
         index = self.emit(f"sext <{n} x i32> {short} to <{n} x i64>")
         base = f"getelementptr (double, ptr {table}, i64 {offset})"
-        places = self.emit(f"getelementptr double, ptr {base}, <{n} x i64> {index}")
+        return self._gathered(self.emit(f"getelementptr double, ptr {base}, <{n} x i64> {index}"))
+
+    def _gathered(self, places: str) -> str:
+        n = self.lanes.number
         given = f"<{n} x ptr> {places}, i32 8, {self.mask} splat (i1 true), {self.vector} poison"
         gather = f"llvm.masked.gather.v{n}f64.v{n}p0"
         self.globals[gather] = f"declare {self.vector} @{gather}(<{n} x ptr>, i32, {self.mask}, {self.vector})"
@@ -139,6 +145,22 @@ class LaneWriter:
         self.body += [f"br i1 {again}, label %{label}.in, label %{label}.out", f"{label}.out:"]
 
     # Functions
+
+    def inputs(self, sizes: dict[str, int], k: str) -> dict[tuple[str, int], str]:
+        """Drive and state of interval k, see :func:`march_text`."""
+        n, found = self.lanes.number, {("s", j): x for j, x in enumerate(self.row("%s", sizes["s"], k))}
+        count, row = self._in_all("i64", "%last"), self.emit(f"add nsw i64 {k}, %row")
+        lanes = f"<{n} x i64> <{', '.join(f'i64 {i}' for i in range(n))}>"
+        lane = self.emit(f"add {lanes}, {self._in_all('i64', '%first')}")
+        lane = self.emit(f"call <{n} x i64> @llvm.smin.v{n}i64(<{n} x i64> {lane}, <{n} x i64> {count})")
+        for j in range(sizes["x"]):
+            at = [self.emit(f"getelementptr i64, ptr %x, i64 {3 * j + i}") for i in range(3)]
+            kinds = zip(("ptr", "i64", "i64"), at, strict=True)
+            start, across, along = [self.emit(f"load {kind}, ptr {x}, !invariant.load !{{}}") for kind, x in kinds]
+            here = self.emit(f"getelementptr i8, ptr {start}, i64 {self.emit(f'mul i64 {row}, {along}')}")
+            distance = self.emit(f"mul <{n} x i64> {lane}, {self._in_all('i64', across)}")
+            found["x", j] = self._gathered(self.emit(f"getelementptr i8, ptr {here}, <{n} x i64> {distance}"))
+        return found
 
     def row(self, array: str, count: int, row: str) -> list[str]:
         """The operands in a row of an array of lanes."""
@@ -162,20 +184,22 @@ def _bits(number: float) -> str:
 
 
 def march_text(program: Program, ends: Sequence[int], sizes: dict[str, int], lanes: Lanes) -> str:
-    """A function ``march(x, s, w, n)``, which writes the states s[1] ... s[n] after s[0].
+    """A function ``march(x, first, last, row, s, w, n)``, which writes the states s[1] ... s[n] after s[0].
 
-    Arrays hold lanes: ``x`` is ``n n_x lanes``, ``s`` is ``n+1 n_s lanes``; ``w`` holds the weights.
+    ``s`` holds lanes, ``n+1 n_s lanes``, and ``w`` the weights. ``x`` has the address of every signal of the drive, and
+    the bytes to the next realisation and to the next interval. The lanes are the realisations ``first`` to ``last``,
+    which also fills the lanes that are left, and their drive begins with the interval ``row``.
     """
     writer = LaneWriter(lanes, "march")
     with writer.loop("%n") as k:
-        inputs = {(name, j): x for name in "xs" for j, x in enumerate(writer.row(f"%{name}", sizes[name], k))}
+        inputs = writer.inputs(sizes, k)
         found = Lowering(program, writer, inputs, "%w").write(ends)
         writer.store_row("%s", found, writer.emit(f"add nsw i64 {k}, 1"))
-    return writer.function("march", "ptr noalias %x, ptr noalias %s, ptr noalias %w")
+    return writer.function("march", f"{DRIVE}, ptr noalias %s, ptr noalias %w")
 
 
 def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[str, int], lanes: Lanes) -> str:
-    """A function ``sweep(x, s, source, stride, l, w, gx, gw, n)``, which goes back from interval n − 1 to 0.
+    """A function ``sweep(x, first, last, row, s, source, stride, l, w, gx, gw, n)``, which goes back to interval 0.
 
     It adds the row k·stride of ``source`` (∂J/∂s_{k+1}) to the co-state ``l``, replaces this by the co-state at the
     start of the interval, writes the gradients by the interval's own inputs into ``gx`` and adds those by the weights
@@ -185,7 +209,7 @@ def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[s
     last = writer.emit("sub nsw i64 %n, 1")
     with writer.loop("%n") as i:
         k = writer.emit(f"sub nsw i64 {last}, {i}")
-        inputs = {(name, j): x for name in "xs" for j, x in enumerate(writer.row(f"%{name}", sizes[name], k))}
+        inputs = writer.inputs(sizes, k)
         source = writer.row("%source", sizes["s"], writer.emit(f"mul nsw i64 {k}, %stride"))
         for j, pair in enumerate(zip(writer.row("%l", sizes["s"], "0"), source, strict=True)):
             inputs["l", j] = writer.compute("add", *pair)
@@ -195,5 +219,5 @@ def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[s
         writer.store_row("%l", [*map(lowering.operand, costates)], "0")
         writer.store_row("%gx", [*map(lowering.operand, driven)], k)
         lowering.add_to("%gw", gradients)
-    arrays = ", ".join(f"ptr noalias %{name}" for name in ("x", "s", "source", "l", "w", "gx", "gw"))
-    return writer.function("sweep", arrays.replace("%source", "%source, i64 %stride"))
+    arrays = ", ".join(f"ptr noalias %{name}" for name in ("s", "source", "l", "w", "gx", "gw"))
+    return writer.function("sweep", f"{DRIVE}, {arrays.replace('%source', '%source, i64 %stride')}")

@@ -1,6 +1,7 @@
 """Outer names: the globals that the code of classes and functions reads, which traced programs depend on."""
 
 import inspect
+import sys
 import types
 from functools import lru_cache
 from typing import Any
@@ -9,8 +10,9 @@ import numpy as np
 from torch import Tensor
 
 DATA = (bool, int, float, complex, str, Tensor, np.ndarray, np.generic)
-FOREIGN = frozenset("torch tensordict torchrl numpy scipy jaxtyping beartype builtins typing abc math".split())
+FOREIGN = sys.stdlib_module_names | {"torch", "tensordict", "torchrl", "numpy", "scipy", "jaxtyping", "beartype"}
 """Packages whose globals do not change."""
+OWN = __name__.partition(".")[0]
 
 Name = tuple[dict[str, Any], str]
 
@@ -47,5 +49,6 @@ def function_of(attribute: object) -> types.FunctionType | None:
 
 
 def foreign(module: str | None) -> bool:
-    """Whether a module belongs to a package whose globals do not change."""
-    return module is None or module.partition(".")[0] in FOREIGN
+    """Whether a module belongs to a package whose globals do not change; those of this library's plants may."""
+    package, _, rest = (module or "").partition(".")
+    return module is None or package in FOREIGN or (package == OWN and not rest.startswith("envs"))

@@ -27,8 +27,7 @@ class Watch:
         self._own = type(root), vars(root)
         self._empty: list[Any] = []
         self._filled: list[Any] = []
-        self._attributes: dict[tuple[int, str], object] = {}
-        self._globals: dict[tuple[int, str], dict[str, Any]] = {}
+        self._named: dict[Callable[..., object], dict[tuple[int, str], Any]] = {getattr: {}, dict.get: {}}
         self._values: list[Reading] = []
 
     def note_collection(self, held: Any) -> None:
@@ -39,39 +38,36 @@ class Watch:
             self._empty.append(held)
 
     def note_attributes(self, holder: object, *names: str) -> None:
-        """Note attributes, which must be the same objects."""
-        self._attributes |= {(id(holder), name): holder for name in names}
+        """Note attributes, or global variables in a dictionary of them, which must be the same objects."""
+        read = dict.get if type(holder) is dict else getattr
+        self._named[read] |= {(id(holder), name): holder for name in names}
 
-    def note_global(self, held: dict[str, Any], name: str) -> None:
-        """Note a global variable, which must be the same object."""
-        self._globals[id(held), name] = held
-
-    def note_values(self, x: object, *reads: Callable[[Any], object]) -> None:
-        """Note functions of an object, whose values must be equal."""
-        self._values += [(read, x) for read in reads]
+    def note_value(self, x: object, read: Callable[[Any], object]) -> None:
+        """Note a function of an object, whose value must be equal."""
+        self._values.append((read, x))
 
     def note_numbers(self, x: np.ndarray) -> None:
         """Note an array, whose numbers must be the same."""
+        x = x.transpose(sorted(range(x.ndim), key=x.strides.__getitem__, reverse=True))
         same = bytearray(x.tobytes()).__eq__  # which takes no copy, but needs numbers side by side
-        self.note_values(x, same if same(x) is True else np.ndarray.tobytes)
+        self.note_value(x, same if same(x) is True else np.ndarray.tobytes)
 
     def note_tensor(self, x: Tensor, *, constant: bool) -> None:
         """Note a tensor, whose memory must be the same, and its numbers if it is constant."""
+        now = x.detach()
         try:
-            numbers = x.detach().numpy()
+            numbers = now.numpy()
         except (RuntimeError, TypeError):  # on another device, or in a layout of its own
             self.complete = False
             return
-        self.note_attributes(x, "dtype", "requires_grad")
-        self.note_values(x, Tensor.data_ptr, Tensor.size, Tensor.stride)
+        self.note_attributes(x, "requires_grad")
+        self.note_value(x, now.is_set_to)  # of the same memory, shape and strides
         if constant:
             self.note_numbers(numbers)
 
     def begin(self) -> None:
         """Remember everything as it is now."""
-        noted: list[tuple[Callable[..., object], dict[tuple[int, str], Any]]] = [(getattr, self._attributes)]
-        noted.append((dict.get, self._globals))
-        self._reads = [(read, [*held.values()], [name for _, name in held]) for read, held in noted]
+        self._reads = [(read, [*held.values()], [name for _, name in held]) for read, held in self._named.items()]
         self._objects = self._identities()  # which keeps their addresses for them
         self._then = self._objects.tobytes(), self._contents()
 

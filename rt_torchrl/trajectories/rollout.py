@@ -35,6 +35,10 @@ ENGINES: dict[Engine, type[GradientEngine]] = {
 }
 
 
+HELD = 2**18
+"""Greatest number of numbers of tensors whose drive a rollout holds for the next call."""
+
+
 class DivergenceError(FloatingPointError):
     """A trajectory left the finite numbers."""
 
@@ -72,6 +76,7 @@ class Rollout:
         self.interval = Interval(plant, closure, policy)
         self.engine = engine
         self._engine = ENGINES[engine](compiled=compiled)
+        self._driven: tuple[tuple[object, ...], Drive, tuple[Tensor | None, ...]] | None = None
 
     def __call__(
         self,
@@ -120,12 +125,31 @@ class Rollout:
         summed = self.plant.end_cost is None or self.interval.policy is not None
         found = self._engine.costs(self.interval, initial_state, drive) if summed else None
         if found is not None and all_finite(found):
-            first = final_cost(self.plant, initial_state) / self.plant.dt  # the sum holds the change from it
-            return (found + first) / exogenous.shape[1]
+            charged = getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
+            if charged:  # the sum holds the change from the first state's
+                found = found + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
+            return found
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
 
     def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:
-        """The drive, after a check of everything."""
+        """The drive, after a check of everything; that of the last call if the same small tensors come again.
+
+        A planner asks many times for one scenario. The drive shares the memory of the tensors, so that their numbers
+        are always the present ones.
+        """
+        given = initial_state, exogenous, command
+        stamps = None if isinstance(start, Tensor) else (start, self.plant.dt, *map(_stamp, given))
+        held = self._driven
+        if held is not None and held[0] == stamps:
+            return held[1]
+        drive, self._driven = self._checked_drive(initial_state, exogenous, command, start), None
+        if stamps is not None and all(map(_repeatable, given)):
+            self._driven = stamps, drive, given
+        return drive
+
+    def _checked_drive(
+        self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor
+    ) -> Drive:
         self._validate(initial_state, exogenous, command)
         if isinstance(start, Tensor) and not self._engine.start_per_realisation:
             others = _listed(name for name, kind in ENGINES.items() if kind.start_per_realisation)
@@ -156,6 +180,18 @@ class Rollout:
                 )
             if not all_finite(value):
                 raise ValueError(f"{argument} holds NaN or infinite values; clean the record before it is used.")
+
+
+def _stamp(x: Tensor | None) -> object:
+    """What tells a tensor as it is from others, as long as it is held."""
+    if x is None or x.is_inference():  # which has no version
+        return x is None
+    return id(x), x._version, x.data_ptr(), x.requires_grad
+
+
+def _repeatable(x: Tensor | None) -> bool:
+    """Whether the drive of a tensor may be held: it keeps little memory alive, and nothing is differentiated by it."""
+    return x is None or not (x.requires_grad or x.is_inference() or x.numel() > HELD)
 
 
 def refusal(engine: Engine, plant: Plant) -> str | None:

@@ -25,7 +25,7 @@ class GradientEngine(Protocol):
         ...
 
     def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
-        """Sums of the running cost over all intervals, ``batch``, differentiable; None if they follow from the states.
+        """Means of the running cost over all intervals, ``batch``, differentiable; None if they follow from the states.
 
         An engine computes them itself if this is quicker than to differentiate the costs of all states.
         """

@@ -1,13 +1,14 @@
 """Groups of lanes: realisations side by side in the vectors of the processor, and groups among threads."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 
 class Group(NamedTuple):
@@ -37,6 +38,16 @@ class Group(NamedTuple):
         array[:, self.first : self.last] = lanes[:, :, : self.live].transpose(0, 2, 1)
 
 
+def signals_of(drive: Iterable[Tensor]) -> np.ndarray:
+    """The address of every signal of tensors ``n batch signals``, and the bytes to the next realisation and row."""
+    found = []
+    for x in drive:
+        step, lane, signal = x.stride()
+        first, lane = x.data_ptr(), lane if x.shape[1] > 1 else 0  # one row for all realisations
+        found += [(first + 8 * signal * j, 8 * lane, 8 * step) for j in range(x.shape[2])]
+    return np.array(found, np.int64).reshape(-1, 3)
+
+
 def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> None:
     """Do the work of every group, on as many threads as torch may use; whoever is free takes the next group."""
     starts = range(0, batch, lanes)
@@ -51,7 +62,8 @@ def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> Non
     try:
         share()
     finally:  # nobody may still write into the arrays of a call that has ended
-        wait(helping)
+        if helping:
+            wait(helping)
     for thread in helping:
         thread.result()  # raises what it raised
 

@@ -57,6 +57,9 @@ class CostInterval(nn.Module):
         interval: the interval of the states s.
     """
 
+    sums = 1
+    """Number of the last states, which begin with zero."""
+
     def __init__(self, interval: Interval):
         super().__init__()
         self.interval = interval

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
-from rt_torchrl.trajectories.engines.groups import Group, for_each_group
+from rt_torchrl.trajectories.engines.groups import Group, for_each_group, signals_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.engines.programs import programs_of
@@ -32,8 +32,8 @@ MEMORY = 2.0**30
 """Bytes of states and drive that a sweep holds at once; of longer trajectories it holds checkpoints in time."""
 LEAST_MEMORY = 2.0**20
 
-Piece = tuple[slice, np.ndarray, np.ndarray, np.ndarray]
-"""Intervals with their drive, their states, and ∂J/∂s at their ends (``n n_s lanes``, or one row that serves all)."""
+Piece = tuple[slice, np.ndarray, np.ndarray]
+"""Intervals with their states and ∂J/∂s at their ends (``n n_s lanes``, or one row that serves all)."""
 
 
 class Native(GradientEngine):
@@ -75,13 +75,13 @@ class Native(GradientEngine):
         return ends
 
     def costs(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor | None:
-        """Sums of the running cost over all intervals, ``batch``; None if the interval cannot become a program.
+        """Means of the running cost over all intervals, ``batch``; None if the interval cannot become a program.
 
         Where a gradient is wanted, it is computed in the same sweep.
         """
         if self._costed is None or self._costed.interval is not interval:
             self._costed = CostInterval(interval)
-        task = self._task(self._costed, nn.functional.pad(initial_state, (0, 1)), drive)
+        task = self._task(self._costed, initial_state, drive)
         enabled = torch.is_grad_enabled()
         costs: Tensor | None = None if task is None else _Costs.apply(task, enabled, *task.leaves)
         return costs
@@ -97,7 +97,7 @@ class _Task:
     Args:
         programs: machine code of the interval.
         weights: weights of the interval.
-        initial_state: initial states.
+        initial_state: initial states; further states of the program begin with zero.
         drive: drive of all intervals.
         memory: bytes that a sweep may hold.
     """
@@ -105,28 +105,37 @@ class _Task:
     def __init__(self, programs: Programs, weights: Weights, initial_state: Tensor, drive: Drive, memory: float):
         self.programs, self.weights, self.lanes = programs, weights, programs.lanes.number
         self.leaves, self.row = (initial_state, *drive, *weights.learned), weights.row()
-        self.initial_state, self.n = initial_state.detach().numpy(), len(drive.t)
-        t = drive.t.unsqueeze(-1).expand(-1, len(initial_state), 1)
-        self.drive = [x.detach().numpy() for x in (t, *drive[1:])]
+        self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
+        self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
+        self._signals = signals_of(self.drive)
         in_lanes = 16 * self.lanes * (programs.sizes["s"] + programs.sizes["x"])
         length = max(1, int(memory / torch.get_num_threads() / in_lanes))
         self.pieces = [slice(first, min(first + length, self.n)) for first in range(0, self.n, length)]
 
     def start(self, group: Group) -> np.ndarray:
         """The initial states of a group, ``n_s lanes``."""
-        return group.gather(self.initial_state[None])[0]
+        found = np.zeros((self.programs.sizes["s"], self.lanes))
+        found[: self.initial_state.shape[1]] = group.gather(self.initial_state[None])[0]
+        return found
 
-    def march(self, group: Group, piece: slice, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Drive ``n n_x lanes`` and states ``n+1 n_s lanes`` of a piece, from the state at its start on."""
-        x = self.driving(group, piece)
-        states = np.empty((len(x) + 1, *state.shape))
+    def march(self, group: Group, piece: slice, state: np.ndarray) -> np.ndarray:
+        """The states ``n+1 n_s lanes`` of a piece, from the state at its start on."""
+        states = np.empty((piece.stop - piece.start + 1, *state.shape))
         states[0] = state
-        self.programs.march(x, states, self.row, len(x))
-        return x, states
+        self.programs.march(*self.driving(group, piece), states, self.row, piece.stop - piece.start)
+        return states
 
-    def driving(self, group: Group, piece: slice) -> np.ndarray:
-        """The drive of a group in a piece, ``n n_x lanes``."""
-        return group.gather(*(signal[piece] for signal in self.drive))
+    def flown(self, group: Group) -> Iterator[tuple[slice, np.ndarray]]:
+        """All pieces with their states."""
+        state = self.start(group)
+        for piece in self.pieces:
+            states = self.march(group, piece, state)
+            yield piece, states
+            state = states[-1]
+
+    def driving(self, group: Group, piece: slice) -> tuple[np.ndarray, int, int, int]:
+        """The drive of a group in a piece, as machine code takes it."""
+        return self._signals, group.first, group.last - 1, piece.start
 
 
 class _Gradients:
@@ -138,9 +147,10 @@ class _Gradients:
     """
 
     def __init__(self, task: _Task, *, driven: bool):
-        self._task, (batch, n_s) = task, task.initial_state.shape
-        self._by_state, self._by_weights = np.empty((1, batch, n_s)), np.empty((1, batch, sum(task.weights.sizes)))
-        self._by_drive = np.empty((task.n, batch, task.programs.sizes["x"])) if driven else None
+        self._task = task
+        self._by_state = np.empty((1, *task.initial_state.shape))
+        self._by_weights = np.empty((1, task.batch, sum(task.weights.sizes)))
+        self._by_drive = np.empty((task.n, task.batch, task.programs.sizes["x"])) if driven else None
         self._sweep = task.programs.sweeps[driven]
 
     def sweep(self, group: Group, pieces: Iterable[Piece], *, last: float) -> None:
@@ -151,28 +161,29 @@ class _Gradients:
             pieces: the pieces from the last one on.
             last: ∂J/∂s of the last signal at the end of all, beside that of the last piece.
         """
-        costate, by_weights = (np.zeros((x.shape[-1], group.lanes)) for x in (self._by_state, self._by_weights))
+        task = self._task
+        costate = np.zeros((task.programs.sizes["s"], group.lanes))
+        by_weights = np.zeros((self._by_weights.shape[-1], group.lanes))
         costate[-1] = last
-        for piece, x, states, source in pieces:
-            by_drive = np.empty(x.shape if self._by_drive is not None else 0)
-            stride = int(len(source) > 1)
-            self._sweep(x, states, source, stride, costate, self._task.row, by_drive, by_weights, len(x))
+        for piece, states, source in pieces:
+            n, stride = piece.stop - piece.start, int(len(source) > 1)
+            by_drive = np.empty((n, task.programs.sizes["x"], group.lanes) if self._by_drive is not None else 0)
+            arrays = costate, task.row, by_drive, by_weights
+            self._sweep(*task.driving(group, piece), states, source, stride, *arrays, n)
             if self._by_drive is not None:
                 group.scatter(by_drive, self._by_drive[piece])
-        group.scatter(costate[None], self._by_state)
+        group.scatter(costate[None, : self._by_state.shape[-1]], self._by_state)
         group.scatter(by_weights[None], self._by_weights)
 
-    def weighed(self, factor: np.ndarray | None = None) -> list[Tensor | None]:
-        """The gradients of the sum of all realisations, which may have factors, in the shapes of the leaves."""
-        by_state, by_drive, by_weights = self._by_state[0], self._by_drive, self._by_weights[0]
-        if factor is not None:
-            by_state, by_weights = by_state * factor[:, None], by_weights * factor[:, None]
-            by_drive = None if by_drive is None else by_drive * factor[:, None]
+    def weighed(self, factor: np.ndarray) -> list[Tensor | None]:
+        """The gradients of the sum of all realisations, each with its factor, in the shapes of the leaves."""
         along: list[Tensor | None] = [None] * 3
-        if by_drive is not None:
-            by_t, *rest = torch.from_numpy(by_drive).split([signal.shape[-1] for signal in self._task.drive], -1)
+        if self._by_drive is not None:
+            by_drive = torch.from_numpy(self._by_drive * factor[:, None])
+            by_t, *rest = by_drive.split([signal.shape[-1] for signal in self._task.drive], -1)
             along = [by_t.squeeze(-1).sum_to_size(self._task.leaves[1].shape), *rest]
-        return [torch.from_numpy(by_state), *along, *self._task.weights.split(by_weights.sum(0))]
+        by_state = torch.from_numpy(self._by_state[0] * factor[:, None])
+        return [by_state, *along, *self._task.weights.split(np.einsum("i,ij->j", factor, self._by_weights[0]))]
 
 
 class _EndStates(torch.autograd.Function):
@@ -183,13 +194,10 @@ class _EndStates(torch.autograd.Function):
         ends = np.empty((task.n, *task.initial_state.shape))
 
         def work(group: Group) -> None:
-            state = task.start(group)
-            for piece in task.pieces:
-                _, states = task.march(group, piece, state)
+            for piece, states in task.flown(group):
                 group.scatter(states[1:], ends[piece])
-                state = states[-1]
 
-        for_each_group(ends.shape[1], task.lanes, work)
+        for_each_group(task.batch, task.lanes, work)
         found = torch.from_numpy(ends)
         ctx.task = task
         # What is saved tells autograd when it is changed between forward and backward, the weights too.
@@ -205,41 +213,42 @@ class _EndStates(torch.autograd.Function):
 
         def way_back(group: Group) -> Iterator[Piece]:
             for piece in reversed(task.pieces):
-                yield piece, task.driving(group, piece), group.gather(starts[piece]), group.gather(sources[piece])
+                yield piece, group.gather(starts[piece]), group.gather(sources[piece])
 
-        for_each_group(starts.shape[1], task.lanes, lambda group: gradients.sweep(group, way_back(group), last=0.0))
-        return None, *gradients.weighed()
+        for_each_group(task.batch, task.lanes, lambda group: gradients.sweep(group, way_back(group), last=0.0))
+        return None, *gradients.weighed(np.ones(task.batch))
 
 
 class _Costs(torch.autograd.Function):
-    """Maps (s_0, t, z, a, w) to the last signal of s_n of each realisation, and computes its gradients at once."""
+    """Maps (s_0, t, z, a, w) to the last signal of s_n by n of each realisation, and computes its gradients at once."""
 
     @staticmethod
     def forward(ctx: Any, task: _Task, enabled: bool, *leaves: Tensor) -> Tensor:
-        costs, nothing = np.empty(len(task.initial_state)), np.zeros((1, task.programs.sizes["s"], task.lanes))
+        costs, nothing = np.empty(task.batch), np.zeros((1, task.programs.sizes["s"], task.lanes))
+        gradients = None
         if enabled and any(ctx.needs_input_grad):
-            ctx.gradients = _Gradients(task, driven=any(ctx.needs_input_grad[3:6]))
+            gradients = ctx.gradients = _Gradients(task, driven=any(ctx.needs_input_grad[3:6]))
 
         def work(group: Group) -> None:
-            starts = [task.start(group)]
-            for piece in task.pieces:
-                x, states = task.march(group, piece, starts[-1])
-                starts.append(states[-1].copy())
-            costs[group.first : group.last] = starts.pop()[-1, : group.live]
+            starts = []
+            for _, states in task.flown(group):
+                starts.append(states[0].copy())
+            costs[group.first : group.last] = states[-1, -1, : group.live]
 
             def way_back() -> Iterator[Piece]:
-                held = x, states  # those of the last piece are still there
+                held = states  # those of the last piece are still there
                 for piece in reversed(task.pieces):
                     start = starts.pop()
-                    yield piece, *(held if piece.stop == task.n else task.march(group, piece, start)), nothing
+                    yield piece, held if piece.stop == task.n else task.march(group, piece, start), nothing
 
-            if hasattr(ctx, "gradients"):
-                ctx.gradients.sweep(group, way_back(), last=1.0)
+            if gradients is not None:
+                gradients.sweep(group, way_back(), last=1.0)
 
-        for_each_group(len(costs), task.lanes, work)
-        return torch.from_numpy(costs)
+        for_each_group(task.batch, task.lanes, work)
+        ctx.n = task.n
+        return torch.from_numpy(costs / task.n)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, *ctx.gradients.weighed(gradient.numpy())
+        return None, None, *ctx.gradients.weighed(gradient.numpy() / ctx.n)

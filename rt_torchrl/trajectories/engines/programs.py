@@ -7,6 +7,7 @@ from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from rt_torchrl.programs.fingerprint import Fingerprint, fingerprint
 from rt_torchrl.programs.program import UntraceableError
@@ -38,13 +39,15 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
     if initial_state.device.type != "cpu":
         return None
     with _lock:
-        (held, weights), lanes = _known_as(interval), lanes_of_this_machine()
-        widths = initial_state.shape[-1], drive.exogenous.shape[-1], drive.command.shape[-1]
+        (held, weights), lanes, sums = _known_as(interval), lanes_of_this_machine(), getattr(interval, "sums", 0)
+        widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (held.digest, lanes, *widths)
         found, alive = _kept.get(key, (None, held.alive))
         if not isinstance(found, UntraceableError):
             try:
-                found = found or Programs(interval, point_of(initial_state, drive, lanes.number), lanes)
+                found = found or Programs(
+                    interval, point_of(functional.pad(initial_state, (0, sums)), drive, lanes.number), lanes
+                )
                 driven = any(x.requires_grad for x in drive)
                 if torch.is_grad_enabled() and (driven or initial_state.requires_grad or weights.learned):
                     found.prepare_sweep(interval, driven)

@@ -16,13 +16,14 @@ from rt_torchrl.programs.operators import new_tracer
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.tracer import STRAIGHT, Tracer
 from rt_torchrl.programs.vector_functions import Lanes
-from rt_torchrl.trajectories.engines.groups import Group
+from rt_torchrl.trajectories.engines.groups import Group, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive, with_weights
 from rt_torchrl.trajectories.engines.weights import Weights
 
 POINTER = ctypes.c_void_p
-MARCH = (POINTER, POINTER, POINTER, ctypes.c_int64)
-SWEEP = (POINTER, POINTER, POINTER, ctypes.c_int64, *[POINTER] * 4, ctypes.c_int64)
+DRIVE = (POINTER, *[ctypes.c_int64] * 3)
+MARCH = (*DRIVE, POINTER, POINTER, ctypes.c_int64)
+SWEEP = (*DRIVE, POINTER, POINTER, ctypes.c_int64, *[POINTER] * 4, ctypes.c_int64)
 AGREEMENT = 1e-8
 """Greatest difference between machine code and torch, relative to the largest value of a signal."""
 ROUNDING = 1e-13
@@ -36,11 +37,11 @@ class Point(NamedTuple):
     state: Tensor
     drive: Drive
 
-    def in_lanes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Drive ``1 n_x lanes`` and states ``1 n_s lanes``, one realisation in each lane."""
-        n, (t, *rest) = len(self.state), (x.unsqueeze(0).numpy() for x in self.drive)
-        lanes = Group(0, n, n)
-        return lanes.gather(t[:, :, None], *rest), lanes.gather(self.state.unsqueeze(0).numpy())
+    def in_lanes(self) -> tuple[tuple[np.ndarray, int, int, int], np.ndarray]:
+        """Drive, as machine code takes it, and states ``1 n_s lanes``, one realisation in each lane."""
+        lanes, (t, *rest) = Group(0, len(self.state), len(self.state)), self.drive
+        signals = signals_of(x.unsqueeze(0) for x in (t.unsqueeze(-1), *rest))
+        return (signals, 0, lanes.last - 1, 0), lanes.gather(self.state.unsqueeze(0).numpy())
 
 
 class Programs:
@@ -72,7 +73,7 @@ class Programs:
         self.march = ObjectCode(text, "march", MARCH)
         x, start = point.in_lanes()
         states = np.concatenate([start, start])
-        self.march(x, states, Weights(interval).row(), 1)
+        self.march(*x, states, Weights(interval).row(), 1)
         with torch.no_grad():
             require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
 
@@ -106,9 +107,9 @@ class Programs:
     def _compare_sweep(self, sweep: ObjectCode, interval: nn.Module, driven: bool) -> None:
         weights, (x, states) = Weights(interval), self.point.in_lanes()
         costate = 1.0 + 0.1 * np.arange(states[0].size, dtype=float).reshape(states[0].shape)
-        by_state, by_drive = costate.copy(), np.zeros_like(x)
+        by_state, by_drive = costate.copy(), np.zeros((1, self.sizes["x"], self.lanes.number))
         by_weights = np.zeros((sum(weights.sizes), self.lanes.number))
-        sweep(x, states, np.zeros_like(states), 0, by_state, weights.row(), by_drive, by_weights, 1)
+        sweep(*x, states, np.zeros_like(states), 0, by_state, weights.row(), by_drive, by_weights, 1)
         leaves = [x.clone().requires_grad_() for x in (self.point.state, *self.point.drive)]
         with torch.enable_grad():
             end = interval(leaves[0], Drive(*leaves[1:]))

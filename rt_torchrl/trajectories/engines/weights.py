@@ -1,6 +1,7 @@
 """The weights of an interval, as machine code takes them."""
 
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -30,5 +31,5 @@ class Weights:
 
     def split(self, gradients: np.ndarray) -> list[Tensor]:
         """A row of gradients by the learned weights, in their own shapes."""
-        parts = torch.from_numpy(gradients).split(self.sizes) if self.learned else []
-        return [part.view(w.shape) for part, w in zip(parts, self.learned, strict=True)]
+        parts = (gradients[end - n : end] for n, end in zip(self.sizes, accumulate(self.sizes), strict=True))
+        return [torch.from_numpy(part.reshape(w.shape)) for part, w in zip(parts, self.learned, strict=True)]
