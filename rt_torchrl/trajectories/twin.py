@@ -89,9 +89,15 @@ class DigitalTwin:
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
+        return self.episode_costs(policy, initial_state, exogenous).mean()
+
+    def episode_costs(
+        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
+    ) -> Float[Tensor, " batch"]:
+        """J_a of each virtual episode under a policy, differentiable by its weights unless it is state feedback."""
         if isinstance(policy, StateFeedback):
-            return control_cost(self.plant, self.control(policy, initial_state, exogenous)).mean()
-        return self._planning(policy).costs(initial_state, exogenous).mean()
+            return control_cost(self.plant, self.control(policy, initial_state, exogenous))
+        return self._planning(policy).costs(initial_state, exogenous)
 
     def retreat(self) -> None:
         """React to a flight that diverges, although the real system flew it; a twin that is alone cannot."""

@@ -106,7 +106,9 @@ class VirtualEpisodes:
         cost = self.cost(policy, episodes)
         if not self.constraints or not cost.isfinite() or isinstance(policy, StateFeedback):
             return cost
-        return self.constraints.priced(cost, self.twin.control(policy, *episodes))
+        return self.constraints.priced(
+            cost.expand(len(episodes.initial_state)), self.twin.control(policy, *episodes)
+        ).mean()
 
     def state_dict(self) -> dict[str, Any]:
         return {"processes": [process.state_dict() for process in self.processes]}

@@ -129,23 +129,16 @@ class TwinEnsemble(DigitalTwin):
         flown = twin.control(policy, twin.plant.at_rest(initial_state), exogenous, start=start)
         return flown._replace(states=flown.states[..., : len(self.plant.states)])
 
-    def costs(
+    def episode_costs(
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
-    ) -> dict[str, Float[Tensor, ""]]:
-        """Mean J_a under each hypothesis that is planned on."""
-        twins = {name: self.twins[name] for name in self._shares}
-        return {name: twin.cost(policy, twin.plant.at_rest(initial_state), exogenous) for name, twin in twins.items()}
-
-    def cost(
-        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
-    ) -> Float[Tensor, ""]:
-        """Mean J_a of virtual episodes over the hypotheses; that of state feedback is the twin's own.
+    ) -> Float[Tensor, " batch"]:
+        """J_a of each virtual episode over the hypotheses; that of state feedback is the twin's own.
 
         State feedback plans on the twin itself, and its flights take too long for all hypotheses.
         """
         if isinstance(policy, StateFeedback):
-            return super().cost(policy, initial_state, exogenous)
-        found = self.costs(policy, initial_state, exogenous)
-        each = torch.stack(list(found.values()))
-        shares = each.new_tensor(list(self._shares.values()))
-        return (1.0 - self.risk) * (shares * each).sum() + self.risk * each.max()
+            return super().episode_costs(policy, initial_state, exogenous)
+        twins = [self.twins[name] for name in self._shares]
+        each = torch.stack([twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins])
+        shares, worst = each.new_tensor(list(self._shares.values())), each[each.detach().mean(1).argmax()]
+        return (1.0 - self.risk) * (shares @ each) + self.risk * worst

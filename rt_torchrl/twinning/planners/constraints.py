@@ -45,20 +45,20 @@ class Constraints:
         """Whether there is any bound."""
         return bool(self.bounds.names)
 
-    def cost(self, twin: DigitalTwin, policy: nn.Module, episodes: Scenario) -> Float[Tensor, ""]:
-        """Mean J_a of virtual episodes with the price of their trajectories, differentiable by the policy's weights."""
-        found = twin.cost(policy, *episodes)
+    def costs(self, twin: DigitalTwin, policy: nn.Module, episodes: Scenario) -> Float[Tensor, " batch"]:
+        """J_a of virtual episodes with the price of their trajectories, differentiable by the policy's weights."""
+        found = twin.episode_costs(policy, *episodes)
         return self.priced(found, twin.control(policy, *episodes)) if self else found
 
-    def priced(self, cost: Float[Tensor, ""], flown: Trajectory) -> Float[Tensor, ""]:
-        """A mean J_a with the price of the trajectories that it is the mean of."""
+    def priced(self, costs: Float[Tensor, " batch"], flown: Trajectory) -> Float[Tensor, " batch"]:
+        """J_a of trajectories with their price."""
         if not self:
-            return cost
-        self.reference = self.reference or abs(cost.item()) or 1.0
+            return costs
+        self.reference = self.reference or abs(costs.mean().item()) or 1.0
         rho, sides = self.config.weight, self.bounds.beyond(flown.states[:, 1:])
         forces = [torch.relu(side.new_tensor(self.multipliers) + rho * side) for side in sides]
-        price = sum((force.square().mean((0, 1)).sum() for force in forces), start=torch.zeros_like(cost))
-        return cost + self.reference * price / (2.0 * rho)
+        price = sum((force.square().mean(1).sum(-1) for force in forces), start=torch.zeros_like(costs))
+        return costs + self.reference * price / (2.0 * rho)
 
     @torch.no_grad()
     def update(self, flown: Trajectory) -> None:

@@ -107,6 +107,8 @@ class PlannerConfig:
             episodes; 0 for none. A descent from the imitation of a controller may end in a minimum beside that
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
+        episode_gradient_limit: limit κ of the gradient of a virtual episode in a descent over whole episodes, in upper
+            quartiles of those of all, see :func:`limited_mean`; infinite for none, as in the paper.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         constraints: bounds on states that plans over whole episodes keep.
         descent: parameters of the policy's descent over whole episodes.
@@ -121,6 +123,7 @@ class PlannerConfig:
     rounds: int = 1
     approach: int = 0
     approach_at: int = 3
+    episode_gradient_limit: float = 10.0
     experience: int = 100
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
@@ -128,7 +131,7 @@ class PlannerConfig:
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
     def __post_init__(self) -> None:
-        check_options(self)
+        check_options(self, infinite=("episode_gradient_limit",))
         if self.method is not None and (self.method == "short_horizon") != (self.short_horizon.window > 0):
             raise ValueError(
                 f"method={self.method!r} of the planning does not go with short_horizon.window="
@@ -158,5 +161,10 @@ class PlannerConfig:
             )
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
+        if not self.episode_gradient_limit >= 1.0:
+            raise ValueError(
+                f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
+                "no limit."
+            )
         if self.experience < 1:
             raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")

@@ -3,9 +3,10 @@
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent
+from rt_torchrl.optimisers.limited_mean import limited_mean
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints import Constraints
@@ -31,13 +32,15 @@ class WholeEpisodes:
 
     def plan(self, episodes: Scenario) -> Descended:
         """Take n_mb gradient steps; the policy keeps the best weights seen in them."""
-        found = self.descent.run(
-            lambda: self.constraints.cost(self.twin, self.policy, episodes), self.config.iterations
-        )
+        found = self.descent.run(lambda: self._cost(episodes), self.config.iterations)
         if self.constraints:
             with torch.no_grad():
                 self.constraints.update(self.twin.control(self.policy, *episodes))
         return found
+
+    def _cost(self, episodes: Scenario) -> Tensor:
+        costs = self.constraints.costs(self.twin, self.policy, episodes)
+        return limited_mean(costs, self.policy.parameters(), self.config.episode_gradient_limit)
 
     def refuse(self) -> None:
         """Forget the state of the optimiser, because it led to the plan that was refused."""
