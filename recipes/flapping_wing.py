@@ -1,6 +1,7 @@
 """Reinforcement twinning of the flapping-wing drone (paper, sections 5.2 and 6.3)."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -60,7 +61,10 @@ PAPER = TwinningConfig(
     exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     planner=PlannerConfig(
-        iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
+        iterations=5,
+        episode_gradient_limit=math.inf,
+        descent=DescentConfig(rate=0.2, gradient_limit=0.5),
+        receding_horizon=PREDICTIVE,
     ),
     referee=RefereeConfig(patience=4, clone_patience=4),
     hypotheses=HypothesesConfig(which="none"),

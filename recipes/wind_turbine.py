@@ -1,6 +1,7 @@
 """Reinforcement twinning of the NREL 5-MW wind turbine (paper, sections 5.1 and 6.2)."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -50,6 +51,7 @@ PAPER = TwinningConfig(
     learner=LearnerConfig(return_steps=10),
     planner=PlannerConfig(
         iterations=10,
+        episode_gradient_limit=math.inf,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),

@@ -1,0 +1,106 @@
+"""The mean of costs whose gradient limits that of each episode, against its formula and on an unstable loop."""
+
+import math
+
+import pytest
+import torch
+from linear_quadratic import LinearGain, LinearQuadratic
+from torch import nn
+
+from rt_torchrl import DigitalTwin, PlannerConfig
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.optimisers.limited_mean import limited_mean
+from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.twinning.planners import WholeEpisodes
+
+
+def slopes_and_costs(slopes, costs):
+    """Costs of episodes that are linear in two weights, with given values and slopes at their present values."""
+    weights = [torch.tensor([1.0, 2.0]).double().requires_grad_(), torch.tensor(3.0).double().requires_grad_()]
+    slopes = torch.tensor(slopes, dtype=torch.float64)
+    change = slopes[:, :2] @ (weights[0] - weights[0].detach()) + slopes[:, 2] * (weights[1] - weights[1].detach())
+    return weights, torch.tensor(costs, dtype=torch.float64) + change
+
+
+def gradient(weights, mean):
+    return torch.cat([g.flatten() for g in torch.autograd.grad(mean, weights)])
+
+
+def test_without_an_exploding_gradient_it_is_the_mean():
+    weights, costs = slopes_and_costs([[1.0, 0.0, 2.0], [0.0, -3.0, 0.0], [0.5, 0.5, 0.5]], [1.0, 2.0, 6.0])
+    found = limited_mean(costs, weights, 10.0)
+    assert found.item() == 3.0
+    expected = torch.tensor([0.5, -2.5 / 3.0, 2.5 / 3.0]).double()
+    torch.testing.assert_close(gradient(weights, found), expected)
+    torch.testing.assert_close(gradient(weights, limited_mean(costs, weights, math.inf)), expected)
+
+
+def test_an_exploding_gradient_counts_as_the_limit_says():
+    slopes = [[1.0, 0.0, 0.0]] * 7 + [[0.0, 0.0, 5000.0]]
+    weights, costs = slopes_and_costs(slopes, [1.0] * 8)
+    found = limited_mean(costs, weights, 4.0)
+    assert found.item() == 1.0
+    torch.testing.assert_close(gradient(weights, found), torch.tensor([7.0, 0.0, 4.0**2 / 5000.0]).double() / 8.0)
+
+
+def test_an_episode_that_costs_more_may_have_a_longer_gradient():
+    slopes = [[1.0, 0.0, 0.0]] * 7 + [[0.0, 0.0, 5000.0]]
+    weights, costs = slopes_and_costs(slopes, [2.0] * 7 + [200.0])
+    found = gradient(weights, limited_mean(costs, weights, 4.0))
+    torch.testing.assert_close(found, torch.tensor([7.0, 0.0, 400.0**2 / 5000.0]).double() / 8.0)
+
+
+@pytest.mark.parametrize("costs", [[1.0] * 8, [0.0] * 8])
+def test_a_few_episodes_off_their_bounds_count_in_full(costs):
+    """A policy at its bounds has no gradient in most episodes, and what the others say is not an explosion."""
+    weights, costs = slopes_and_costs([[0.0] * 3] * 7 + [[0.0, 3.0, 4.0]], costs)
+    found = gradient(weights, limited_mean(costs, weights, 10.0))
+    torch.testing.assert_close(found, torch.tensor([0.0, 3.0, 4.0]).double() / 8.0)
+
+
+def test_a_gradient_that_is_not_a_number_is_not_hidden():
+    weights, costs = slopes_and_costs([[1.0, 0.0, 0.0]] * 7 + [[math.nan, 0.0, 0.0]], [1.0] * 8)
+    assert gradient(weights, limited_mean(costs, weights, 10.0)).isnan().any()
+
+
+def test_a_limit_below_one_is_refused():
+    with pytest.raises(ValueError, match=r"episode_gradient_limit=0\.5 of the planning must be at least 1"):
+        PlannerConfig(episode_gradient_limit=0.5)
+
+
+@pytest.mark.parametrize("engine", ["native", "autograd"])
+def test_gradients_of_flights_are_limited_alike(engine):
+    plant, generator, policy = LinearQuadratic(), torch.Generator().manual_seed(0), LinearGain([[0.4, 0.2]])
+    twin = DigitalTwin(plant, plant.closure, engine=engine)
+    start, exogenous = plant.draw_initial_state(6, generator), plant.draw_exogenous(6, generator)
+    costs, weights = twin.episode_costs(policy, start, exogenous), list(policy.parameters())
+    alone = [twin.cost(policy, s[None], z[None]) for s, z in zip(start, exogenous, strict=True)]
+    each = torch.stack([gradient(weights, cost) for cost in alone])
+    norms = each.norm(dim=1)
+    dearer = (costs / costs.median()).clamp_min(1.0).detach()
+    shares = (0.2 * norms.quantile(0.75) * dearer / norms).clamp_max(1.0).square()
+    assert shares.min() < 0.9
+    torch.testing.assert_close(gradient(weights, limited_mean(costs, weights, 0.2)), (shares @ each) / 6.0)
+
+
+class Hunting(DigitalTwin):
+    """Ten episodes like bowls; in the last one, the cost also ripples by 1e-9 with the gain."""
+
+    def episode_costs(self, policy: nn.Module, initial_state: torch.Tensor, exogenous: torch.Tensor) -> torch.Tensor:
+        gain = policy.gain.flatten()
+        ripple = 1e-9 * torch.sin(1e12 * gain[1])
+        bowl = 1.0 + 0.5 * (gain - torch.tensor([2.0, 3.0]).double()).square().sum()
+        return torch.stack([bowl] * 9 + [bowl + ripple])
+
+
+@pytest.mark.parametrize(("limit", "far"), [(10.0, False), (math.inf, True)])
+def test_a_plan_goes_on_beside_an_episode_whose_gradient_explodes(limit, far):
+    plant, policy = LinearQuadratic(), LinearGain([[0.0, 0.0]])
+    config = PlannerConfig(
+        iterations=40, episode_gradient_limit=limit, descent=DescentConfig(optimiser="lbfgs", rate=1.0)
+    )
+    nothing = torch.zeros(1, 2, dtype=torch.float64)
+    planner = WholeEpisodes(Hunting(plant, plant.closure), policy, config)
+    found = planner.plan(Scenario(nothing, torch.zeros(1, plant.n_steps, 1, dtype=torch.float64)))
+    assert found.start == pytest.approx(7.5)
+    assert (found.best > 3.0) is far
