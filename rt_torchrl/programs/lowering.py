@@ -61,7 +61,7 @@ class Lowering:
 
     def operand(self, value: int) -> str:
         """The operand of a scalar value that has been written."""
-        number = self.program.number(value)
+        number = self.program.numbers.get(value)
         if number is not None:
             return self.writer.constant(number, truth=self.program.kinds[value] == "truth")
         return self._operands[value]
@@ -161,7 +161,7 @@ class Lowering:
                     self._add(array, self.writer.index(first, [(1, i)]), found)
             else:
                 for j in (first, *rest):
-                    if self.program.number(outputs[j]) != 0.0:
+                    if self.program.numbers.get(outputs[j]) != 0.0:
                         self._add(array, self.writer.index(j, ()), self.operand(outputs[j]))
 
     def _add(self, array: str, index: str, operand: str) -> None:

@@ -21,6 +21,7 @@ COMPARISONS = {
     "ne": ("une", "!="),
 }  # fmt: skip
 """Comparisons in LLVM and in C, of which NaN makes all false but the last one."""
+LOGIC = {"and": "&&", "or": "||", "xor": "!="}
 ROUNDED = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "trunc": "trunc", "round": "rint", "abs": "fabs"}
 """Functions that are instructions of most processors, by their names in LLVM and C; halves are rounded to even."""
 EXTREMES = {"minimum": "{0} < {1} || {0} != {0} ? {0} : {1}", "maximum": "{0} > {1} || {0} != {0} ? {0} : {1}"}
@@ -28,10 +29,7 @@ EXTREMES = {"minimum": "{0} < {1} || {0} != {0} ? {0} : {1}", "maximum": "{0} > 
 FORMS = {
     **{name: Form(f"f{name} contract {{number}} {{0}}, {{1}}", f"{{0}} {c} {{1}}") for name, c in ARITHMETIC.items()},
     **{name: Form(f"fcmp {how} {{number}} {{0}}, {{1}}", f"{{0}} {c} {{1}}") for name, (how, c) in COMPARISONS.items()},
-    **{
-        name: Form(f"{name} {{truth}} {{0}}, {{1}}", f"{{0}} {c} {{1}}")
-        for name, c in (("and", "&&"), ("or", "||"), ("xor", "!="))
-    },
+    **{name: Form(f"{name} {{truth}} {{0}}, {{1}}", f"{{0}} {c} {{1}}") for name, c in LOGIC.items()},
     **{
         name: Form(f"call {{number}} @llvm.{known}.v{{lanes}}f64({{number}} {{0}})", f"{known}({{0}})")
         for name, known in ROUNDED.items()

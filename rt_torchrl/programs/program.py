@@ -1,7 +1,7 @@
 """Programs of scalar operations: values in the order of their computation, folded and shared."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
@@ -11,6 +11,8 @@ from torch import Tensor
 from rt_torchrl.programs.operations import COMPARISONS
 
 Kind = Literal["number", "truth", "array"]
+SIMPLER = frozenset("add sub mul div pow".split())
+"""Functions of numbers that may become simpler ones, each by a method of :class:`Program`."""
 HIGHEST_POWER = 8
 """Greatest integer exponent of a power that becomes a product."""
 
@@ -61,6 +63,7 @@ class Program:
         """While co-states are traced, 0·x is zero: a value that the result does not depend on has no derivative. In
         the trajectory itself 0·x stays, because x may be infinite or NaN."""
         self.numbers: dict[int, float] = {}
+        """The values that are known when the program is made."""
         self._known: dict[Operation, int] = {}
 
     def new(self, name: str, *operands: int, attributes: tuple[Any, ...] = (), kind: Kind = "number") -> int:
@@ -79,19 +82,12 @@ class Program:
         self.numbers[found] = float(value)
         return found
 
-    def number(self, value: int) -> float | None:
-        """The number that a value is known to have; None if it is computed later."""
-        return self.numbers.get(value)
-
     def needed(self, outputs: Iterable[int]) -> list[int]:
         """The values that the outputs depend on, in the order of their computation."""
-        found: set[int] = set()
-        stack = list(outputs)
-        while stack:
-            value = stack.pop()
-            if value not in found:
-                found.add(value)
-                stack += self.operations[value].operands
+        found = set(outputs)
+        for value in range(max(found, default=-1), -1, -1):  # operands come before what is made of them
+            if value in found:
+                found.update(self.operations[value].operands)
         return sorted(found)
 
     # Truth values
@@ -106,7 +102,7 @@ class Program:
         condition = self.as_truth(condition)
         if self.kinds[a] != self.kinds[b]:
             a, b = self.as_number(a), self.as_number(b)
-        known = self.number(condition)
+        known = self.numbers.get(condition)
         if known is not None:
             return a if known else b
         if a == b:
@@ -118,7 +114,7 @@ class Program:
     def logic(self, how: str, *operands: int) -> int:
         """``and``, ``or``, ``xor`` or ``not``."""
         truths = [self.as_truth(a) for a in operands]
-        known = [self.number(a) for a in truths]
+        known = [self.numbers.get(a) for a in truths]
         if None not in known:
             return self.constant(getattr(torch, f"logical_{how}")(*map(torch.tensor, known)).item())
         if (how == "and" and 0.0 in known) or (how == "or" and 1.0 in known):
@@ -130,17 +126,17 @@ class Program:
     def apply(self, name: str, *operands: int) -> int:
         """A function of numbers, by torch's name: what it is known to be, something simpler, or a new operation."""
         numbers = [self.as_number(a) for a in operands]
-        known = [self.number(a) for a in numbers]
+        known = [self.numbers.get(a) for a in numbers]
         given = [torch.tensor(x, dtype=torch.float64) for x in known if x is not None]
         if len(given) == len(known):
             return self.constant(getattr(torch, name)(*given).item())
-        if name in SIMPLER:
-            return SIMPLER[name](self, *numbers)
-        return self.new(name, *numbers, kind="truth" if name in COMPARISONS else "number")
+        kind: Kind = "truth" if name in COMPARISONS else "number"
+        found: int = getattr(self, f"_{name}")(*numbers) if name in SIMPLER else self.new(name, *numbers, kind=kind)
+        return found
 
     def _is_nothing(self, a: int, *, subtracted: bool = False) -> bool:
         """Whether a value is a zero that a sum does not need: 0 − 0 is 0, but −0 + 0 is not −0."""
-        x = self.number(a)
+        x = self.numbers.get(a)
         return x == 0.0 and (self.differentiating or (math.copysign(1.0, x) > 0.0) == subtracted)
 
     def _add(self, a: int, b: int) -> int:
@@ -154,30 +150,20 @@ class Program:
         return self.new("neg", b) if self._is_nothing(a) else self.new("sub", a, b)
 
     def _mul(self, a: int, b: int) -> int:
-        a, b = sorted((a, b), key=lambda v: (self.number(v) is None, v))
-        x = self.number(a)
+        a, b = sorted((a, b), key=lambda v: (self.numbers.get(v) is None, v))
+        x = self.numbers.get(a)
         if x == 0.0 and self.differentiating:
             return a
         return b if x == 1.0 else self.new("mul", a, b)
 
     def _div(self, a: int, b: int) -> int:
-        return a if self.number(a) == 0.0 and self.differentiating else self.new("div", a, b)
+        return a if self.numbers.get(a) == 0.0 and self.differentiating else self.new("div", a, b)
 
     def _pow(self, a: int, b: int) -> int:
-        y, one = self.number(b), self.constant(1.0)
+        y, one = self.numbers.get(b), self.constant(1.0)
         if y is None or not (abs(y) == 0.5 or (abs(y) <= HIGHEST_POWER and y == int(y))):
             return self.new("pow", a, b)
         if y == 0.0:
             return one
         found = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
         return found if y > 0 else self.apply("div", one, found)
-
-
-SIMPLER: dict[str, Callable[..., int]] = {
-    "add": Program._add,
-    "sub": Program._sub,
-    "mul": Program._mul,
-    "div": Program._div,
-    "pow": Program._pow,
-}
-"""Functions of numbers that may become simpler ones."""

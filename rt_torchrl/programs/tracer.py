@@ -49,7 +49,8 @@ class Tracer(TorchDispatchMode):
         self.program = Program()
         self.places, self.straight = Places(), straight
         elementwise = {name: partial(Tracer._elementwise, name=name) for name in ELEMENTWISE}
-        self._rules: dict[str, Rule] = {**dict.fromkeys(FILLS, Tracer._filled), **elementwise, **rules}
+        filled = dict.fromkeys(FILLS, lambda tracer, args, options, out: tracer._constants(out))
+        self._rules: dict[str, Rule] = {**filled, **elementwise, **rules}
         self._cells: dict[int, Tensor] = {}
         self._sizes = Counter[str]()  # of the inputs by their names, and of the weights
         self._alive: list[Tensor] = []  # a storage that is freed could give its address to another one
@@ -197,9 +198,6 @@ class Tracer(TorchDispatchMode):
         except Exception as error:
             raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
 
-    def _filled(self, args: Arguments, kwargs: Options, out: Tensor) -> Tensor:
-        return self._constants(out)
-
     def _elementwise(self, args: Arguments, kwargs: Options, out: Tensor, name: str) -> Tensor:
         if out.is_floating_point() and out.dtype != torch.float64:
             raise self.refuse(f"{name} computes in {out.dtype}; trajectories need torch.float64")
@@ -207,8 +205,7 @@ class Tracer(TorchDispatchMode):
         if unknown or (name.startswith("bitwise") and out.dtype != torch.bool):
             raise self.refuse(f"{name} of {out.dtype} with {unknown or 'bits'}")
         operands = [self.cells(a) for a in args[: ARITY[name]]]
-        alpha = kwargs.get("alpha", 1)
-        if alpha != 1:
+        if (alpha := kwargs.get("alpha", 1)) != 1:
             operands[1] = self.pointwise("mul", [operands[1], self.cells(alpha)], operands[1].shape)
         found = self.pointwise(name, operands, out.shape)
         rounding = kwargs.get("rounding_mode")
@@ -220,7 +217,7 @@ class Tracer(TorchDispatchMode):
         spread = [o.expand(shape) for o in operands]
         values = {i for o in spread for i in o.flatten().tolist()}
         long = math.prod(shape) > self.straight and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
-        if not long or all(p.number(i) is not None for i in values):
+        if not long or all(p.numbers.get(i) is not None for i in values):
             rows = zip(*(o.flatten().tolist() for o in spread), strict=True)
             return in_shape([ELEMENTWISE[name](p, *row) for row in rows], shape)
         if (shortcut := self._shortcut(name, spread)) is not None:
@@ -248,7 +245,7 @@ class Tracer(TorchDispatchMode):
     def uniform_number(self, cells: Tensor) -> float | None:
         """The number that all cells are known to hold; None if they hold different or unknown ones."""
         first = cells.flatten()[0]
-        return self.program.number(int(first)) if bool((cells == first).all()) else None
+        return self.program.numbers.get(int(first)) if bool((cells == first).all()) else None
 
     def access(self, cells: Tensor) -> tuple[int, Access | None]:
         """An operand of a loop: a scalar (None), or an array with the way to walk through it."""

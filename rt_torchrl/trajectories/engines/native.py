@@ -82,8 +82,7 @@ class Native(GradientEngine):
         if self._costed is None or self._costed.interval is not interval:
             self._costed = CostInterval(interval)
         task = self._task(self._costed, initial_state, drive)
-        enabled = torch.is_grad_enabled()
-        costs: Tensor | None = None if task is None else _Costs.apply(task, enabled, *task.leaves)
+        costs: Tensor | None = None if task is None else _Costs.apply(task, torch.is_grad_enabled(), *task.leaves)
         return costs
 
     def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":
@@ -225,9 +224,8 @@ class _Costs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, task: _Task, enabled: bool, *leaves: Tensor) -> Tensor:
         costs, nothing = np.empty(task.batch), np.zeros((1, task.programs.sizes["s"], task.lanes))
-        gradients = None
-        if enabled and any(ctx.needs_input_grad):
-            gradients = ctx.gradients = _Gradients(task, driven=any(ctx.needs_input_grad[3:6]))
+        wanted, driven = enabled and any(ctx.needs_input_grad), any(ctx.needs_input_grad[3:6])
+        gradients = ctx.gradients = _Gradients(task, driven=driven) if wanted else None
 
         def work(group: Group) -> None:
             starts = []

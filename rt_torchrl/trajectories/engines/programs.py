@@ -45,9 +45,7 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
         found, alive = _kept.get(key, (None, held.alive))
         if not isinstance(found, UntraceableError):
             try:
-                found = found or Programs(
-                    interval, point_of(functional.pad(initial_state, (0, sums)), drive, lanes.number), lanes
-                )
+                found = found or Programs(interval, point_of(initial_state, drive, lanes.number, sums), lanes)
                 driven = any(x.requires_grad for x in drive)
                 if torch.is_grad_enabled() and (driven or initial_state.requires_grad or weights.learned):
                     found.prepare_sweep(interval, driven)
@@ -76,13 +74,16 @@ def _reason(error: Exception) -> UntraceableError:
 
 
 @torch.no_grad()
-def point_of(initial_state: Tensor, drive: Drive, lanes: int) -> Point:
-    """States and drive of one interval for every lane, near the initial states and at times over the whole drive."""
+def point_of(initial_state: Tensor, drive: Drive, lanes: int, sums: int = 0) -> Point:
+    """States and drive of one interval for every lane, near the initial states and at times over the whole drive.
+
+    Behind the states are the sums of the interval, which begin with zero.
+    """
     n, batch, lane = len(drive.t), len(initial_state), torch.arange(lanes)
     at = (lane * n) // lanes
     t = drive.t[at, lane % batch if drive.t.shape[1] > 1 else 0]
     driving = (_nudged(x[at, lane % batch]) for x in (drive.exogenous, drive.command))
-    return Point(_nudged(initial_state.detach()[lane % batch]), Drive(t, *driving))
+    return Point(_nudged(functional.pad(initial_state.detach()[lane % batch], (0, sums))), Drive(t, *driving))
 
 
 def _nudged(x: Tensor) -> Tensor:

@@ -69,8 +69,7 @@ class Programs:
         if end.shape != state.shape:
             raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
         self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
-        text = march_text(tracer.program, tracer.outputs(end), self.sizes, lanes)
-        self.march = ObjectCode(text, "march", MARCH)
+        self.march = ObjectCode(march_text(tracer.program, tracer.outputs(end), self.sizes, lanes), "march", MARCH)
         x, start = point.in_lanes()
         states = np.concatenate([start, start])
         self.march(*x, states, Weights(interval).row(), 1)
