@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-TYPICAL = 0.75
-"""Quantile of the norms of the episodes' gradients that is taken as typical; a policy at its bounds has many zeros."""
+USUAL = 0.25
+"""Quantile of the norms of the episodes' gradients that is usual; more than half of them may explode."""
 
 
 def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], limit: float) -> Float[Tensor, ""]:
@@ -16,12 +16,14 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
 
     With :math:`g_i = \partial J_i/\partial w` the gradient is
 
-    .. math:: \frac1N\sum_i g_i\min\Bigl(1, \frac{\kappa\,g_{3/4}\max(1, |J_i|/J_{1/2})}{\|g_i\|}\Bigr)^2
+    .. math::
+        \frac1N\sum_i g_i\min\Bigl(1, \frac{\ell_i}{\|g_i\|}\Bigr), \qquad
+        \ell_i = \kappa\max\Bigl(\frac{|J_i|}{\|w\|}, g_{1/4}\Bigr)
 
-    where κ is the limit, :math:`g_{3/4}` the upper quartile of the norms and :math:`J_{1/2}` the median of :math:`|J|`:
-    an episode that costs more may have a longer gradient, and one far beyond the limit counts for nothing. Where a
-    closed loop is unstable for a while, small differences grow exponentially, and so do gradients, although the cost
-    hardly changes. Such an episode would decide on the direction of a descent alone.
+    where κ is the limit and :math:`g_{1/4}` the lower quartile of the norms: a gradient is too long if it says that the
+    cost changes by more than itself when the weights change by a share 1/κ of their norm, and if it is κ times as long
+    as usual. Where a closed loop is unstable for a while, small differences grow exponentially, and so do gradients,
+    although the cost hardly changes. Such an episode would decide on the direction of a descent alone.
 
     Args:
         costs: costs J of the episodes, which depend on each weight.
@@ -37,19 +39,12 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     each = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
     slopes = [torch.stack(parts) for parts in zip(*each, strict=True)]
     norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
-    shares = _shares(costs.detach(), norms, limit)
+    size = torch.stack([weight.detach().norm() for weight in weights]).norm()
+    allowed = limit * torch.maximum(costs.detach().abs() / size, norms.quantile(USUAL))
+    too_long = (norms > allowed) & (allowed > 0.0)  # where nothing is usual, nothing is too long
+    shares = torch.where(too_long, allowed / norms, 1.0)
     found = costs.detach().mean()
     for weight, part in zip(weights, slopes, strict=True):
         slope = torch.tensordot(shares, part, 1) / len(costs)
         found = found + ((weight - weight.detach()) * slope).sum()
     return found
-
-
-def _shares(costs: Tensor, norms: Tensor, limit: float) -> Tensor:
-    """The share of each episode's gradient that counts."""
-    typical, middle = norms.quantile(TYPICAL), costs.abs().median()
-    if typical == 0.0:  # most episodes are at the bounds, and say nothing of what is usual
-        return torch.ones_like(norms)
-    dearer = (costs.abs() / middle.clamp_min(torch.finfo(costs.dtype).tiny)).clamp_min(1.0)
-    allowed = limit * typical * dearer
-    return torch.where(norms > allowed, (allowed / norms).square(), 1.0)

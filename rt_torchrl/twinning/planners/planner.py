@@ -107,8 +107,8 @@ class PlannerConfig:
             episodes; 0 for none. A descent from the imitation of a controller may end in a minimum beside that
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
-        episode_gradient_limit: limit κ of the gradient of a virtual episode in a descent over whole episodes, in upper
-            quartiles of those of all, see :func:`limited_mean`; infinite for none, as in the paper.
+        episode_gradient_limit: limit κ of the gradient of each virtual episode in a descent over whole episodes, see
+            :func:`limited_mean`; infinite for none, as in the paper.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         constraints: bounds on states that plans over whole episodes keep.
         descent: parameters of the policy's descent over whole episodes.
