@@ -7,23 +7,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-USUAL = 0.25
-"""Quantile of the norms of the episodes' gradients that is usual; more than half of them may explode."""
-
 
 def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], limit: float) -> Float[Tensor, ""]:
     r"""The mean of costs, with a limit for the gradient of each.
 
     With :math:`g_i = \partial J_i/\partial w` the gradient is
 
-    .. math::
-        \frac1N\sum_i g_i\min\Bigl(1, \frac{\ell_i}{\|g_i\|}\Bigr), \qquad
-        \ell_i = \kappa\max\Bigl(\frac{|J_i|}{\|w\|}, g_{1/4}\Bigr)
+    .. math:: \frac1N\sum_i g_i\min\Bigl(1, \frac{\kappa\,|J_i|}{\|w\|\,\|g_i\|}\Bigr)
 
-    where κ is the limit and :math:`g_{1/4}` the lower quartile of the norms: a gradient is too long if it says that the
-    cost changes by more than itself when the weights change by a share 1/κ of their norm, and if it is κ times as long
-    as usual. Where a closed loop is unstable for a while, small differences grow exponentially, and so do gradients,
-    although the cost hardly changes. Such an episode would decide on the direction of a descent alone.
+    where κ is the limit: a gradient is too long if it says that the cost changes by itself when the weights change by
+    less than a share 1/κ of their norm. Where a closed loop is unstable for a while, small differences grow
+    exponentially, and so do gradients, although the cost hardly changes. Such an episode would decide on the direction
+    of a descent alone.
 
     Args:
         costs: costs J of the episodes, which depend on each weight.
@@ -40,9 +35,8 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     slopes = [torch.stack(parts) for parts in zip(*each, strict=True)]
     norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
     size = torch.stack([weight.detach().norm() for weight in weights]).norm()
-    allowed = limit * torch.maximum(costs.detach().abs() / size, norms.quantile(USUAL))
-    too_long = (norms > allowed) & (allowed > 0.0)  # where nothing is usual, nothing is too long
-    shares = torch.where(too_long, allowed / norms, 1.0)
+    allowed = limit * costs.detach().abs() / size
+    shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)  # no cost is no scale
     found = costs.detach().mean()
     for weight, part in zip(weights, slopes, strict=True):
         slope = torch.tensordot(shares, part, 1) / len(costs)
