@@ -61,6 +61,7 @@ PAPER = TwinningConfig(
     planner=PlannerConfig(
         iterations=5,
         realisations=20,
+        extremes=0,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
         receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
@@ -71,7 +72,10 @@ PAPER = TwinningConfig(
 CONVERGED = dataclasses.replace(
     PAPER,
     planner=dataclasses.replace(
-        PAPER.planner, iterations=12, descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6)
+        PAPER.planner,
+        iterations=12,
+        extremes=1000,
+        descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
     ),
     hypotheses=HypothesesConfig(),
     referee=dataclasses.replace(PAPER.referee, rule="weight_of_evidence"),

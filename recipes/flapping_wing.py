@@ -60,7 +60,10 @@ PAPER = TwinningConfig(
     exogenous=ExogenousConfig(kernel_width=20.0, tube=2e-4, penalty=1e3),
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     planner=PlannerConfig(
-        iterations=5, descent=DescentConfig(rate=0.2, gradient_limit=0.5), receding_horizon=PREDICTIVE
+        iterations=5,
+        extremes=0,
+        descent=DescentConfig(rate=0.2, gradient_limit=0.5),
+        receding_horizon=PREDICTIVE,
     ),
     referee=RefereeConfig(patience=4, clone_patience=4),
     hypotheses=HypothesesConfig(which="none"),

@@ -50,6 +50,7 @@ PAPER = TwinningConfig(
     learner=LearnerConfig(return_steps=10),
     planner=PlannerConfig(
         iterations=10,
+        extremes=0,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),

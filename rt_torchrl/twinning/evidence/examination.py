@@ -185,6 +185,13 @@ class RealJudge:
         """The cost on the real system that is as likely exceeded as not."""
         return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
 
+    def refuting(self, policy: nn.Module) -> list[nn.Module]:
+        """Policies as this one that flew for more than the twin says of them, beyond chance."""
+        found = self.differences
+        each = zip(found.policies, found.values, found.exploration, strict=True)
+        beyond = [one for one, d, explored in each if d > 0.0 and unexplained(d, explored) > BEYOND_CHANCE]
+        return [one for one in beyond if same_architecture(one, policy)]
+
     @torch.no_grad()
     def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
         """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""

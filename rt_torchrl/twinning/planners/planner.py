@@ -108,6 +108,9 @@ class PlannerConfig:
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
+        extremes: number of random initial states among which the extremes of each state are found, from which a plan
+            and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one
+            of hundreds.
         constraints: bounds on states that plans over whole episodes keep.
         descent: parameters of the policy's descent over whole episodes.
         short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
@@ -122,6 +125,7 @@ class PlannerConfig:
     approach: int = 0
     approach_at: int = 3
     experience: int = 100
+    extremes: int = 1000
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
@@ -158,5 +162,7 @@ class PlannerConfig:
             )
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
+        if self.extremes < 0:
+            raise ValueError(f"extremes={self.extremes} of the planning must not be negative; 0 looks at none.")
         if self.experience < 1:
             raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")
