@@ -107,23 +107,16 @@ class Planning:
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
             found = merged(found, further) if further["plan_accepted"] else found
-        refuted = self._refuted(judged_on, judgement)
+        refuted = self._refuted(judgement)
         if refuted:
             found.update(findings(withheld=max(refuted, float(found.get("withheld", 0.0)))))
         constraints = self.virtual.constraints
         return merged(found, findings(**constraints.report())) if constraints else found
 
-    def _refuted(self, judged_on: Scenario, judgement: Judgement) -> float:
-        """How much better the twin finds weights that have flown, and whose real episodes refute it, than the present.
-
-        A plan of another episode may lie where no evidence is; what this one refutes stays refuted.
-        """
+    def _refuted(self, judgement: Judgement) -> float:
+        """What flights of earlier weights refute, wherever the plan of this episode lies."""
         policy, evidence = self.planner.policy, judgement.evidence
-        refuting = [] if evidence is None or isinstance(policy, StateFeedback) else evidence.refuting(policy)
-        if not refuting:
-            return 0.0
-        stays, *others = (judgement.of(one, self.virtual.price(one, judged_on).item()) for one in (policy, *refuting))
-        return max(other.withheld(stays) for other in others)
+        return 0.0 if evidence is None or isinstance(policy, StateFeedback) else evidence.refuted(policy)
 
     def _recall(self, judged_on: Scenario, judgement: Judgement) -> float | None:
         """Go back to weights that have flown for less on the real system, and say what that withholds."""
