@@ -52,7 +52,10 @@ def test_they_fly_under_the_inputs_of_other_episodes():
         (16.0, 15.0, 1.9, False),
         (225.0, 220.0, 2.0, True),  # the other one fails, too, and is not to be made worse
         (230.0, 60.0, 0.1, False),  # one episode in a hundred is not worth what it saves elsewhere
+        (45.0, 15.0, 6.0, False),  # it costs three times as much everywhere
+        (80.0, 15.0, 6.0, True),
         (math.inf, 15.0, 1.9, True),
+        (math.inf, 15.0, math.inf, False),
         (math.inf, math.inf, 1.9, False),
     ],
 )

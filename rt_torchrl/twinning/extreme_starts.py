@@ -54,7 +54,7 @@ def astray(tail: float, than: float, *, cost: float, usual: float) -> bool:
     """Whether a policy fails from the extreme starts, where another one does not.
 
     Its mean cost there is higher by more than the other one's usual cost, and by more than it saves elsewhere where
-    one episode in a hundred begins like these.
+    one episode in a hundred begins like these. What it costs more elsewhere, in the same ratio, is no failure from there.
 
     Args:
         tail: mean J_a of the policy from the extreme starts.
@@ -64,4 +64,5 @@ def astray(tail: float, than: float, *, cost: float, usual: float) -> bool:
     """
     if not (math.isfinite(than) and math.isfinite(usual)):
         return False
-    return tail - than > max(abs(usual), (usual - cost) / RARE)
+    saved, ratio = usual - cost, max(1.0, abs(than / usual)) if usual else 1.0
+    return tail - than - ratio * max(0.0, -saved) > max(abs(usual), saved / RARE)
