@@ -54,7 +54,7 @@ def astray(tail: float, than: float, *, cost: float, usual: float) -> bool:
     """Whether a policy fails from the extreme starts, where another one does not.
 
     Its mean cost there is higher by more than the other one's usual cost, and by more than it saves elsewhere where
-    one episode in a hundred begins like these. What it costs more elsewhere, in the same ratio, is no failure from there.
+    one episode in a hundred begins like these. What it costs more everywhere, in the same ratio, does not count.
 
     Args:
         tail: mean J_a of the policy from the extreme starts.
