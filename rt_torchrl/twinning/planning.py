@@ -175,7 +175,7 @@ class Planning:
             cost = self.virtual.price(policy, judged_on)
             failed = astray(self.virtual.tail(policy, judged_on), tail, cost=cost.item(), usual=least.item())
             if cost < least and not failed:
-                return planned(found, accepted=True)
+                return planned(found)
         policy.load_state_dict(best)
         self.planner.restart()
         return None
@@ -219,7 +219,7 @@ class Planning:
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         try:
-            return planned(self.planner.plan(episodes), accepted=True)
+            return planned(self.planner.plan(episodes))
         except FloatingPointError as error:
             judgement.require_sound_twin(episodes)
             policy.load_state_dict(before)
@@ -227,11 +227,6 @@ class Planning:
             return findings(f"no plan: {error}", plan_accepted=0.0)
 
 
-def planned(found: Descended, *, accepted: bool) -> TensorDict:
-    """The report of a plan."""
-    return findings(
-        J_a_plan_before=found.start,
-        J_a_plan=found.best if accepted else found.start,
-        policy_gradient=found.gradient,
-        plan_accepted=float(accepted),
-    )
+def planned(found: Descended) -> TensorDict:
+    """The report of a plan that is kept."""
+    return findings(J_a_plan_before=found.start, J_a_plan=found.best, policy_gradient=found.gradient, plan_accepted=1.0)
