@@ -63,6 +63,7 @@ PAPER = TwinningConfig(
         iterations=5,
         realisations=20,
         episode_gradient_limit=math.inf,
+        extremes=0,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
         receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
@@ -76,6 +77,7 @@ CONVERGED = dataclasses.replace(
         PAPER.planner,
         iterations=12,
         episode_gradient_limit=10.0,
+        extremes=1000,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
     ),
     hypotheses=HypothesesConfig(),

@@ -63,6 +63,7 @@ PAPER = TwinningConfig(
     planner=PlannerConfig(
         iterations=5,
         episode_gradient_limit=math.inf,
+        extremes=0,
         descent=DescentConfig(rate=0.2, gradient_limit=0.5),
         receding_horizon=PREDICTIVE,
     ),

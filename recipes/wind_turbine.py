@@ -52,6 +52,7 @@ PAPER = TwinningConfig(
     planner=PlannerConfig(
         iterations=10,
         episode_gradient_limit=math.inf,
+        extremes=0,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),

@@ -36,7 +36,7 @@ from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.planning import Costs, Judgement, Planning
 from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
-from rt_torchrl.twinning.track_record import Differences
+from rt_torchrl.twinning.track_record import Differences, Flown
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
@@ -269,6 +269,29 @@ def test_the_report_says_what_a_recall_withholds():
     report = planning.plan(1, episodes, episodes, judgement)
     assert policy.gain.tolist() == [[4.0, 0.0]] and report["recalled"] == 1.0
     assert report["withheld"].item() == pytest.approx(math.log(2.0))
+
+
+@pytest.mark.parametrize(
+    ("said", "d", "withheld"),
+    [
+        (2.0, 2.0, math.log(1.5)),
+        (2.0, 0.1, 0.0),  # within chance
+        (2.0, 0.3, 0.0),  # it cost 2.7, less than the policy that stays
+        (4.0, 2.0, 0.0),  # the twin does not prefer it
+        (2.0, -2.0, 0.0),
+    ],
+)
+def test_what_a_flown_episode_refutes_stays_refuted(said, d, withheld):
+    """The twin says 3 of the policy that stays; an earlier one flew for e^d times what the twin says of it."""
+    judge, policy = judge_of([said], [d]), LinearGain([[3.0, 0.0]])
+    episode = Flown(judge.record, "model_based", {}, said * math.exp(d))
+    judge.differences = judge.differences._replace(flown=[episode])
+    judge.recalled, judge.median = lambda policy, episodes: None, lambda policy, cost: cost
+    planning = Planning(Content(policy), judge.virtual, PlannerConfig())
+    judgement = Judgement(lambda episodes: judge.virtual.cost(policy, episodes), lambda a, b: a > b, print, judge)
+    episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
+    report = planning.plan(1, episodes, episodes, judgement)
+    assert float(report.get("withheld", 0.0)) == pytest.approx(withheld)
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.5])

@@ -93,7 +93,7 @@ class ReinforcementTwinning:
         self.track_record = TrackRecord(self.policies)
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
-        self.virtual.constraints = getattr(self.planner, "constraints", None)
+        self.virtual.judge_by(getattr(self.planner, "constraints", None), config.planner.extremes)
         system = env.system if isinstance(env, Operation) else env
         self.clearance = Clearance(system, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)

@@ -14,6 +14,7 @@ from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
+from rt_torchrl.twinning.extreme_starts import astray
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -120,6 +121,11 @@ class Cloning:
             draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
             error = self.distillation.imitate(teacher, policy, seen=records, draw=draw)
             wanted = self.virtual.price(teacher, judged_on).item()
+            if self._astray(teacher, policy, judged_on, wanted):
+                policy.load_state_dict(before)
+                error = self.distillation.imitate(
+                    teacher, policy, seen=records, draw=lambda: self.virtual.with_extremes(draw())
+                )
         cost = self.virtual.price(policy, judged_on).item()
         found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": cost / wanted}
         if cost <= start:
@@ -128,6 +134,13 @@ class Cloning:
         return findings(
             f"{role} does not imitate the controller: its J_a would be {cost:.4g}, not {start:.4g}", **found
         )
+
+    def _astray(self, teacher: nn.Module, policy: nn.Module, judged_on: Scenario, wanted: float) -> bool:
+        """Whether an imitation fails from extreme starts; flights of model predictive control take too long to ask."""
+        if isinstance(teacher, PredictiveControl):
+            return False
+        tails = (self.virtual.tail(each, judged_on) for each in (policy, teacher))
+        return astray(*tails, cost=self.virtual.price(policy, judged_on).item(), usual=wanted)
 
 
 def same_architecture(first: nn.Module, second: nn.Module) -> bool:

@@ -14,6 +14,7 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.examination import RealJudge
 from rt_torchrl.twinning.evidence.paired_differences import difference
+from rt_torchrl.twinning.extreme_starts import astray
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.planners import Planner, PlannerConfig
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -107,8 +108,16 @@ class Planning:
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
             found = merged(found, further) if further["plan_accepted"] else found
+        refuted = self._refuted(judgement)
+        if refuted:
+            found.update(findings(withheld=max(refuted, float(found.get("withheld", 0.0)))))
         constraints = self.virtual.constraints
         return merged(found, findings(**constraints.report())) if constraints else found
+
+    def _refuted(self, judgement: Judgement) -> float:
+        """What flights of earlier weights refute, wherever the plan of this episode lies."""
+        policy, evidence = self.planner.policy, judgement.evidence
+        return 0.0 if evidence is None or isinstance(policy, StateFeedback) else evidence.refuted(policy)
 
     def _recall(self, judged_on: Scenario, judgement: Judgement) -> float | None:
         """Go back to weights that have flown for less on the real system, and say what that withholds."""
@@ -154,6 +163,7 @@ class Planning:
         """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
         policy = self.planner.policy
         best, least = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on)
+        tail = self.virtual.tail(policy, judged_on)
         policy.load_state_dict(weights)
         self.planner.restart()
         try:
@@ -162,8 +172,11 @@ class Planning:
             found = self.planner.plan(planned_on)
         except FloatingPointError:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
-        if found is not None and self.virtual.price(policy, judged_on) < least:
-            return planned(found, accepted=True)
+        if found is not None:
+            cost = self.virtual.price(policy, judged_on)
+            failed = astray(self.virtual.tail(policy, judged_on), tail, cost=cost.item(), usual=least.item())
+            if cost < least and not failed:
+                return planned(found)
         policy.load_state_dict(best)
         self.planner.restart()
         return None
@@ -175,32 +188,47 @@ class Planning:
         return limited_mean(costs, policy.parameters(), self.config.episode_gradient_limit)
 
     def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
+        """A plan from the present weights; one that fails from extreme starts is made again on these, too."""
+        policy = self.planner.policy
+        if isinstance(policy, StateFeedback):
+            return self._descended(planned_on, judgement)
+        before, tail = copy.deepcopy(policy.state_dict()), self.virtual.tail(policy, judged_on)
+        incumbent = judgement.of(policy, judgement.incumbent(judged_on).item())
+        failed = 0.0
+        for episodes in (planned_on, self.virtual.with_extremes(planned_on)):
+            found = self._descended(episodes, judgement)
+            if not found["plan_accepted"]:
+                return found
+            plan = judgement.of(policy, self.virtual.price(policy, judged_on).item())
+            if judgement.worse(plan.expected, incumbent.expected):
+                break
+            if not astray(self.virtual.tail(policy, judged_on), tail, cost=plan.twin, usual=incumbent.twin):
+                return self._with_failure(found, failed)
+            failed = 1.0
+            policy.load_state_dict(before)
+            self.planner.restart()
+        policy.load_state_dict(before)
+        self.planner.refuse()
+        refused = found.update(findings(plan_accepted=0.0, J_a_plan=found["J_a_plan_before"]))
+        return self._with_failure(merged(refused, findings(withheld=plan.withheld(incumbent))), failed)
+
+    def _with_failure(self, found: TensorDict, failed: float) -> TensorDict:
+        """A report, and whether a plan has failed from extreme starts if there are any."""
+        return merged(found, findings(astray=failed)) if self.virtual.extremes else found
+
+    def _descended(self, episodes: Scenario, judgement: Judgement) -> TensorDict:
+        """The report of a plan, or why there is none; the policy then has its earlier weights."""
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
-        judged = not isinstance(policy, StateFeedback)
-        incumbent = judgement.of(policy, judgement.incumbent(judged_on).item()) if judged else None
         try:
-            found = self.planner.plan(planned_on)
+            return planned(self.planner.plan(episodes))
         except FloatingPointError as error:
-            judgement.require_sound_twin(planned_on)
+            judgement.require_sound_twin(episodes)
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
-        if incumbent is None:
-            return planned(found, accepted=True)
-        plan = judgement.of(policy, self.virtual.price(policy, judged_on).item())
-        if not judgement.worse(plan.expected, incumbent.expected):
-            return planned(found, accepted=True)
-        policy.load_state_dict(before)
-        self.planner.refuse()
-        return merged(planned(found, accepted=False), findings(withheld=plan.withheld(incumbent)))
 
 
-def planned(found: Descended, *, accepted: bool) -> TensorDict:
-    """The report of a plan."""
-    return findings(
-        J_a_plan_before=found.start,
-        J_a_plan=found.best if accepted else found.start,
-        policy_gradient=found.gradient,
-        plan_accepted=float(accepted),
-    )
+def planned(found: Descended) -> TensorDict:
+    """The report of a plan that is kept."""
+    return findings(J_a_plan_before=found.start, J_a_plan=found.best, policy_gradient=found.gradient, plan_accepted=1.0)

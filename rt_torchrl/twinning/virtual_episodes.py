@@ -12,6 +12,7 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, sample_experience
+from rt_torchrl.twinning.extreme_starts import ExtremeStarts
 from rt_torchrl.twinning.flight import Flight
 from rt_torchrl.twinning.planners.constraints import Constraints
 
@@ -28,10 +29,17 @@ class VirtualEpisodes:
 
     constraints: Constraints | None = None
     """Bounds on states, whose price counts where policies are compared; None for none."""
+    extremes: ExtremeStarts | None = None
+    """Extreme initial states, from which a new policy must not fail; None for none."""
 
     def __init__(self, twin: DigitalTwin, config: ExogenousConfig, experience: int, *, generator: torch.Generator):
         self.twin, self.config, self.generator = twin, config, generator
         self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
+
+    def judge_by(self, constraints: Constraints | None, extremes: int) -> None:
+        """Compare policies by bounds on states, too, and from the extremes of so many random initial states."""
+        self.constraints = constraints
+        self.extremes = ExtremeStarts(self.twin.plant, extremes, self.generator.device)
 
     def wanting(self, arm: str) -> bool:
         """Whether an arm with a twin still needs the inputs of one whole real episode."""
@@ -99,6 +107,14 @@ class VirtualEpisodes:
         except DivergenceError:
             return torch.full((), torch.inf, dtype=torch.float64, device=episodes.initial_state.device)
         return cost.nan_to_num(nan=torch.inf, posinf=torch.inf)
+
+    def tail(self, policy: nn.Module, episodes: Scenario) -> float:
+        """Mean J_a of a policy from the extreme starts, under the inputs of some episodes; zero without extremes."""
+        return self.cost(policy, self.extremes.under(episodes)).item() if self.extremes else 0.0
+
+    def with_extremes(self, episodes: Scenario) -> Scenario:
+        """Some episodes, and those from the extreme starts."""
+        return self.extremes.beside(episodes) if self.extremes else episodes
 
     @torch.no_grad()
     def price(self, policy: nn.Module, episodes: Scenario) -> Tensor:

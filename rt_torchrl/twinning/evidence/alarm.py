@@ -54,7 +54,7 @@ def contradiction(withheld: float) -> str:
     """
     return (
         f"the twin is wrong where it matters: it says that a plan would cost 1/{math.exp(withheld):.3g} of the policy "
-        "that stays, and real episodes of its neighbours cost so much more than it said that the plan is refused"
+        "that stays, and by real episodes of that plan or of its neighbours it costs more"
     )
 
 

@@ -186,6 +186,27 @@ class RealJudge:
         return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
 
     @torch.no_grad()
+    def refuted(self, policy: nn.Module) -> float:
+        """How much better the twin finds weights that have flown than a policy, where their flights refute it.
+
+        Each is compared in the episode that it flew, because in one of many random episodes the twin may blow up. An
+        episode refutes the twin if it cost more than the twin says even now, beyond chance, and more than the policy is
+        expected to cost in it.
+
+        Returns:
+            The greatest log of the ratio of both costs on the twin; zero if the twin prefers nothing that is refuted.
+        """
+        found, sizes = self.differences, [0.0]
+        for one, d, explored, flown in zip(found.policies, found.values, found.exploration, found.flown, strict=False):
+            if d < 0.0 or unexplained(d, explored) <= BEYOND_CHANCE or not same_architecture(one, policy):
+                continue
+            episode = self.virtual.repeated(flown.trajectory)
+            predicted, stays = (self.virtual.cost(each, episode).item() for each in (one, policy))
+            if math.isfinite(predicted) and self.median(policy, stays) < flown.cost:
+                sizes.append(difference(stays, predicted))
+        return max(sizes)
+
+    @torch.no_grad()
     def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
         """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""
         flown = [one for one in self.differences.policies if same_architecture(one, policy)]

@@ -110,6 +110,9 @@ class PlannerConfig:
         episode_gradient_limit: limit κ of the gradient of each virtual episode in a descent over whole episodes, see
             :func:`limited_mean`; infinite for none, as in the paper.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
+        extremes: number of random initial states among which the extremes of each state are found, from which a plan
+            and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one
+            of hundreds.
         constraints: bounds on states that plans over whole episodes keep.
         descent: parameters of the policy's descent over whole episodes.
         short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
@@ -125,6 +128,7 @@ class PlannerConfig:
     approach_at: int = 3
     episode_gradient_limit: float = 10.0
     experience: int = 100
+    extremes: int = 1000
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
@@ -142,8 +146,6 @@ class PlannerConfig:
                 f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
                 "planner.method and short_horizon.window as they are, or leave the constraints out."
             )
-        if self.iterations < 0:
-            raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
         if self.rounds < 1 or (self.rounds > 1 and self.method == "receding_horizon"):
             raise ValueError(
                 f"rounds={self.rounds} of the planning must be at least 1, and 1 with method receding_horizon, which "
@@ -159,6 +161,11 @@ class PlannerConfig:
                 f"approach={self.approach} of the planning belongs to descents over whole episodes; leave it out, or "
                 "short_horizon.window and method=receding_horizon."
             )
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        if self.iterations < 0:
+            raise ValueError(f"iterations={self.iterations} of the planning (n_mb) must not be negative.")
         if self.realisations is not None and self.realisations < 1:
             raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
         if not self.episode_gradient_limit >= 1.0:
@@ -166,5 +173,7 @@ class PlannerConfig:
                 f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
                 "no limit."
             )
+        if self.extremes < 0:
+            raise ValueError(f"extremes={self.extremes} of the planning must not be negative; 0 looks at none.")
         if self.experience < 1:
             raise ValueError(f"experience={self.experience} of the planning must be at least 1 episode.")
