@@ -9,7 +9,6 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, by_small_steps
-from rt_torchrl.optimisers.limited_mean import limited_mean
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.examination import RealJudge
@@ -184,8 +183,7 @@ class Planning:
     def _priced(self, policy: nn.Module, episodes: Scenario) -> Tensor:
         """The mean J_a with the price of leaving the bounds, if there are some, for a descent."""
         twin, constraints = self.virtual.twin, self.virtual.constraints
-        costs = constraints.costs(twin, policy, episodes) if constraints else twin.episode_costs(policy, *episodes)
-        return limited_mean(costs, policy.parameters(), self.config.episode_gradient_limit)
+        return constraints.costs(twin, policy, episodes).mean() if constraints else twin.cost(policy, *episodes)
 
     def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """A plan from the present weights; one that fails from extreme starts is made again on these, too."""

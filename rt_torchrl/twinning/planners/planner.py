@@ -107,8 +107,9 @@ class PlannerConfig:
             episodes; 0 for none. A descent from the imitation of a controller may end in a minimum beside that
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
-        episode_gradient_limit: limit κ of the gradient of each virtual episode in a descent over whole episodes, see
-            :func:`limited_mean`; infinite for none, as in the paper.
+        episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
+            descent over whole episodes where the first one gains nothing beside a mean gradient that is longer;
+            infinite for none, as in the paper.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         extremes: number of random initial states among which the extremes of each state are found, from which a plan
             and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one

@@ -1,5 +1,6 @@
 """Planning over whole virtual episodes, as in the paper."""
 
+import math
 from typing import Any
 
 import torch
@@ -11,6 +12,9 @@ from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints import Constraints
 from rt_torchrl.twinning.planners.planner import PlannerConfig
+
+NOTHING = 1e-3
+"""Share of a cost that a plan must gain, where its gradient promises much more."""
 
 
 class WholeEpisodes:
@@ -31,16 +35,26 @@ class WholeEpisodes:
         self.constraints = Constraints(twin.plant, config.constraints)
 
     def plan(self, episodes: Scenario) -> Descended:
-        """Take n_mb gradient steps; the policy keeps the best weights seen in them."""
-        found = self.descent.run(lambda: self._cost(episodes), self.config.iterations)
+        """Take n_mb gradient steps, and as many with limited gradients where they gain nothing; the best weights stay."""
+        limit = self.config.episode_gradient_limit
+        found = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
+        if self._stalled(found, limit):
+            again = self.descent.run(lambda: self._cost(episodes, limit), self.config.iterations)
+            found = found._replace(best=again.best, iterations=found.iterations + again.iterations)
         if self.constraints:
             with torch.no_grad():
                 self.constraints.update(self.twin.control(self.policy, *episodes))
         return found
 
-    def _cost(self, episodes: Scenario) -> Tensor:
+    def _stalled(self, found: Descended, limit: float) -> bool:
+        """Whether a descent gained nothing although its first gradient is longer than the limit."""
+        size = torch.stack([w.detach().norm() for w in self.policy.parameters()]).norm().item()
+        gained = found.start - found.best > NOTHING * abs(found.start)
+        return not gained and found.gradient * size > limit * abs(found.start)
+
+    def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.constraints.costs(self.twin, self.policy, episodes)
-        return limited_mean(costs, self.policy.parameters(), self.config.episode_gradient_limit)
+        return limited_mean(costs, self.policy.parameters(), limit)
 
     def refuse(self) -> None:
         """Forget the state of the optimiser, because it led to the plan that was refused."""
