@@ -112,4 +112,3 @@ def test_a_plan_goes_on_beside_an_episode_whose_gradient_explodes(limit, far):
     found = planner.plan(Scenario(nothing, torch.zeros(1, plant.n_steps, 1, dtype=torch.float64)))
     assert found.start == pytest.approx(13.5)
     assert (found.best > 3.0) is far
-    assert (found.iterations > 40) is not far

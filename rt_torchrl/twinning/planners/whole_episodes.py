@@ -35,7 +35,7 @@ class WholeEpisodes:
         self.constraints = Constraints(twin.plant, config.constraints)
 
     def plan(self, episodes: Scenario) -> Descended:
-        """Take n_mb gradient steps, and as many with limited gradients where they gain nothing; the best weights stay."""
+        """Take n_mb gradients, and as many limited ones where they gain nothing; the policy keeps the best weights."""
         limit = self.config.episode_gradient_limit
         found = self.descent.run(lambda: self._cost(episodes, math.inf), self.config.iterations)
         if self._stalled(found, limit):
