@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
+from tensordict import TensorDict
 from test_ddpg import seeded
 from test_explicit_update import assert_same, whole
 from torch import nn
@@ -25,6 +26,7 @@ from rt_torchrl.twinning.learners.episode_memory import decision_intervals
 from rt_torchrl.twinning.learners.explicit import row_function
 from rt_torchrl.twinning.learners.explicit.critic_formulas import symexp, symlog
 from rt_torchrl.twinning.learners.incremental_td3 import IncrementalTD3, settled
+from rt_torchrl.twinning.learners.innovations import Innovations, count_innovations, inputs_within
 from rt_torchrl.twinning.learners.lesson import Lesson
 from rt_torchrl.twinning.learners.weights import change_of_actions, weights_of
 
@@ -116,6 +118,44 @@ def test_transitions_sum_rewards_of_whole_decisions():
         assert part["next", "discount"][k].item() == pytest.approx(GAMMA**n)
         torch.testing.assert_close(part["action"][k], episode["action"][k : k + m].mean(0) / 2.0)
         assert torch.equal(part["next", "observation"][k], episode["observation"][k + n])
+
+
+@pytest.mark.parametrize("intervals", [1, 4])
+def test_an_innovation_is_what_the_beginning_does_not_foretell(intervals):
+    """Of z' = 0.8 z + w it is w/σ for one interval, and for more it is uncorrelated with what is known."""
+    generator, n = seeded(0), 4000
+    noise = torch.randn(n, generator=generator, dtype=torch.float64)
+    inputs = [noise[0]]
+    for fresh in noise[1:]:
+        inputs.append(0.8 * inputs[-1] + fresh)
+    constant = torch.full((n,), 7.0, dtype=torch.float64)
+    episode = TensorDict({"exogenous": torch.stack([torch.stack(inputs), constant], -1)}, batch_size=n)
+    at = torch.arange(n - intervals)
+    starts = (episode["exogenous"][at, :1] - episode["exogenous"][at, :1].mean()) / episode["exogenous"][at, :1].std()
+    ahead = inputs_within(episode, at, intervals)
+    found = Innovations(starts, ahead)(starts, ahead)
+    assert found.shape[-1] == count_innovations(2, intervals) == 2 * min(intervals, 2)
+    assert not found[:, 1::2].any()  # what is constant is foretold
+    assert found[:, 0].std().item() == pytest.approx(1.0)
+    assert abs((found[:, 0] * starts[:, 0]).mean().item()) < 1e-4
+    if intervals == 1:
+        torch.testing.assert_close(found[:, 0], (noise[1:] - noise[1:].mean()) / noise[1:].std(), rtol=0.0, atol=0.05)
+    else:
+        torch.testing.assert_close(ahead[5, 2], episode["exogenous"][6:10, 0].mean())
+        assert torch.equal(inputs_within(episode, torch.tensor([n - 1]), intervals)[0, :2], episode["exogenous"][-1])
+
+
+def test_targets_take_the_mean_of_critics_at_the_innovation_of_another_transition():
+    found = learner()
+    loss, batch = found.loss, Lesson(found, 1.0).data[torch.arange(5, 25)]
+    assert batch["innovation"].shape == (20, count_innovations(len(PLANT.inputs), found.memory.intervals))
+    following, others = batch["next"].clone(), torch.arange(20).roll(1)
+    following["innovation"] = batch["innovation"][others]
+    following["action"] = found.actor_module()(following)["action"].detach()
+    value = loss._values(following, loss.target_qvalue_network_params).mean(0)
+    goal = symlog(batch["next", "reward"] + batch["next", "discount"] * symexp(value.unsqueeze(-1))).squeeze(-1)
+    expected = (loss._values(batch, loss.qvalue_network_params) - goal).abs().amax(0)
+    torch.testing.assert_close(loss.value_loss(batch)[1]["td_error"], expected.detach())
 
 
 def test_rescaling_is_inverted_and_keeps_four_orders_of_magnitude_apart():

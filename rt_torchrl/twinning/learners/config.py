@@ -64,7 +64,7 @@ class IncrementalTD3Config:
     """Parameters of incremental TD3 that the other learners do not have.
 
     Args:
-        critics: number of critics, at least two, of whose targets the least counts.
+        critics: number of critics, at least two, of whose targets the mean counts.
         delay: number of critic iterations for each iteration of the policy and of the targets.
         decisions: number of decisions in the time 1/(1 − γ); a decision lasts as many control intervals as fit.
         actor_episodes: number of latest real episodes in whose states the policy is improved.

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from rt_torchrl.plants.increments import Increments
+from rt_torchrl.twinning.learners.innovations import Innovations, inputs_within
 
 SEEN = ("observation", "state", "exogenous")
 """Entries of an episode that the critics see."""
@@ -106,10 +107,24 @@ class EpisodeMemory:
             ValueError: if a transition is longer than an episode.
         """
         first, scales = len(self.episodes) - recent, self.statistics()
+        law = self.innovations(scales)
         return [
-            self._transitions(episode, decisions if k >= first else 1, scales, reward_scale)
+            self._transitions(episode, decisions if k >= first else 1, scales, law, reward_scale)
             for k, episode in enumerate(self.episodes)
         ]
+
+    def innovations(self, scales: tuple[Tensor, Tensor]) -> Innovations:
+        """The law by which features foretell the inputs within a decision, from all episodes."""
+        places = [self.inner_places(episode, self.intervals) for episode in self.episodes]
+        parts = list(zip(self.episodes, places, strict=True))
+        starts = torch.cat([self._scaled_features(episode, at, scales) for episode, at in parts])
+        return Innovations(starts, torch.cat([inputs_within(episode, at, self.intervals) for episode, at in parts]))
+
+    def innovation(
+        self, episode: TensorDict, at: Tensor, scales: tuple[Tensor, Tensor], law: Innovations
+    ) -> Float[Tensor, "n n_y"]:
+        """Innovations of the decisions that begin at some control intervals."""
+        return law(self._scaled_features(episode, at, scales), inputs_within(episode, at, self.intervals))
 
     def places(self, episode: TensorDictBase, intervals: int) -> Tensor:
         """Control intervals at which transitions begin that last so many intervals, or up to an early end.
@@ -136,7 +151,12 @@ class EpisodeMemory:
         return max(1, self.intervals // PLACES)
 
     def _transitions(
-        self, episode: TensorDict, decisions: int, scales: tuple[Tensor, Tensor], reward_scale: float
+        self,
+        episode: TensorDict,
+        decisions: int,
+        scales: tuple[Tensor, Tensor],
+        law: Innovations,
+        reward_scale: float,
     ) -> TensorDict:
         n = decisions * self.intervals
         at = self.places(episode, n)
@@ -147,7 +167,7 @@ class EpisodeMemory:
             rewards = torch.cat([rewards, rewards.new_full((n,), -(self.end_cost or 0.0))])
         sums, discount = self.closed(windows(rewards, self.discounts(n))[at], at + n >= len(episode), n)
         then["reward"], then["discount"] = reward_scale * sums.unsqueeze(-1), discount.unsqueeze(-1)
-        now["action"] = self.taken(episode, at)
+        now |= {"action": self.taken(episode, at), "innovation": self.innovation(episode, at, scales, law)}
         return TensorDict(now | {"next": then, "place": at}, batch_size=len(at), device=at.device)
 
     def closed(
@@ -165,9 +185,14 @@ class EpisodeMemory:
 
     def situation(self, episode: TensorDict, at: Tensor, scales: tuple[Tensor, Tensor]) -> dict[str, Any]:
         """What policy and critics need of some control intervals: observation, centre of the increments, features."""
-        mean, spread = scales
         seen = {"observation": episode["observation"][at], "centre": self.increments.centre(episode["state"][at])}
-        return seen | {"features": (features(episode)[at] - mean) / spread}
+        return seen | {"features": self._scaled_features(episode, at, scales)}
+
+    def _scaled_features(
+        self, episode: TensorDict, at: Tensor, scales: tuple[Tensor, Tensor]
+    ) -> Float[Tensor, "n n_x"]:
+        mean, spread = scales
+        return (features(episode)[at] - mean) / spread
 
     def taken(self, episode: TensorDict, at: Tensor) -> Float[Tensor, "n n_a"]:
         """Increments of the decisions that begin at some control intervals."""

@@ -21,6 +21,7 @@ from rt_torchrl.twinning.learners.episode_memory import EpisodeMemory, decision_
 from rt_torchrl.twinning.learners.explicit.critic_formulas import symexp
 from rt_torchrl.twinning.learners.explicit.incremental_td3 import ExplicitIncrementalTD3
 from rt_torchrl.twinning.learners.informed_critic import IncrementalPolicy, InformedCritic, RescaledTD3Loss
+from rt_torchrl.twinning.learners.innovations import count_innovations
 from rt_torchrl.twinning.learners.lesson import Lesson
 from rt_torchrl.twinning.learners.rescaled_iterations import RescaledIterations
 from rt_torchrl.twinning.learners.twin_teacher import TwinTeacher
@@ -106,8 +107,9 @@ class IncrementalTD3:
     def _make_loss(self, plant: Plant) -> RescaledTD3Loss:
         n_x, n_a = len(plant.observations) + len(plant.states) + len(plant.inputs), len(plant.actions)
         count, one = self.config.incremental.critics, torch.ones_like(self.increments.low)
-        critics = [InformedCritic(n_x, n_a, self.config.critic_hidden, generator=self.generator) for _ in range(count)]
-        operators = [ValueOperator(critic, in_keys=["features", "action"]) for critic in critics]
+        n_y, hidden = count_innovations(len(plant.inputs), self.memory.intervals), self.config.critic_hidden
+        critics = [InformedCritic(n_x, n_y, n_a, hidden, generator=self.generator) for _ in range(count)]
+        operators = [ValueOperator(critic, in_keys=["features", "innovation", "action"]) for critic in critics]
         actor = self.actor_module()
         return RescaledTD3Loss(actor, operators, bounds=(-one, one), num_qvalue_nets=count, loss_function="l2")
 

@@ -112,12 +112,14 @@ class TwinTeacher:
         """
         memory, n = self.memory, decisions * self.memory.intervals
         scales, parts = memory.statistics(), []
+        law = memory.innovations(scales)
         long = [episode for episode in memory.episodes if len(memory.inner_places(episode, n))]
         for episode in long:
             share, places = -(-count // len(long)), memory.inner_places(episode, n)
             drawn = torch.randint(len(places), (share,), generator=generator, device=generator.device)
             at = places[drawn]
             now = memory.situation(episode, at, scales) | {"action": memory.taken(episode, at), "place": at}
+            now["innovation"] = memory.innovation(episode, at, scales, law)
             now["next"] = self._flown(episode, at, n, scales, reward_scale)
             parts.append(TensorDict(now, batch_size=share, device=at.device))
         return torch.cat(parts)[:count] if parts else None

@@ -124,7 +124,7 @@ def derivatives_of(
 
 @dataclass(frozen=True)
 class TemporalDifferences:
-    r"""The formula of a critic iteration for critics i, of which the targets take the least.
+    r"""The formula of a critic iteration for critics i, of which the targets take the least or the mean.
 
     .. math::
         \delta_i = q_i(x) - r - \gamma\min_j q_j'(x'), \qquad g_i = 2 w\delta_i
@@ -132,9 +132,9 @@ class TemporalDifferences:
     A row holds x, x', r, γ and w; weights are those of all critics and then of their targets. The results of a row are,
     for each critic in turn, δ, g, h_l of all hidden layers, and g dq/dz_l.
 
-    Rescaled critics give :math:`f_i = h(q_i)` with :func:`symlog` for h, and
+    Rescaled critics give :math:`f_i = h(q_i)` with :func:`symlog` for h, and their targets take the mean,
 
-    .. math:: \delta_i = f_i(x) - h\big(r + \gamma\min_j h^{-1}(f_j'(x'))\big)
+    .. math:: \delta_i = f_i(x) - h\Big(r + \gamma h^{-1}\Big(\frac1M\sum_j f_j'(x')\Big)\Big)
 
     Args:
         shape: numbers of each critic.
@@ -162,8 +162,10 @@ class TemporalDifferences:
         critics = [self.shape.layers(part) for part in weights.split(self.shape.n_w)]
         normal = self.shape.normalised
         values = [value_of(target, following, normal=normal) for target in critics[self.members :]]
-        least = reduce(torch.minimum, values)
-        goal = reward + discount * (symexp(least) if self.rescaled else least)
+        if self.rescaled:
+            goal = reward + discount * symexp(reduce(torch.add, values) / self.members)
+        else:
+            goal = reward + discount * reduce(torch.minimum, values)
         goal = symlog(goal) if self.rescaled else goal
         found: list[Tensor] = []
         for critic in critics[: self.members]:

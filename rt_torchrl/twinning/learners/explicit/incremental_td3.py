@@ -17,6 +17,7 @@ from rt_torchrl.twinning.learners.explicit.row_function import RowFunction
 from rt_torchrl.twinning.learners.explicit.slope_formulas import REACH, SlopeDifferences
 from rt_torchrl.twinning.learners.explicit.stacked_critics import StackedCritics, members_of
 from rt_torchrl.twinning.learners.explicit.td3 import ACTOR
+from rt_torchrl.twinning.learners.informed_critic import drawn_anew
 
 if TYPE_CHECKING:
     from rt_torchrl.twinning.learners.incremental_td3 import IncrementalTD3
@@ -53,7 +54,10 @@ class ExplicitIncrementalTD3:
 
     def _take(self, transitions: TensorDictBase) -> None:
         following, action = transitions["next"], transitions["action"]
-        parts = [transitions["features"], action, following["features"], torch.zeros_like(action)]
+        innovation = transitions["innovation"]
+        parts = [transitions["features"], innovation, action]
+        parts += [following["features"], innovation, torch.zeros_like(action)]
+        self._n_y = innovation.shape[-1]
         parts += [following["reward"], following["discount"], transitions["weight"]]
         self._rows = torch.cat([part.t() for part in parts])
         self._seen, self._centre = transitions["observation"], transitions["centre"]
@@ -78,7 +82,10 @@ class ExplicitIncrementalTD3:
         torch.index_select(self._rows, 1, index, out=rows)
         rows[-1] /= len(index)
         action = self._next_policy(self._next_seen[index])
-        rows[shape.n_x + shape.n_o : -3] = self._reached(self._next_centre[index], action).t()
+        following = rows[shape.n_x :]
+        innovation = following[shape.n_o - self._n_y : shape.n_o]
+        innovation.copy_(drawn_anew(innovation.t()).t())
+        following[shape.n_o : -3] = self._reached(self._next_centre[index], action).t()
         loss, td_error = self.critics.learn()
         if self._slopes is not None and direction is not None:
             share = self._share[index] / len(index)
