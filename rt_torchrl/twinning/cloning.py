@@ -21,6 +21,9 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 Result = TypeVar("Result")
 
+TWICE = 2.0
+"""Cost of an imitation from extreme starts over the controller's that is a failure: a small one differs everywhere."""
+
 
 class Cloning:
     """Copies weights between policies of the same architecture, and distils one into another architecture.
@@ -139,8 +142,9 @@ class Cloning:
         """Whether an imitation fails from extreme starts; flights of model predictive control take too long to ask."""
         if isinstance(teacher, PredictiveControl):
             return False
-        tails = (self.virtual.tail(each, judged_on) for each in (policy, teacher))
-        return astray(*tails, cost=self.virtual.price(policy, judged_on).item(), usual=wanted)
+        own, model = (self.virtual.tail(each, judged_on) for each in (policy, teacher))
+        cost = self.virtual.price(policy, judged_on).item()
+        return own > TWICE * abs(model) and astray(own, model, cost=cost, usual=wanted)
 
 
 def same_architecture(first: nn.Module, second: nn.Module) -> bool:
