@@ -275,7 +275,7 @@ def write(config: Config) -> Path:
     page = findings_page(results, PARTS, command(config))
     (config.folder / "worth.md").write_text(f"# What twinning is worth\n\n{page}\n", encoding="utf-8")
     if config.page is not None:
-        write_into(config.page, f"worth of {', '.join(config.cases())}", page)
+        write_into(config.page, f"worth of {', '.join(config.cases())} in {config.episodes} episodes", page)
     numbers = [{"case": found.case, "system": found.system, "least": found.least} for found in results]
     for number, found in zip(numbers, results, strict=True):
         number["oracle"] = found.oracle.mean
