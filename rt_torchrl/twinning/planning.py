@@ -189,12 +189,12 @@ class Planning:
         """A plan from the present weights; one that fails from extreme starts is made again on these, too."""
         policy = self.planner.policy
         if isinstance(policy, StateFeedback):
-            return self._descended(planned_on, judgement)
+            return self._descended(planned_on, planned_on, judgement)
         before, tail = copy.deepcopy(policy.state_dict()), self.virtual.tail(policy, judged_on)
         incumbent = judgement.of(policy, judgement.incumbent(judged_on).item())
         failed = 0.0
         for episodes in (planned_on, self.virtual.with_extremes(planned_on)):
-            found = self._descended(episodes, judgement)
+            found = self._descended(episodes, planned_on, judgement)
             if not found["plan_accepted"]:
                 return found
             plan = judgement.of(policy, self.virtual.price(policy, judged_on).item())
@@ -214,14 +214,17 @@ class Planning:
         """A report, and whether a plan has failed from extreme starts if there are any."""
         return merged(found, findings(astray=failed)) if self.virtual.extremes else found
 
-    def _descended(self, episodes: Scenario, judgement: Judgement) -> TensorDict:
-        """The report of a plan, or why there is none; the policy then has its earlier weights."""
+    def _descended(self, episodes: Scenario, usual: Scenario, judgement: Judgement) -> TensorDict:
+        """The report of a plan, or why there is none; the policy then has its earlier weights.
+
+        The twin must be sound in the usual episodes alone: what has just flown may diverge from extreme starts.
+        """
         policy = self.planner.policy
         before = copy.deepcopy(policy.state_dict())
         try:
             return planned(self.planner.plan(episodes))
         except FloatingPointError as error:
-            judgement.require_sound_twin(episodes)
+            judgement.require_sound_twin(usual)
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)
