@@ -38,12 +38,12 @@ def test_how_often_and_how_far_a_state_is_beyond_its_bounds():
 @pytest.mark.parametrize("method", ["augmented_lagrangian", "penalty"])
 def test_the_price_is_that_of_the_formula(method):
     constraints = Constraints(LinearQuadratic(), ConstraintsConfig(states=POSITION, method=method, weight=8.0))
-    positions, cost = (-1.5, 0.0, 5.0, 3.0), torch.tensor(3.0, dtype=torch.float64)
+    positions, cost = (-1.5, 0.0, 5.0, 3.0), torch.tensor([3.0], dtype=torch.float64)
     first = constraints.priced(cost, flown(*positions)).item()
     # Excess of 0.5 and 2 metres of a width of 4, in two of four intervals.
     assert first == pytest.approx(3.0 + 3.0 * 0.5 * 8.0 * (0.125**2 + 0.5**2) / 4.0)
     constraints.update(flown(*positions))
-    again = constraints.priced(torch.tensor(5.0).double(), flown(*positions)).item()
+    again = constraints.priced(torch.tensor([5.0]).double(), flown(*positions)).item()
     mu = 8.0 * (0.125 + 0.5) / 2.0 if method == "augmented_lagrangian" else 0.0
     beyond = [(-1.0 - x) / 4.0 for x in positions] + [(x - 3.0) / 4.0 for x in positions]
     price = sum(max(0.0, mu + 8.0 * g) ** 2 for g in beyond) / 4.0 / 16.0
