@@ -34,11 +34,16 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     each = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
     slopes = [torch.stack(parts) for parts in zip(*each, strict=True)]
     norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
-    size = torch.stack([weight.detach().norm() for weight in weights]).norm()
-    allowed = limit * costs.detach().abs() / size
-    shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)  # no cost is no scale
+    allowed = limit * costs.detach().abs() / norm_of(weights)
+    # A cost of zero says nothing about what is long.
+    shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)
     found = costs.detach().mean()
     for weight, part in zip(weights, slopes, strict=True):
         slope = torch.tensordot(shares, part, 1) / len(costs)
         found = found + ((weight - weight.detach()) * slope).sum()
     return found
+
+
+def norm_of(weights: Iterable[Tensor]) -> Float[Tensor, ""]:
+    """The norm of all weights together."""
+    return torch.stack([weight.detach().norm() for weight in weights]).norm()

@@ -173,8 +173,9 @@ class Planning:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
         if found is not None:
             cost = self.virtual.price(policy, judged_on)
-            failed = astray(self.virtual.tail(policy, judged_on), tail, cost=cost.item(), usual=least.item())
-            if cost < least and not failed:
+            if cost < least and not astray(
+                self.virtual.tail(policy, judged_on), tail, cost=cost.item(), usual=least.item()
+            ):
                 return planned(found)
         policy.load_state_dict(best)
         self.planner.restart()

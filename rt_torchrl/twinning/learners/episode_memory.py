@@ -120,12 +120,6 @@ class EpisodeMemory:
         starts = torch.cat([self._scaled_features(episode, at, scales) for episode, at in parts])
         return Innovations(starts, torch.cat([inputs_within(episode, at, self.intervals) for episode, at in parts]))
 
-    def innovation(
-        self, episode: TensorDict, at: Tensor, scales: tuple[Tensor, Tensor], law: Innovations
-    ) -> Float[Tensor, "n n_y"]:
-        """Innovations of the decisions that begin at some control intervals."""
-        return law(self._scaled_features(episode, at, scales), inputs_within(episode, at, self.intervals))
-
     def places(self, episode: TensorDictBase, intervals: int) -> Tensor:
         """Control intervals at which transitions begin that last so many intervals, or up to an early end.
 
@@ -167,7 +161,8 @@ class EpisodeMemory:
             rewards = torch.cat([rewards, rewards.new_full((n,), -(self.end_cost or 0.0))])
         sums, discount = self.closed(windows(rewards, self.discounts(n))[at], at + n >= len(episode), n)
         then["reward"], then["discount"] = reward_scale * sums.unsqueeze(-1), discount.unsqueeze(-1)
-        now |= {"action": self.taken(episode, at), "innovation": self.innovation(episode, at, scales, law)}
+        now["action"] = self.taken(episode, at)
+        now["innovation"] = law(now["features"], inputs_within(episode, at, self.intervals))
         return TensorDict(now | {"next": then, "place": at}, batch_size=len(at), device=at.device)
 
     def closed(

@@ -11,6 +11,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
 from rt_torchrl.twinning.learners.episode_memory import EpisodeMemory, windows
+from rt_torchrl.twinning.learners.innovations import inputs_within
 
 INSIDE = 1.0 - 1e-9
 """Share of an increment at which a slope is taken; at the very limit of an actuator there are two."""
@@ -119,7 +120,7 @@ class TwinTeacher:
             drawn = torch.randint(len(places), (share,), generator=generator, device=generator.device)
             at = places[drawn]
             now = memory.situation(episode, at, scales) | {"action": memory.taken(episode, at), "place": at}
-            now["innovation"] = memory.innovation(episode, at, scales, law)
+            now["innovation"] = law(now["features"], inputs_within(episode, at, memory.intervals))
             now["next"] = self._flown(episode, at, n, scales, reward_scale)
             parts.append(TensorDict(now, batch_size=share, device=at.device))
         return torch.cat(parts)[:count] if parts else None
