@@ -6,6 +6,7 @@ import pytest
 import tyro
 from handwritten_study import WRITE_RESULTS, finished, recipe, training, written
 
+from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import VARIANTS
 
 
@@ -68,6 +69,18 @@ def test_a_training_that_was_cut_short_is_not_finished(tmp_path):
     metrics = found.metrics()
     (found.folder / "metrics.json").write_text(json.dumps(metrics | {"episodes": metrics["episodes"][:2]}))
     assert not found.done()
+
+
+def test_an_interrupted_training_ends_the_study(tmp_path):
+    """Its recipe takes the signal and ends well, with the results of the episodes that it has done."""
+    fewer = WRITE_RESULTS.replace("config.episodes", "(config.episodes - 1)")
+    assert fewer != WRITE_RESULTS
+    cut_short = training(tmp_path, recipe=written(tmp_path / "cut_short.py", fewer))
+    following = training(tmp_path, 1, recipe=written(tmp_path / "tiny.py", WRITE_RESULTS))
+    with pytest.raises(KeyboardInterrupt):
+        on_this_machine([cut_short, following], jobs=1)
+    assert not following.folder.exists()
+    assert not cut_short.done()
 
 
 def test_a_training_with_damaged_results_runs_again(tmp_path):

@@ -84,6 +84,7 @@ class Training:
 
         Raises:
             RuntimeError: if the recipe fails, with what it said, or ends without the results of all episodes.
+            KeyboardInterrupt: if Ctrl-C or SIGTERM ended the training before its last episode.
         """
         if self.done():
             return
@@ -99,6 +100,8 @@ class Training:
                 recipe.main(from_command_line(recipe.Config, arguments))
             except (Exception, SystemExit) as error:
                 raise RuntimeError(f"{command} failed; see {log}: {error}") from error
+        if self._cut_short():
+            raise KeyboardInterrupt  # the recipe has taken the signal, and no other training must follow
         if not self.done():
             raise RuntimeError(f"{command} ended without the results of {self.episodes} episodes; see {log}")
 
@@ -115,9 +118,16 @@ class Training:
             )
         return found
 
+    def _cut_short(self) -> bool:
+        # An interrupted run writes results, too, of the episodes that it has done.
+        written = self._written()
+        return written is not None and len(written["episodes"]) < self.episodes
+
     def _results(self) -> dict[str, Any] | None:
-        # An interrupted run writes results too, of the episodes that it has done.
+        written = self._written()
+        return written if written is not None and len(written["episodes"]) == self.episodes else None
+
+    def _written(self) -> dict[str, Any] | None:
         found = read_json(self.folder / "metrics.json") or {}
-        episodes, summary = found.get("episodes"), found.get("summary")
-        whole = isinstance(summary, dict) and isinstance(episodes, list) and len(episodes) == self.episodes
-        return found if whole else None
+        sound = isinstance(found.get("summary"), dict) and isinstance(found.get("episodes"), list)
+        return found if sound else None
