@@ -17,7 +17,6 @@ from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.evidence.alarm import alarm
-from rt_torchrl.twinning.evidence.examination import RealJudge
 from rt_torchrl.twinning.evidence.paired_differences import (
     COMMON,
     EXPLORED,
@@ -29,6 +28,7 @@ from rt_torchrl.twinning.evidence.paired_differences import (
     PairedDifferences,
     difference,
 )
+from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.learners import LearnerConfig

@@ -14,7 +14,7 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.evidence.paired_differences import PairedDifferences, difference
+from rt_torchrl.twinning.evidence.paired_differences import LARGEST, PairedDifferences, difference
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -131,11 +131,11 @@ class Differences(NamedTuple):
     exploration: list[float]
     flown: Sequence[Flown] = ()
 
-    def learned(self, plant: Plant, record: Trajectory) -> PairedDifferences:
-        """The belief about all policies, which are compared in the observations of a record."""
+    def learned(self, plant: Plant, record: Trajectory, *, limit: float = LARGEST) -> PairedDifferences:
+        """The belief about all policies, compared in the observations of a record; ``limit`` is the largest d."""
         actions = [shares(policy, plant, record) for policy in self.policies]
         stacked = torch.stack(actions) if actions else record.states.new_empty(0, 1)
-        return PairedDifferences(stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration))
+        return PairedDifferences(stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration), limit)
 
 
 def shares(policy: nn.Module, plant: Plant, record: Trajectory) -> Float[Tensor, " m"]:

@@ -50,6 +50,7 @@ class PairedDifferences:
         actions: actions of the policies of past episodes in the same observations.
         differences: d of these episodes.
         exploration: exploration of these episodes, as a share of half the ranges, which the twin does not repeat.
+        limit: greatest |d| that counts.
 
     Raises:
         ValueError: if the numbers of policies, differences and explorations differ.
@@ -60,6 +61,7 @@ class PairedDifferences:
         actions: Float[Tensor, "n m"],
         differences: Float[Tensor, " n_d"],
         exploration: Float[Tensor, " n_e"] | None = None,
+        limit: float = LARGEST,
     ):
         exploration = torch.zeros_like(differences) if exploration is None else exploration
         if not len(actions) == len(differences) == len(exploration):
@@ -68,7 +70,7 @@ class PairedDifferences:
                 "as many."
             )
         self.actions = actions.detach()
-        self.differences = differences.detach().clamp(-LARGEST, LARGEST)
+        self.differences = differences.detach().clamp(-limit, limit)
         covariance = self._kernel(self.actions) + torch.diag(NOISE**2 + (EXPLORED * exploration) ** 2)
         self._root = torch.linalg.cholesky(covariance)
         self._weights = torch.cholesky_solve(self.differences.unsqueeze(-1), self._root)
