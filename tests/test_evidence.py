@@ -150,6 +150,7 @@ def test_the_alarm(differences, wrong):
 def test_the_alarm_says_how_wrong_the_twin_is():
     assert "the last 2 episodes cost 5.75 times as much as the twin says" in alarm((1.7, 1.8))
     assert "cost 1/2.01 of what the twin says" in alarm((-0.7, -0.69, -0.71))
+    assert "the last 2 episodes cost 1.22 times as much" in alarm((-0.4, 0.0, 0.2, 0.2))
 
 
 def test_false_alarms_of_a_sound_twin_are_rare():

@@ -9,7 +9,6 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.paired_differences import REACH
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
@@ -20,6 +19,10 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 WAYS = 8
 """Number of random directions of the weights, from the best of which a corrected plan begins."""
+KNOWN = 0.25
+"""Standard deviation of log J_real below which flights say what a policy costs; one that has not flown has 0.5."""
+PROMISED = 0.95
+"""Share of what the policy is expected to cost, below which a corrected plan must be: each one costs a flight."""
 STEPS = 12
 """Greatest number of trials of the distance along a direction."""
 NEAR = 0.2
@@ -45,53 +48,63 @@ class CorrectedPlans:
     counts as dearer. At weights that have flown, m has no slope, and at an optimum on the twin the cost has none
     either. A descent therefore begins at the best of a few weights that lie around, within reach of the evidence.
 
-    A plan stays if it is expected to cost less than the policy does, by a belief that takes paired differences as they
-    are and by one that limits them: whichever is dearer.
+    A plan that the twin has just made flies first: there is nothing to correct at a policy of which no flight tells. A
+    corrected plan stays if it is expected to cost less than the policy does, by two beliefs: one that takes paired
+    differences as they are, and one that limits those by which other policies become cheaper.
 
     Source: de Avila Ferreira et al., *Real-time optimization of uncertain process systems via modifier adaptation and
     Gaussian processes*, European Control Conference 2018.
 
     Args:
-        planner: planner of step 5; one without the attribute ``correction`` makes no corrected plans.
+        planner: planner of step 5, whose cost takes a correction.
         virtual: virtual episodes.
+
+    Raises:
+        ValueError: if the planner takes none.
     """
 
     def __init__(self, planner: Planner, virtual: VirtualEpisodes):
-        self.planner, self.virtual = planner, virtual
+        if not isinstance(planner, Correctable):
+            raise ValueError(
+                f"corrected_descents=True needs a planner with the attribute correction; {type(planner).__name__} has "
+                "none. docs/planner.md says what it does; or leave corrected_descents out."
+            )
+        self.planner: Correctable = planner
+        self.virtual = virtual
 
-    def plan(self, planned_on: Scenario, judged_on: Scenario, judge: RealJudge | None) -> TensorDict:
+    def plan(self, planned_on: Scenario, judged_on: Scenario, judge: RealJudge) -> TensorDict:
         """Make a corrected plan, which stays if it is expected to cost less.
 
         Returns:
-            ``corrected``, whether there was one that stays; nothing without evidence, or if the planner makes none.
+            ``corrected``, whether there was one that stays; nothing without evidence about the policy, or if it costs
+            nothing or less, of which there is no ratio.
         """
-        planner, policy = self.planner, self.planner.policy
-        if judge is None or not isinstance(planner, Correctable) or isinstance(policy, StateFeedback):
+        policy = self.planner.policy
+        usual = self.virtual.price(policy, judged_on).item()
+        if not usual > 0.0 or judge.deviation(policy) > KNOWN:
             return findings()
         before, tail = copy.deepcopy(policy.state_dict()), self.virtual.tail(policy, judged_on)
-        usual = self.virtual.price(policy, judged_on).item()
         stays = judge.expected(policy, usual)
         self._go_around(planned_on, judge)
-        if self._descended(planner, planned_on, judge):
+        if self._descended(planned_on, judge):
             cost = self.virtual.price(policy, judged_on).item()
             strays = astray(self.virtual.tail(policy, judged_on), tail, cost=cost, usual=usual)
-            if judge.dearest(policy, cost) < stays and not strays:
+            if judge.dearest(policy, cost) < PROMISED * stays and not strays:
                 return findings(corrected=1.0, plan_accepted=1.0)
         policy.load_state_dict(before)
-        planner.refuse()
+        self.planner.refuse()
         return findings(corrected=0.0)
 
-    @staticmethod
-    def _descended(planner: Correctable, episodes: Scenario, judge: RealJudge) -> bool:
+    def _descended(self, episodes: Scenario, judge: RealJudge) -> bool:
         """Descend from the present weights; False if the twin diverges with them."""
-        planner.restart()
-        planner.correction = judge.factor
+        self.planner.restart()
+        self.planner.correction = judge.factor
         try:
-            planner.plan(episodes)
+            self.planner.plan(episodes)
         except FloatingPointError:
             return False
         finally:
-            planner.correction = None
+            self.planner.correction = None
         return True
 
     @torch.no_grad()

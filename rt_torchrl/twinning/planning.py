@@ -75,11 +75,12 @@ class Planning:
         planner: planner of step 5.
         virtual: virtual episodes.
         config: parameters of step 5.
+        corrected: whether to make :class:`CorrectedPlans`, too, where there is evidence.
     """
 
-    def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig):
+    def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig, *, corrected: bool = False):
         self.planner, self.virtual, self.config = planner, virtual, config
-        self.corrected = CorrectedPlans(planner, virtual)
+        self.corrected = CorrectedPlans(planner, virtual) if corrected else None
         self.others: list[dict[str, Tensor]] = []
         self._first: list[dict[str, Tensor]] = []
 
@@ -109,7 +110,8 @@ class Planning:
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
             found = merged(found, further) if further["plan_accepted"] else found
-        found = merged(found, self.corrected.plan(planned_on, judged_on, judgement.evidence))
+        if self.corrected is not None and judgement.evidence is not None:
+            found = merged(found, self.corrected.plan(planned_on, judged_on, judgement.evidence))
         refuted = self._refuted(judgement)
         if refuted:
             found.update(findings(withheld=max(refuted, float(found.get("withheld", 0.0)))))

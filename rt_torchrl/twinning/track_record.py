@@ -14,7 +14,7 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.evidence.paired_differences import LARGEST, PairedDifferences, difference
+from rt_torchrl.twinning.evidence.paired_differences import PairedDifferences, difference
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -131,11 +131,13 @@ class Differences(NamedTuple):
     exploration: list[float]
     flown: Sequence[Flown] = ()
 
-    def learned(self, plant: Plant, record: Trajectory, *, limit: float = LARGEST) -> PairedDifferences:
-        """The belief about all policies, compared in the observations of a record; ``limit`` is the largest d."""
+    def learned(self, plant: Plant, record: Trajectory, **options: float) -> PairedDifferences:
+        """The belief about all policies, compared in the observations of a record, with these options of it."""
         actions = [shares(policy, plant, record) for policy in self.policies]
         stacked = torch.stack(actions) if actions else record.states.new_empty(0, 1)
-        return PairedDifferences(stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration), limit)
+        return PairedDifferences(
+            stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration), **options
+        )
 
 
 def shares(policy: nn.Module, plant: Plant, record: Trajectory) -> Float[Tensor, " m"]:
