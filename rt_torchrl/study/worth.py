@@ -24,7 +24,7 @@ WHOLE = "twinning"
 COUNTED = {
     "false": "false, of the episodes as the twin",
     "missed": "missed, of the episodes with a gap of 10 %",
-    "missed, twin wrong": "missed, of those of these in which the twin is wrong by a tenth about the policy",
+    "missed, twin wrong": "missed where the twin is a tenth off about the policy, too",
     "not white, false": "residuals not white, of the episodes as the twin",
     "not white, missed": "residuals white, of the episodes with a gap of 10 %",
 }
