@@ -17,7 +17,6 @@ from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.evidence.alarm import alarm
-from rt_torchrl.twinning.evidence.examination import RealJudge
 from rt_torchrl.twinning.evidence.paired_differences import (
     COMMON,
     EXPLORED,
@@ -29,6 +28,7 @@ from rt_torchrl.twinning.evidence.paired_differences import (
     PairedDifferences,
     difference,
 )
+from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.learners import LearnerConfig
@@ -150,6 +150,7 @@ def test_the_alarm(differences, wrong):
 def test_the_alarm_says_how_wrong_the_twin_is():
     assert "the last 2 episodes cost 5.75 times as much as the twin says" in alarm((1.7, 1.8))
     assert "cost 1/2.01 of what the twin says" in alarm((-0.7, -0.69, -0.71))
+    assert "the last 2 episodes cost 1.22 times as much" in alarm((-0.4, 0.0, 0.2, 0.2))
 
 
 def test_false_alarms_of_a_sound_twin_are_rare():

@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 from handwritten_study import EPISODES, finish, recipe
 
-from rt_torchrl.study.arms import Arm, SystemResult, false_alarms, missed_alarms
+from rt_torchrl.study.arms import Arm, SystemResult, false_alarms, missed_alarms, missed_errors
 from rt_torchrl.study.results import Entry
 from rt_torchrl.study.worth import ablation_section, alarm_section, findings_page, verdict
 
 PAID = [[4.0, 3.0, 1.0], [4.0, 2.0, 1.0]]
 
 
-def arm(name, shift=0.0, *, alarms=(), correlated=(), curves=(), paid=PAID):
+def arm(name, shift=0.0, *, alarms=(), correlated=(), wrong=None, curves=(), paid=PAID):
     ruler = np.random.default_rng(0).random((1, 40))
     costs = 1.0 + 0.1 * ruler + shift * np.array([[1.0], [1.2]])
     entry = Entry(name=name, costs=costs, merit={}, curves=list(curves))
-    return Arm(entry=entry, paid=paid, alarms=list(alarms), correlated=list(correlated))
+    wrong = [[True] * len(seed) for seed in alarms] if wrong is None else wrong
+    return Arm(entry=entry, paid=paid, alarms=list(alarms), correlated=list(correlated), wrong=wrong)
 
 
 def system(arms, name="pitch"):
@@ -41,6 +42,10 @@ def test_alarms_are_counted_where_they_could_be_wrong():
     unknown = missed_alarms(arm("twinning", alarms=alarms, curves=curves), 1.0)
     assert (unknown.episodes, unknown.wrong) == (3, 2)
     assert unknown.words() == "2 of 3 (66.7 %)"
+    # In one of these the twin is right about a policy that a poor minimum holds.
+    wrong = [[True] * 6 + [False], [False] * 6 + [True]]
+    blamed = missed_errors(arm("twinning", alarms=alarms, wrong=wrong, curves=curves), 1.0)
+    assert blamed.words() == "2 of 2 (100.0 %)"
 
 
 def test_the_alarm_section_adds_the_systems():
@@ -53,7 +58,7 @@ def test_the_alarm_section_adds_the_systems():
             system([arm("twinning", alarms=down, correlated=up, curves=curves)], "inflow"),
         ]
     )
-    counts = "0 of 7 (0.0 %) | 2 of 4 (50.0 %) | 7 of 7 (100.0 %) | 0 of 4 (0.0 %)"
+    counts = "0 of 7 (0.0 %) | 2 of 4 (50.0 %) | 2 of 4 (50.0 %) | 7 of 7 (100.0 %) | 0 of 4 (0.0 %)"
     assert f"| twinning | {counts} |" in page and "model-free" not in page
     assert "- not white, false: 7 of 7 (100.0 %); at most 5 % are wanted: no." in page
     assert "- false: 0 of 7 (0.0 %); at most 5 % are wanted: yes." in page

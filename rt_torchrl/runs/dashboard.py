@@ -41,6 +41,7 @@ TAGS = {
     "diverged_solves": "predictive control/solves whose model diverged",
     "paired_difference": "twin/log of the real cost over the twin's, same policy and inputs",
     "withheld": "twin/log of the cost that stays over that of the plan which real episodes contradict (twin)",
+    "corrected": "twin/plans that real episodes have corrected",
     "astray": "twin/plans that failed from extreme starts",
     "alarm": "twin/alarm: the twin is wrong where it matters",
     "whiteness": "twin/apart from the alarm: probability that white noise leaves as much over (Ljung-Box)",
@@ -112,6 +113,8 @@ class Dashboard:
         for key in record:
             if key.startswith(("hypothesis/", "misfit/")):
                 self._scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
+        if "warning" in record:
+            self._writer.add_text("alarm", str(record["warning"]), step)
         faults = record.get("faults", ())
         if faults:
             rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
@@ -143,5 +146,5 @@ def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
     found = {f"J_a {role.replace('_', '-')}": unseen[f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
     found["J_a live"] = unseen[f"J_a_{summary['live']}"]["mean"]
     found |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
-    found |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"]}
+    found |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
     return {name: float(value) for name, value in found.items() if value is not None and np.isfinite(value)}

@@ -154,7 +154,7 @@ def hypothesis_lines(hypotheses: dict[str, Any]) -> list[str]:
 
 
 def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
-    """A line with the number of alarms, and apart from it how often the twin's replay left more over than noise."""
+    """The number of alarms, apart from it how often the twin's replay left more over than noise, and the last alarm."""
     watched = [one for one in episodes if "alarm" in one]
     if not watched:
         return []
@@ -162,7 +162,8 @@ def alarm_lines(episodes: list[dict[str, Any]]) -> list[str]:
     # An episode too short for the test has none.
     correlated = sum(one["whiteness"] < SIGNIFICANT for one in watched if "whiteness" in one)
     about = f"alarm, the twin is wrong where it matters: in {raised} of {len(watched)} episodes"
-    return [f"  {about}; apart from that, its replay left more over than noise in {correlated}"]
+    last = [f"  episode {one['episode']}: {one['warning']}" for one in watched if one.get("warning")][-1:]
+    return [f"  {about}; apart from that, its replay left more over than noise in {correlated}", *last]
 
 
 def _change(start: float | None, found: float | None) -> float:

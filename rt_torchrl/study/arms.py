@@ -1,5 +1,6 @@
 """Arms on systems that the twin knows and on others: what they cost, what learning has paid, and when alarms rose."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +14,8 @@ from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 
 MATTERS = 0.1
 """Gap over the oracle from which an alarm is missed if it does not rise."""
+MUCH = math.log(1.0 + MATTERS)
+"""Paired difference from which the twin is wrong about a policy."""
 SETTLED = 5
 """Number of first episodes in which no alarm is missed."""
 NO_WORTH = 0.02
@@ -28,12 +31,14 @@ class Arm:
         paid: J_a of every real episode, with that of the start, for each seed; empty for a yardstick.
         alarms: whether the alarm was up after each real episode, for each seed; empty for an arm without a twin.
         correlated: whether the replay of each real episode left more over than white noise; empty without a twin.
+        wrong: whether each real episode cost over a tenth other than the twin says of it; empty without a twin.
     """
 
     entry: Entry
     paid: list[list[float]] = field(default_factory=list)
     alarms: list[list[bool]] = field(default_factory=list)
     correlated: list[list[bool]] = field(default_factory=list)
+    wrong: list[list[bool]] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -99,6 +104,14 @@ def missed_alarms(arm: Arm, oracle: float) -> AlarmCount:
     return _unsaid(arm, arm.alarms, oracle)
 
 
+def missed_errors(arm: Arm, oracle: float) -> AlarmCount:
+    """As :func:`missed_alarms`, of the episodes alone in which the twin is wrong about the policy, too.
+
+    A plan may end in a poor minimum, about which the twin is right.
+    """
+    return _unsaid(arm, arm.alarms, oracle, among=arm.wrong)
+
+
 def falsely_correlated(arm: Arm) -> AlarmCount:
     """Episodes of a system as its twin knows it whose replay left more over than white noise."""
     found = [correlated for seed in arm.correlated for correlated in seed]
@@ -110,13 +123,14 @@ def not_correlated(arm: Arm, oracle: float) -> AlarmCount:
     return _unsaid(arm, arm.correlated, oracle)
 
 
-def _unsaid(arm: Arm, said: list[list[bool]], oracle: float) -> AlarmCount:
+def _unsaid(arm: Arm, said: list[list[bool]], oracle: float, *, among: list[list[bool]] | None = None) -> AlarmCount:
     """Episodes after the first ones whose policy costs at least a tenth more than the oracle, where nothing is said."""
+    counted = [[True] * len(seed) for seed in said] if among is None else among
     silent = [
         not up
-        for curve, seed in zip(arm.entry.curves, said, strict=True)
-        for cost, up in list(zip(curve, seed, strict=False))[SETTLED:]
-        if cost >= (1.0 + MATTERS) * oracle
+        for each in zip(arm.entry.curves, said, counted, strict=True)
+        for cost, up, counts in list(zip(*each, strict=False))[SETTLED:]
+        if counts and cost >= (1.0 + MATTERS) * oracle
     ]
     return AlarmCount(len(silent), sum(silent))
 
@@ -129,7 +143,9 @@ def trained_arm(name: str, trainings: Sequence[Training]) -> Arm:
     alarms = [[bool(one["alarm"]) for one in seed] for seed in found] if watched else []
     # An episode too short for the test has no whiteness.
     correlated = [[one.get("whiteness", 1.0) < SIGNIFICANT for one in seed] for seed in found] if watched else []
-    return Arm(entry=arm_entry(name, list(trainings)), paid=paid, alarms=alarms, correlated=correlated)
+    off = [[abs(one.get("paired_difference", 0.0)) > MUCH for one in seed] for seed in found] if watched else []
+    entry = arm_entry(name, list(trainings))
+    return Arm(entry=entry, paid=paid, alarms=alarms, correlated=correlated, wrong=off)
 
 
 def classical_arms(training: Training) -> list[Arm]:

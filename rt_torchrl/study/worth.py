@@ -12,6 +12,7 @@ from rt_torchrl.study.arms import (
     false_alarms,
     falsely_correlated,
     missed_alarms,
+    missed_errors,
     not_correlated,
 )
 from rt_torchrl.study.results import difference
@@ -23,6 +24,7 @@ WHOLE = "twinning"
 COUNTED = {
     "false": "false, of the episodes as the twin",
     "missed": "missed, of the episodes with a gap of 10 %",
+    "missed, twin wrong": "missed where the twin is a tenth off about the policy, too",
     "not white, false": "residuals not white, of the episodes as the twin",
     "not white, missed": "residuals white, of the episodes with a gap of 10 %",
 }
@@ -126,7 +128,11 @@ def counted(arm: Arm, found: SystemResult) -> dict[str, AlarmCount]:
     """What is wrong with the alarms of an arm on a system, and apart from these with the test of whiteness."""
     if not found.system:
         return {"false": false_alarms(arm), "not white, false": falsely_correlated(arm)}
-    return {"missed": missed_alarms(arm, found.least), "not white, missed": not_correlated(arm, found.least)}
+    return {
+        "missed": missed_alarms(arm, found.least),
+        "missed, twin wrong": missed_errors(arm, found.least),
+        "not white, missed": not_correlated(arm, found.least),
+    }
 
 
 def alarm_section(results: Sequence[SystemResult]) -> str:

@@ -98,7 +98,7 @@ class ReinforcementTwinning:
         self.clearance = Clearance(system, self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
-        self.planning = Planning(self.planner, self.virtual, config.planner)
+        self.planning = Planning(self.planner, self.virtual, config.planner, corrected=config.corrected_descents)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)

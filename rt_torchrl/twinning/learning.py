@@ -10,7 +10,7 @@ from torch import nn
 
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.alarm import MATTERS
-from rt_torchrl.twinning.evidence.examination import RealJudge
+from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.learners import Learner
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes

@@ -38,12 +38,14 @@ def alarm(differences: Sequence[float]) -> str | None:
     mean = sum(counted) / n
     spread = math.sqrt(sum((d - mean) ** 2 for d in counted) / (n - 1))
     bound = student.ppf(CONFIDENCE, n - 1) * max(spread, LEAST_DEVIATION) / math.sqrt(n)
-    if abs(mean) <= max(bound, MATTERS) and not twice(latest):
+    off = abs(mean) > max(bound, MATTERS)
+    if not off and not twice(latest):
         return None
-    mean = sum(latest) / n
+    told = latest if off else latest[-2:]
+    mean = sum(told) / len(told)
     ratio = math.exp(abs(mean))
     relation = f"{ratio:.3g} times as much as" if mean > 0.0 else f"1/{ratio:.3g} of what"
-    return f"the twin is wrong where it matters: the last {n} episodes cost {relation} the twin says of them"
+    return f"the twin is wrong where it matters: the last {len(told)} episodes cost {relation} the twin says of them"
 
 
 def contradiction(withheld: float) -> str:

@@ -1,28 +1,23 @@
 """The examination of the twin by the real episodes: paired differences, beliefs about policies, and the alarm."""
 
-import copy
-import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import nn
 
 from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.assimilation import Assimilation
-from rt_torchrl.twinning.cloning import same_architecture
 from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE, EPISODES, MATTERS, QUIET, alarm, contradiction
-from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, LARGEST, Belief, PairedDifferences, difference
+from rt_torchrl.twinning.evidence.paired_differences import LARGEST, Belief, difference
+from rt_torchrl.twinning.evidence.real_judge import RealJudge, unexplained
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration, repeatable
 from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.referees import Role
-from rt_torchrl.twinning.track_record import Differences, Flown, TrackRecord, shares
+from rt_torchrl.twinning.track_record import Flown, TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
-
-RECALLED_BELOW = 0.98
-"""Share of the present policy's expected cost below which earlier weights take its place."""
 
 
 class Examination:
@@ -129,12 +124,12 @@ class Examination:
         real, predicted = (control_cost(twin.plant, one).tolist() for one in (whole, flown))
         return max(abs(difference(*pair)) for pair in zip(real, predicted, strict=True))
 
-    def judge(self, record: Trajectory) -> "RealJudge":
+    def judge(self, record: Trajectory) -> RealJudge:
         """The judge of policies by the evidence so far; a record gives the observations in which they are compared."""
         found = self.track_record.differences(self.virtual)
         return RealJudge(found, found.learned(self.virtual.twin.plant, record), self.virtual, record)
 
-    def correction(self, record: Trajectory) -> "RealJudge | None":
+    def correction(self, record: Trajectory) -> RealJudge | None:
         """The judge of plans, where one of the latest real episodes contradicts the twin beyond chance; else None.
 
         A twin that has been right so far keeps the last word: the belief about a policy that never flew is so wide that
@@ -149,69 +144,3 @@ class Examination:
         """The belief about log J_real − log J_twin of each policy, compared in the observations of a record."""
         judge = self.judge(record)
         return {role: judge.belief(policy) for role, policy in policies.items()}
-
-
-def unexplained(value: float, exploration: float) -> float:
-    """Size of a paired difference beyond what exploration explains."""
-    return abs(value) - 2.0 * EXPLORED * exploration
-
-
-class RealJudge:
-    r"""Judges policies by what they are expected to cost on the real system, :math:`\hat J e^{m + s^2/2}`.
-
-    Args:
-        differences: paired differences of real episodes.
-        learned: the belief about all policies that follows from them.
-        virtual: virtual episodes, which give Ĵ.
-        record: record in whose observations policies are compared.
-    """
-
-    def __init__(
-        self, differences: Differences, learned: PairedDifferences, virtual: VirtualEpisodes, record: Trajectory
-    ):
-        self.differences, self.learned, self.virtual, self.record = differences, learned, virtual, record
-
-    @torch.no_grad()
-    def belief(self, policy: nn.Module) -> Belief:
-        """The belief about log J_real − log J_twin of a policy."""
-        return self.learned.belief(shares(policy, self.virtual.twin.plant, self.record))
-
-    def expected(self, policy: nn.Module, cost: float) -> float:
-        """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
-        mean, deviation = self.belief(policy)
-        return cost * math.exp(mean + 0.5 * deviation**2) if cost > 0.0 else cost
-
-    def median(self, policy: nn.Module, cost: float) -> float:
-        """The cost on the real system that is as likely exceeded as not."""
-        return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
-
-    @torch.no_grad()
-    def refuted(self, policy: nn.Module) -> float:
-        """How much better the twin finds weights that have flown than a policy, where their flights refute it.
-
-        Each is compared in the episode that it flew, because in one of many random episodes the twin may blow up. An
-        episode refutes the twin if it cost more than the twin says even now, beyond chance, and more than the policy is
-        expected to cost in it.
-
-        Returns:
-            The greatest log of the ratio of both costs on the twin; zero if the twin prefers nothing that is refuted.
-        """
-        found, sizes = self.differences, [0.0]
-        for one, d, explored, flown in zip(found.policies, found.values, found.exploration, found.flown, strict=False):
-            if d < 0.0 or unexplained(d, explored) <= BEYOND_CHANCE or not same_architecture(one, policy):
-                continue
-            episode = self.virtual.repeated(flown.trajectory)
-            predicted, stays = (self.virtual.cost(each, episode).item() for each in (one, policy))
-            if math.isfinite(predicted) and self.median(policy, stays) < flown.cost:
-                sizes.append(difference(stays, predicted))
-        return max(sizes)
-
-    @torch.no_grad()
-    def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
-        """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""
-        flown = [one for one in self.differences.policies if same_architecture(one, policy)]
-        costs = [self.expected(one, self.virtual.price(one, episodes).item()) for one in flown]
-        present = self.expected(policy, self.virtual.price(policy, episodes).item())
-        if not costs or not min(costs) < RECALLED_BELOW * present:
-            return None
-        return copy.deepcopy(flown[costs.index(min(costs))].state_dict())

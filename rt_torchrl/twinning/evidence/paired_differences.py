@@ -50,6 +50,8 @@ class PairedDifferences:
         actions: actions of the policies of past episodes in the same observations.
         differences: d of these episodes.
         exploration: exploration of these episodes, as a share of half the ranges, which the twin does not repeat.
+        least: least d that counts; a smaller one is taken for it.
+        noise: standard deviation of d for one episode that does not explore.
 
     Raises:
         ValueError: if the numbers of policies, differences and explorations differ.
@@ -60,6 +62,8 @@ class PairedDifferences:
         actions: Float[Tensor, "n m"],
         differences: Float[Tensor, " n_d"],
         exploration: Float[Tensor, " n_e"] | None = None,
+        least: float = -LARGEST,
+        noise: float = NOISE,
     ):
         exploration = torch.zeros_like(differences) if exploration is None else exploration
         if not len(actions) == len(differences) == len(exploration):
@@ -68,8 +72,9 @@ class PairedDifferences:
                 "as many."
             )
         self.actions = actions.detach()
-        self.differences = differences.detach().clamp(-LARGEST, LARGEST)
-        covariance = self._kernel(self.actions) + torch.diag(NOISE**2 + (EXPLORED * exploration) ** 2)
+        self.differences = differences.detach().clamp(least, LARGEST)
+        self.noise = noise
+        covariance = self._kernel(self.actions) + torch.diag(noise**2 + (EXPLORED * exploration) ** 2)
         self._root = torch.linalg.cholesky(covariance)
         self._weights = torch.cholesky_solve(self.differences.unsqueeze(-1), self._root)
 
@@ -84,8 +89,13 @@ class PairedDifferences:
             return actions.new_zeros(()), prior.sqrt()
         k = self._kernel(actions.unsqueeze(0))
         half = torch.linalg.solve_triangular(self._root, k.mT, upper=False)
-        variance = (prior - half.square().sum()).clamp_min(NOISE**2 / len(self.differences))
+        variance = (prior - half.square().sum()).clamp_min(self.noise**2 / len(self.differences))
         return (k @ self._weights).squeeze(), variance.sqrt()
+
+    def log_likelihood(self) -> float:
+        """Log of the marginal likelihood of the differences, without its constant."""
+        misfit = (self.differences * self._weights.squeeze(-1)).sum()
+        return (-0.5 * misfit - self._root.diagonal().log().sum()).item()
 
     def belief(self, actions: Float[Tensor, " m"]) -> Belief:
         """The same as numbers."""

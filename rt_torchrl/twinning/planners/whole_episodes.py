@@ -1,6 +1,7 @@
 """Planning over whole virtual episodes, as in the paper."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -29,6 +30,9 @@ class WholeEpisodes:
     algorithm compares policies on the twin.
     """
 
+    correction: Callable[[nn.Module], Tensor] | None = None
+    """Function of a policy that multiplies its cost in the plans; None for the cost on the twin."""
+
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
@@ -54,6 +58,8 @@ class WholeEpisodes:
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.constraints.costs(self.twin, self.policy, episodes)
+        if self.correction is not None:
+            costs = costs * self.correction(self.policy)
         return limited_mean(costs, self.policy.parameters(), limit)
 
     def refuse(self) -> None:

@@ -1,0 +1,124 @@
+"""What policies are expected to cost on the real system, by the paired differences of real episodes."""
+
+import copy
+import math
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.twinning.cloning import same_architecture
+from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
+from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, NOISE, Belief, PairedDifferences, difference
+from rt_torchrl.twinning.track_record import Differences, shares
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+
+RECALLED_BELOW = 0.98
+"""Share of the present policy's expected cost below which earlier weights take its place."""
+LEAST = -1.0
+"""Least d that makes other policies cheaper. A twin that says more than e times the real cost blows up or stalls where
+the real system does not; its neighbours need not."""
+NOISES = tuple(NOISE * 2.0**k for k in range(4))
+"""Standard deviations of d for one episode among which the likeliest is taken: luck does not cancel where the real
+system has inputs that no sensor reads. Beforehand log₂ of their ratio to the first one is normal, with deviation 1."""
+
+
+def unexplained(value: float, exploration: float) -> float:
+    """Size of a paired difference beyond what exploration explains."""
+    return abs(value) - 2.0 * EXPLORED * exploration
+
+
+class RealJudge:
+    r"""Judges policies by what they are expected to cost on the real system, :math:`\hat J e^{m + s^2/2}`.
+
+    Args:
+        differences: paired differences of real episodes.
+        learned: the belief about all policies that follows from them.
+        virtual: virtual episodes, which give Ĵ.
+        record: record in whose observations policies are compared.
+    """
+
+    def __init__(
+        self, differences: Differences, learned: PairedDifferences, virtual: VirtualEpisodes, record: Trajectory
+    ):
+        self.differences, self.learned, self.virtual, self.record = differences, learned, virtual, record
+
+    def shares(self, policy: nn.Module) -> Float[Tensor, " m"]:
+        """Actions in which policies are compared, in shares of half their ranges."""
+        return shares(policy, self.virtual.twin.plant, self.record)
+
+    @torch.no_grad()
+    def belief(self, policy: nn.Module) -> Belief:
+        """The belief about log J_real − log J_twin of a policy."""
+        return self.learned.belief(self.shares(policy))
+
+    @cached_property
+    def limited(self) -> PairedDifferences:
+        """The belief that follows from paired differences of at least ``LEAST``, with the likeliest noise."""
+        plant = self.virtual.twin.plant
+        found = [self.differences.learned(plant, self.record, least=LEAST, noise=noise) for noise in NOISES]
+        return max(found, key=lambda one: one.log_likelihood() - 0.5 * math.log2(one.noise / NOISE) ** 2)
+
+    def factor(self, policy: nn.Module) -> Tensor:
+        """What multiplies the cost of a policy on the twin in a descent, by the limited belief; differentiable.
+
+        The mean stays between the least and the largest paired difference, and zero: a Gaussian process goes beyond
+        them where neighbours differ.
+        """
+        mean, deviation = self.limited.posterior(self.shares(policy))
+        seen = self.limited.differences
+        mean = mean.clamp(seen.min().clamp_max(0.0), seen.max().clamp_min(0.0))
+        return (mean + 0.5 * deviation.square()).exp()
+
+    @torch.no_grad()
+    def deviation(self, policy: nn.Module) -> float:
+        """Standard deviation of the limited belief about a policy."""
+        return self.limited.belief(self.shares(policy)).deviation
+
+    @torch.no_grad()
+    def dearest(self, policy: nn.Module, cost: float) -> float:
+        """The cost that is expected on the real system by the dearer of both beliefs; ``cost`` is that on the twin."""
+        expected = self.expected(policy, cost)
+        return max(expected, cost * self.factor(policy).item()) if cost > 0.0 else expected
+
+    def expected(self, policy: nn.Module, cost: float) -> float:
+        """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
+        mean, deviation = self.belief(policy)
+        return cost * math.exp(mean + 0.5 * deviation**2) if cost > 0.0 else cost
+
+    def median(self, policy: nn.Module, cost: float) -> float:
+        """The cost on the real system that is as likely exceeded as not."""
+        return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
+
+    @torch.no_grad()
+    def refuted(self, policy: nn.Module) -> float:
+        """How much better the twin finds weights that have flown than a policy, where their flights refute it.
+
+        Each is compared in the episode that it flew, because in one of many random episodes the twin may blow up. An
+        episode refutes the twin if it cost more than the twin says even now, beyond chance, and more than the policy is
+        expected to cost in it.
+
+        Returns:
+            The greatest log of the ratio of both costs on the twin; zero if the twin prefers nothing that is refuted.
+        """
+        found, sizes = self.differences, [0.0]
+        for one, d, explored, flown in zip(found.policies, found.values, found.exploration, found.flown, strict=False):
+            if d < 0.0 or unexplained(d, explored) <= BEYOND_CHANCE or not same_architecture(one, policy):
+                continue
+            episode = self.virtual.repeated(flown.trajectory)
+            predicted, stays = (self.virtual.cost(each, episode).item() for each in (one, policy))
+            if math.isfinite(predicted) and self.median(policy, stays) < flown.cost:
+                sizes.append(difference(stays, predicted))
+        return max(sizes)
+
+    @torch.no_grad()
+    def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
+        """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""
+        flown = [one for one in self.differences.policies if same_architecture(one, policy)]
+        costs = [self.expected(one, self.virtual.price(one, episodes).item()) for one in flown]
+        present = self.expected(policy, self.virtual.price(policy, episodes).item())
+        if not costs or not min(costs) < RECALLED_BELOW * present:
+            return None
+        return copy.deepcopy(flown[costs.index(min(costs))].state_dict())
