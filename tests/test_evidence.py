@@ -141,6 +141,9 @@ def test_stakes_are_those_of_a_simulation():
         ((0.1, 0.9, 1.85), True),  # two in a row are no chance, however they scatter
         ((1.67, 0.15, 0.14, 0.12, 0.13), True),  # one bad policy does not hide the others
         ((1.67, 0.0, 0.02, -0.03, 0.05), False),
+        ((0.0, 0.02, 0.75), True),  # a single episode that costs over twice what the twin says
+        ((0.0, 0.02, -0.75), True),
+        ((0.0, 0.02, 0.65), False),
     ],
 )
 def test_the_alarm(differences, wrong):
@@ -151,6 +154,7 @@ def test_the_alarm_says_how_wrong_the_twin_is():
     assert "the last 2 episodes cost 5.75 times as much as the twin says" in alarm((1.7, 1.8))
     assert "cost 1/2.01 of what the twin says" in alarm((-0.7, -0.69, -0.71))
     assert "the last 2 episodes cost 1.22 times as much" in alarm((-0.4, 0.0, 0.2, 0.2))
+    assert "the last episode cost 2.72 times as much as the twin says of it" in alarm((0.0, 0.0, 1.0))
 
 
 def test_false_alarms_of_a_sound_twin_are_rare():

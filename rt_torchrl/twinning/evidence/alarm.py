@@ -13,6 +13,8 @@ GREAT = math.log(1.35)
 """Difference of log J beyond which a greater one says no more, so that a single bad policy does not hide the others."""
 BEYOND_CHANCE = 3.0 * LEAST_DEVIATION
 """Difference of log J that two episodes in a row of a sound twin hardly ever have."""
+ALONE = math.log(2.0)
+"""Difference of log J that a single episode of a sound twin does not have."""
 QUIET = 0.02
 """Exploration, as a share of half the ranges, above which the cost of an episode says little about its policy."""
 CONFIDENCE = 0.975
@@ -23,7 +25,7 @@ def alarm(differences: Sequence[float]) -> str | None:
 
     The mean of the paired differences :math:`d = \log J - \log\hat J` of the last episodes, each at most ``GREAT``, is
     off zero by Student's test with at least ``LEAST_DEVIATION``, and by more than matters; or the last two are both
-    beyond chance to the same side.
+    beyond chance to the same side; or the last one is beyond ``ALONE``.
 
     Args:
         differences: d of the latest quiet episodes, oldest first.
@@ -38,14 +40,20 @@ def alarm(differences: Sequence[float]) -> str | None:
     mean = sum(counted) / n
     spread = math.sqrt(sum((d - mean) ** 2 for d in counted) / (n - 1))
     bound = student.ppf(CONFIDENCE, n - 1) * max(spread, LEAST_DEVIATION) / math.sqrt(n)
-    off = abs(mean) > max(bound, MATTERS)
-    if not off and not twice(latest):
-        return None
-    told = latest if off else latest[-2:]
-    mean = sum(told) / len(told)
-    ratio = math.exp(abs(mean))
+    if abs(mean) > max(bound, MATTERS):
+        return wrong(latest)
+    if twice(latest):
+        return wrong(latest[-2:])
+    return wrong(latest[-1:]) if abs(latest[-1]) > ALONE else None
+
+
+def wrong(differences: Sequence[float]) -> str:
+    """What is wrong with a twin of which the last episodes have these differences, in plain words."""
+    mean = sum(differences) / len(differences)
+    ratio, n = math.exp(abs(mean)), len(differences)
+    episodes = "the last episode cost" if n == 1 else f"the last {n} episodes cost"
     relation = f"{ratio:.3g} times as much as" if mean > 0.0 else f"1/{ratio:.3g} of what"
-    return f"the twin is wrong where it matters: the last {len(told)} episodes cost {relation} the twin says of them"
+    return f"the twin is wrong where it matters: {episodes} {relation} the twin says of {'it' if n == 1 else 'them'}"
 
 
 def contradiction(withheld: float) -> str:
