@@ -159,6 +159,8 @@ class Config:
                     f"systems: {system} is on none of {', '.join(self.cases())}; choose nothing, or names among "
                     f"{', '.join(known)}, which a plus combines."
                 )
+        for case, system in self.rows():
+            CATALOGUES[case].require_unknown(names(system))
 
     def cases(self) -> list[str]:
         """The plants, and the drone's hop."""

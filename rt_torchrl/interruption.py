@@ -78,6 +78,10 @@ def safe_point() -> None:
         raise KeyboardInterrupt
 
 
+class Interrupted(SystemExit):
+    """The end of a program, in words, whose training Ctrl-C or SIGTERM has stopped; no other training must follow."""
+
+
 def require_finished(done: int, asked: int) -> None:
     """End the program after a training that Ctrl-C or SIGTERM has stopped, where other trainings would follow.
 
@@ -89,4 +93,4 @@ def require_finished(done: int, asked: int) -> None:
         SystemExit: if fewer episodes are done.
     """
     if done < asked:
-        raise SystemExit(f"interrupted after {done} of {asked} episodes of a training; the trainings after it are left")
+        raise Interrupted(f"interrupted after {done} of {asked} episodes of a training; those after it are left")

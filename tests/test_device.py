@@ -17,6 +17,7 @@ from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
 from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -34,6 +35,11 @@ ESTIMATED = AssimilationConfig(
 WINDOWS = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=3, critic_iterations=1))
 NEURAL = {"closure": "mlp", "closure_hidden": (4,), "model_free_policy": "mlp", "hidden": (4,)}
 TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
+
+# The trust from the start lets the twin teach in the first update; then a paired difference measures it.
+INCREMENTAL = dataclasses.replace(
+    TD3, algorithm="incremental_td3", return_steps=6, incremental=IncrementalTD3Config(trust=0.5, virtual=4)
+)
 
 
 @pytest.fixture
@@ -60,6 +66,12 @@ def train(tmp_path, monkeypatch):
 
 def test_real_system_short_horizon_and_td3(train):
     assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
+
+
+@pytest.mark.parametrize("update", ["explicit", pytest.param("torchrl", marks=pytest.mark.slow)])
+def test_incremental_td3_with_a_twin_that_teaches(train, update):
+    learner = dataclasses.replace(INCREMENTAL, update=update)
+    assert not train("pendulum", horizon=0.5, twinning={"learner": learner})
 
 
 @pytest.mark.slow

@@ -353,6 +353,18 @@ def test_plans_are_corrected_where_a_real_episode_contradicts_the_twin(factor, c
     assert (found.examination.correction(found.short_term[-1]) is not None) == corrects
 
 
+@pytest.mark.parametrize(("exploration", "corrects"), [(0.0, True), (0.02, True), (0.1, False)])
+def test_what_exploration_explains_corrects_no_plan(exploration, corrects):
+    """A real episode cost 30 % more than the twin says; two standard deviations of an exploration by 0.1 are 40 %."""
+    found = twinning(LinearQuadratic(horizon=2.0), arm="model_based")
+    found.interact()
+    record, policy = found.short_term[-1], LinearGain([[1.0, 1.0]])
+    flown = [Flown(record, "model_based", {}, 1.3, exploration)]
+    paired = Differences([policy], [math.log(1.3)], [exploration], flown)
+    found.track_record.differences = lambda virtual: paired
+    assert (found.examination.correction(record) is not None) == corrects
+
+
 @pytest.mark.parametrize("factor", [1.0, 10.0])
 def test_the_learner_trusts_the_twin_as_far_as_it_was_right(factor):
     """The real system costs the factor times what the twin says."""

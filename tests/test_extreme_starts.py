@@ -66,8 +66,8 @@ def test_who_fails(tail, than, cost, fails):
 class Trapped(VirtualEpisodes):
     """Virtual episodes in which a gain costs itself, and a gain below 1 costs 1000 from the extreme starts."""
 
-    def __init__(self, plant):
-        self.twin, self.extremes = DigitalTwin(plant, plant.closure), ExtremeStarts(plant, 1000, CPU)
+    def __init__(self, plant, count=1000):
+        self.twin, self.extremes = DigitalTwin(plant, plant.closure), ExtremeStarts(plant, count, CPU)
 
     def cost(self, policy, episodes):
         gain = policy.gain.detach().sum()
@@ -104,8 +104,29 @@ def test_a_plan_that_fails_from_extreme_starts_is_made_again_with_them(wary, kep
     assert report["astray"] == 1.0 and report["plan_accepted"] == float(wary)
 
 
-@pytest.mark.parametrize("fails", [False, True])
-def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(fails):
+@pytest.mark.parametrize(("count", "kept"), [(1000, [[1.0, 1.0]]), (0, [[0.25, 0.25]])])
+def test_a_plan_from_other_weights_that_fails_from_extreme_starts_is_refused(count, kept):
+    policy = LinearGain([[1.0, 1.0]])
+    virtual = Trapped(LinearQuadratic(horizon=2.0), count)
+    planning = Planning(Greedy(policy, wary=False), virtual, PlannerConfig())
+    planning.others.append({"gain": torch.full((1, 2), 4.0).double()})
+    # The plan from the present weights is refused, so that only the one from the others could be kept.
+    judgement = Judgement(lambda episodes: virtual.cost(policy, episodes), lambda a, b: True, print)
+    episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
+    planning.plan(1, episodes, episodes, judgement)
+    assert policy.gain.tolist() == kept and not planning.others
+
+
+@pytest.mark.parametrize(
+    ("own", "of_the_controller", "fails"),
+    [
+        (1e3, 0.0, True),
+        (0.0, 0.0, False),
+        (1900.0, 1000.0, False),  # the controller itself fails there, and its imitation not twice as much
+        (2100.0, 1000.0, True),
+    ],
+)
+def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(own, of_the_controller, fails):
     found, drawn = twinning(), []
     imitate, teacher = found.cloning.distillation.imitate, found.first.teacher
 
@@ -114,7 +135,7 @@ def test_an_imitation_that_fails_from_extreme_starts_imitates_there_too(fails):
         return imitate(live, idle, seen=seen, draw=draw)
 
     found.cloning.distillation.imitate = seen
-    found.virtual.tail = lambda policy, episodes: 1e3 if fails and policy is not teacher else 0.0
+    found.virtual.tail = lambda policy, episodes: of_the_controller if policy is teacher else own
     found.start()
     assert drawn == 2 * ([4, 8] if fails else [4])  # both policies
 

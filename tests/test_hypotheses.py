@@ -5,23 +5,28 @@ import dataclasses
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from small_runs import SMALL
 
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.extension import ExtendedClosure
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.runs.results import hypotheses_of
 from rt_torchrl.runs.results_table import hypothesis_lines
+from rt_torchrl.runs.run import Run
+from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
+from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.hypotheses.assimilation import FIRST_ROUNDS, EnsembleAssimilation, evidence, misfit
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
 from rt_torchrl.twinning.hypotheses.reread import Reread, reread
+from rt_torchrl.twinning.planners import PlannerConfig, make_planner
 
 LAG = 0.6
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
@@ -217,22 +222,55 @@ def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):
 
 
 def test_a_twin_that_diverges_leaves_the_hypotheses_out():
+    """The step diverges for as long as a hypothesis counts."""
     twin, _ = ensemble(PLANT)
     twin.weights = {"late": 1.0}
-    twin.retreat()
-    assert twin.weights == {ALONE: 1.0}
-    assert EarlierClosure.sound  # which calls it
+    policy, weights = LinearGain([[1.0, 1.0]]), []
+    generator = torch.Generator()
+    planner = make_planner(twin, policy, PlannerConfig(), generator=generator)
+
+    def step():
+        weights.append(twin.weights)
+        if "late" in twin.weights:
+            raise DivergenceError("late diverges")
+        return findings()
+
+    report = EarlierClosure(twin, policy, planner, generator).sound(step)
+    assert weights == [{"late": 1.0}, {ALONE: 1.0}] and report["closure_refused"] == 1.0
+    assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
+
+
+def test_the_worst_hypothesis_counts_as_the_parameters_say():
+    """Also in an ensemble of one's own, which the algorithm is given."""
+    own = TwinEnsemble(PLANT, PLANT.closure, {"late": PLANT.suspects()["late"]}, {"late": PLANT.closure})
+    config = HypothesesConfig(risk=0.25)
+    assert make_assimilation(own, ASSIMILATION, config).ensemble is own and own.risk == 0.25
 
 
 def test_the_state_is_kept():
-    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
-    other, resumed = ensemble(PLANT)
+    """What goes on from it makes the same of the next record, in as many rounds."""
+    twin, assimilation = ensemble(PLANT, call=0.05)
+    record, _ = recorded(LaggedActuator(PLANT, "force", LAG))
+    assimilation.update([record], (), 1, torch.Generator())
+    assert assimilation.explain(0.06, torch.Generator())
+    other, resumed = ensemble(PLANT, call=0.05)
+    other.load_hypotheses(twin.state_dict()["hypotheses"])
+    other.closure.load_state_dict(twin.closure.state_dict())
     resumed.load_state_dict(assimilation.state_dict())
-    assert other.weights == twin.weights and resumed.misfits == assimilation.misfits
+    assert resumed.called and counters(resumed) == counters(assimilation)
+    # The hopeless one waits; the other one is fitted, and in fewer rounds than the first time.
+    assert counters(resumed)["late"][1:] == (1, 2) and counters(resumed)["lags"][0] < 1e-6
+    for one in (assimilation, resumed):
+        one.update([record], (), 1, torch.Generator())
+    assert other.weights == twin.weights == {"lags": 1.0} and resumed.misfits == assimilation.misfits
+    assert counters(resumed) == counters(assimilation) and counters(resumed)["late"][1:] == (0, 2)
     for name, one in twin.twins.items():
-        if name != ALONE:
-            for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
-                assert torch.equal(mine, its)
+        for mine, its in zip(other.twins[name].closure.parameters(), one.closure.parameters(), strict=True):
+            assert torch.equal(mine, its)
+
+
+def counters(assimilation):
+    return {name: (fit.least, fit.waiting, fit.pause) for name, fit in assimilation.fits.items()}
 
 
 def test_hypotheses_are_chosen_by_name():
@@ -263,8 +301,14 @@ def test_what_is_no_hypothesis_is_refused(make, message):
         make()
 
 
-def test_options_are_those_of_the_algorithm():
-    from rt_torchrl.twinning.config import TwinningConfig
-
-    changed = dataclasses.replace(TwinningConfig(), hypotheses=HypothesesConfig(which="none"))
-    assert TwinningConfig().hypotheses.which == "automatic" and changed.hypotheses.which == "none"
+@pytest.mark.parametrize("which", ["none", "automatic"])
+def test_options_are_those_of_the_algorithm(which, tmp_path):
+    """They reach the twin and its step 4 through a run."""
+    hypotheses = HypothesesConfig(which=which, call=0.02, names=("late",) if which == "automatic" else (), risk=0.1)
+    twinning = dataclasses.replace(SMALL, hypotheses=hypotheses)
+    options = {"compiled": False, "unseen": 2, "figures": False, "twinning": twinning}
+    algorithm = Run(RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=2.0)).algorithm
+    assert isinstance(algorithm.twin, TwinEnsemble) == (which == "automatic")
+    if which == "automatic":
+        assert list(algorithm.twin.twins) == [ALONE, "late"] and algorithm.twin.risk == 0.1
+        assert algorithm.assimilation.hypotheses == hypotheses and not algorithm.assimilation.called

@@ -6,6 +6,7 @@ import pytest
 import tyro
 from handwritten_study import WRITE_RESULTS, finished, recipe, training, written
 
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import VARIANTS
 
@@ -81,6 +82,39 @@ def test_an_interrupted_training_ends_the_study(tmp_path):
         on_this_machine([cut_short, following], jobs=1)
     assert not following.folder.exists()
     assert not cut_short.done()
+
+
+PRESSED = """
+import os, signal
+from unittest.mock import patch
+from small_recipe import Config, main as train
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+
+INTERACT = ReinforcementTwinning.interact
+
+def pressed(algorithm):
+    os.kill(os.getpid(), signal.SIGNAL)
+    return INTERACT(algorithm)
+
+def main(config):
+    with patch.object(ReinforcementTwinning, "interact", pressed):
+        train(config)
+"""
+"""A recipe that is interrupted in its first episode."""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_training_that_is_interrupted_in_its_first_episode_ends_the_study(tmp_path, name):
+    """It has nothing to report, which is no failure; by hand the recipe says so."""
+    path = tmp_path / "pressed.py"
+    path.write_text(PRESSED.replace("SIGNAL", name))
+    pressed, following = (training(tmp_path, seed, recipe=path) for seed in (0, 1))
+    with pytest.raises(KeyboardInterrupt):
+        on_this_machine([pressed, following], jobs=1)
+    assert (pressed.folder / "config.json").exists() and not following.folder.exists()
+    found = load_recipe(path)
+    with pytest.raises(SystemExit, match="^interrupted before the first episode was done; nothing to report.$"):
+        found.main(from_command_line(found.Config, pressed.arguments()))
 
 
 def test_a_training_with_damaged_results_runs_again(tmp_path):

@@ -90,6 +90,9 @@ def test_what_does_not_exist_is_refused():
         config(arms=("magic",))
     with pytest.raises(ValueError, match=r"systems: bias_5 is on none of wind_turbine; choose nothing, or names among"):
         config(plants=("wind_turbine",), systems=("bias_5",))
+    for plants in (("wind_turbine",), ("all",)):
+        with pytest.raises(ValueError, match=r"all and pitch both change the pitch drive; give one"):
+            config(plants=plants, systems=("inflow+pitch", "all+pitch"))
     for name in ("seeds", "episodes"):
         with pytest.raises(ValueError, match=f"{name}=0 must be at least 1"):
             config(**{name: 0})

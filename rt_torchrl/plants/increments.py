@@ -50,7 +50,7 @@ class Increments(nn.Module):
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         names = [state.name for state in plant.states]
         self._places = [names.index(action.name) if action.name in names else 0 for action in plant.actions]
-        reach = intervals * greatest_increments(plant)
+        reach = intervals * greatest_increments(plant).to(low.device)
         limited = reach < half
         parts = {"low": low, "high": high, "middle": middle, "scale": torch.minimum(reach, half), "limited": limited}
         for name, values in parts.items():
@@ -75,9 +75,10 @@ def greatest_increments(plant: Plant) -> Float[Tensor, " n_a"]:
         plant: plant whose :meth:`Plant.actuate` is asked, in a state in which each applied action is in the middle of
             its range.
     """
-    low, high = bounds(plant.actions)
+    device = next((x.device for x in plant.buffers()), torch.device("cpu"))
+    low, high = bounds(plant.actions, device=device)
     names = [state.name for state in plant.states]
-    state = plant.draw_initial_state(1, torch.Generator(device="cpu").manual_seed(0))
+    state = plant.draw_initial_state(1, torch.Generator(device=device).manual_seed(0))
     remembered = [action.name in names for action in plant.actions]
     for action, known, middle in zip(plant.actions, remembered, 0.5 * (low + high), strict=True):
         if known:
@@ -85,4 +86,4 @@ def greatest_increments(plant: Plant) -> Float[Tensor, " n_a"]:
     ends = (plant.actuate(state, end.expand(1, -1))[0] for end in (low, high))
     reach = torch.stack([(end - 0.5 * (low + high)).abs() for end in ends]).amax(0)
     free = reach >= 0.5 * (high - low) * (1.0 - 1e-9)
-    return torch.where(free | ~torch.tensor(remembered), torch.inf, reach)
+    return torch.where(free | ~torch.tensor(remembered, device=device), torch.inf, reach)

@@ -19,7 +19,7 @@ from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.interruption import Interruption, safe_point, termination_as_interrupt
+from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.state_bounds import StateBounds
@@ -204,7 +204,7 @@ class Run:
             dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
             self._all_episodes(dashboard, bar)
             if not self.episodes:
-                raise SystemExit("interrupted before the first episode was done; nothing to report.")
+                raise Interrupted("interrupted before the first episode was done; nothing to report.")
             self._drop_half_an_episode()
             end_operation(self.algorithm)
             bar.doing("judging on unseen episodes")

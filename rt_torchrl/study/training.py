@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rt_torchrl.interruption import Interrupted
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.study.json_file import read_json
 from rt_torchrl.twinning.config import Arm
@@ -98,6 +99,8 @@ class Training:
             try:
                 recipe = load_recipe(self.recipe)
                 recipe.main(from_command_line(recipe.Config, arguments))
+            except Interrupted as error:
+                raise KeyboardInterrupt from error  # it came before the first episode was done
             except (Exception, SystemExit) as error:
                 raise RuntimeError(f"{command} failed; see {log}: {error}") from error
         if self._cut_short():

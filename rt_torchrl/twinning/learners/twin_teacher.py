@@ -49,7 +49,9 @@ class TwinTeacher:
         Args:
             episode: one of the memory's episodes, of n control intervals.
         """
-        by_state, by_action, law, cost_by_state, cost_by_action = (part.numpy() for part in self._linearised(episode))
+        by_state, by_action, law, cost_by_state, cost_by_action = (
+            part.cpu().numpy() for part in self._linearised(episode)
+        )
         discount, costate = self.memory.discount, np.zeros(by_state.shape[-1])
         found = np.empty_like(cost_by_action)
         closed = by_state + by_action @ law
@@ -57,13 +59,13 @@ class TwinTeacher:
         for k in reversed(range(len(found))):
             found[k] = cost_by_action[k] + discount * (costate @ by_action[k])
             costate = held[k] + discount * (costate @ closed[k])
-        return torch.from_numpy(found)
+        return torch.from_numpy(found).to(episode.device)
 
     def _linearised(self, episode: TensorDict) -> tuple[Tensor, ...]:
         """Φ_s, Φ_a, π_s, L_s and L_a at every control interval."""
         twin, increments = self.twin.believed, self.memory.increments
         plant = twin.plant
-        t = plant.dt * torch.arange(len(episode), dtype=torch.float64)
+        t = plant.dt * torch.arange(len(episode), dtype=torch.float64, device=episode.device)
         exogenous = episode["exogenous"]
         with torch.enable_grad():
             state = self._whole(episode).clone().requires_grad_()
