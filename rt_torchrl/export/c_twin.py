@@ -145,9 +145,9 @@ def _comment(plant: Plant, closure: nn.Module, name: str) -> list[str]:
     signals = {"state": plant.states, "command": plant.actions, "exogenous": plant.inputs}
     read, every = len(plant.readings), len(plant.states)
     rest = [
-        f"No sensor reads the last {plant.unread} of the states. At the start of an episode they follow from the others:",
+        f"No sensor reads the last {plant.unread} of the states. At the start of an episode they follow:",
         "",
-        f"    {name}_rest(read, state);    read has the first {read} states, state all {every}; they may be the same array",
+        f"    {name}_rest(read, state);    read has the first {read} states, state all {every}, maybe in its place",
         "",
     ]
     return [
