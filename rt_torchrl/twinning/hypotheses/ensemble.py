@@ -93,8 +93,8 @@ class TwinEnsemble(DigitalTwin):
     def believed_law(self) -> nn.Module:
         """Closure of the ensemble's plant as the likeliest hypothesis has found it."""
         plant, closure = self.believed.plant, self.believed.closure
-        while isinstance(plant, Extension) and plant is not self.plant:
-            plant, closure = plant.base, plant.of_base(closure)
+        while plant is not self.plant and isinstance(plant, Extension):
+            closure, plant = plant.of_base(closure), plant.base
         return closure
 
     def explanation(self) -> str:
