@@ -40,8 +40,8 @@ class Config:
     Args:
         run: run folder of any recipe.
         what: one or more of policy (from the observation to the action), controller (from the measured signals to the
-            action, with filters and integrals) and twin (one control interval with the learned closure); controller and
-            twin are written in C alone.
+            action, with filters and integrals) and twin (one control interval with the learned closure, of the
+            hypothesis that explains the records best); controller and twin are written in C alone.
         role: role of the policy, model_based or model_free.
         formats: one or more of c (C99 file and header), onnx (needs the extra onnx) and pt2 (torch.export); by default
             c, and pt2 of a policy.
@@ -89,10 +89,12 @@ def main(config: Config) -> None:
     run = load_run(config.run, config.recipe or beside)
     policy = run.policy(config.role)
     if isinstance(policy, StateFeedback) and {"policy", "controller"} & set(config.what):
+        beside = run.twin.hypothesis
+        model = "the model that it plans on" if beside is None else f"the twin with {beside}, on which it does not plan"
         raise ValueError(
             f"role={config.role!r} of this run plans its actions by model predictive control and cannot be exported. "
-            "Export the model-free policy, which has learned from its records: --role model_free; or --what twin, the "
-            "model that it plans on."
+            f"Export the model-free policy, which has learned from its records: --role model_free; or --what twin, "
+            f"{model}."
         )
     output = config.output or config.run / "exported"
     try:
@@ -125,8 +127,11 @@ def written(config: Config, run: LoadedRun, output: Path, what: str, kind: str) 
             )
         )
     else:
-        error = export_twin(run.closure, path, plant, name=name)
+        believed, beside = run.twin.believed, run.twin.hypothesis
+        error = export_twin(believed.closure, path, believed.plant, name=name)
         found = "" if error is None else f"within {error:.1e} of the sizes of the states"
+        if beside is not None:
+            found = f"{found or 'not checked'}; the twin with {beside}, which explains the records best"
     return f"{path}: {found or 'not checked'}"
 
 

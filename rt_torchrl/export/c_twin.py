@@ -29,12 +29,15 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
     double *next)``, which is :meth:`Plant.step`; ``next`` may be ``state``. It allocates nothing, keeps nothing between
     calls and needs only ``math.h``.
 
+    A plant with states that no sensor reads, such as that of a hypothesis, also gets ``void <name>_rest(const double
+    *read, double *state)``, which is :meth:`Plant.at_rest`: the states at the start of an episode.
+
     The check compiles the file and compares it on flights under random commands.
 
     Args:
-        closure: the learned closure.
+        closure: the learned closure, such as ``run.twin.believed.closure``.
         path: file to write, such as ``twin.c``; the header gets the same name with ``.h``.
-        plant: the physics.
+        plant: the physics that the closure belongs to, such as ``run.twin.believed.plant``.
         name: prefix of the function; by default the name of the plant with ``_twin``.
 
     Returns:
@@ -49,11 +52,15 @@ def export_twin(closure: nn.Module, path: Path | str, plant: Plant, *, name: str
     plant, closure = frozen(plant), frozen(closure)
     points, ends = _flights(plant, closure)
     head, source = _source(plant, closure, file.name, {argument: x[:1] for argument, x in points.items()})
+    heads = [head, *_add_rest(source, plant, file.name)]
 
     def compare(library: ctypes.CDLL) -> float:
-        return _difference(getattr(library, f"{file.name}_step"), points, ends, file.name)
+        error = _difference(getattr(library, f"{file.name}_step"), points, ends, file.name)
+        if plant.unread:
+            error = max(error, _rest_difference(getattr(library, f"{file.name}_rest"), plant, points["state"]))
+        return error
 
-    return file.write(_comment(plant, closure, file.name), [f"{head};"], source, compare)
+    return file.write(_comment(plant, closure, file.name), [f"{head};" for head in heads], source, compare)
 
 
 def _source(plant: Plant, closure: nn.Module, name: str, example: dict[str, Tensor]) -> tuple[str, CSource]:
@@ -71,6 +78,18 @@ def _source(plant: Plant, closure: nn.Module, name: str, example: dict[str, Tens
     source = CSource(weights_of({"closure": closure}))
     source.add(head, found.program, inputs, [(f"next[{k}]", v) for k, v in enumerate(found.outputs["next"])])
     return head, source
+
+
+def _add_rest(source: CSource, plant: Plant, name: str) -> list[str]:
+    """Add the function of the states at the start, and return its declaration; a plant that is read wholly has none."""
+    if not plant.unread:
+        return []
+    read = plant.draw_initial_state(1, torch.Generator().manual_seed(SEED))[:, : len(plant.readings)]
+    found = traced(f"the start of plant {plant.name!r}", lambda read: {"state": plant.at_rest(read)}, {"read": read})
+    head = f"void {name}_rest(const double *read, double *state)"
+    inputs = {("read", k): f"read[{k}]" for k in range(len(plant.readings))}
+    source.add(head, found.program, inputs, [(f"state[{k}]", v) for k, v in enumerate(found.outputs["state"])])
+    return [head]
 
 
 @torch.no_grad()
@@ -109,8 +128,28 @@ def _difference(function: Any, points: dict[str, Tensor], ends: Tensor, name: st
     return errors.max().item()
 
 
+@torch.no_grad()
+def _rest_difference(function: Any, plant: Plant, states: Tensor) -> float:
+    """Greatest difference of a state at rest from that in torch, as a share of the greatest size of the state."""
+    read = states[:, : len(plant.readings)]
+    expected = plant.at_rest(read)
+    found = torch.stack([called(function, [c_array(row)], expected.shape[1]) for row in read.tolist()])
+    size = expected.abs().amax(0).clamp(min=torch.finfo(torch.float64).tiny)
+    error = ((found - expected).abs() / size).max().item()
+    if not error <= TOLERANCE:
+        raise ValueError(f"the states at rest of plant {plant.name!r} differ in C by {error:.2g}; nothing was written.")
+    return error
+
+
 def _comment(plant: Plant, closure: nn.Module, name: str) -> list[str]:
     signals = {"state": plant.states, "command": plant.actions, "exogenous": plant.inputs}
+    read, every = len(plant.readings), len(plant.states)
+    rest = [
+        f"No sensor reads the last {plant.unread} of the states. At the start of an episode they follow:",
+        "",
+        f"    {name}_rest(read, state);    read has the first {read} states, state all {every}, maybe in its place",
+        "",
+    ]
     return [
         f"{name}: a twin of the plant {plant.name} with the closure {type(closure).__name__}, written by rt_torchrl.",
         "",
@@ -120,5 +159,6 @@ def _comment(plant: Plant, closure: nn.Module, name: str) -> list[str]:
         "inputs are held. It has no memory, allocates nothing, may be called from several threads, and needs only",
         "math.h. A state that leaves the range of a table becomes NaN.",
         "",
+        *(rest if plant.unread else []),
         *signal_table(signals),
     ]

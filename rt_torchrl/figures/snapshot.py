@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
@@ -22,12 +23,12 @@ class Snapshot:
     Args:
         plant: plant with the true closure, if that is known.
         known: whether the true closure is known; that of a real system may not be.
-        closure: the learned closure.
+        closure: the learned closure of the plant, as the likeliest hypothesis has it.
         initial_closure: the closure that the training started from.
         policies: both policies, by role.
         live: role of the live policy.
         record: the last real episode, or its longest sound part.
-        replay: states of the twin with the record's actions and exogenous input.
+        replay: states of the believed twin with the record's actions and exogenous input.
         large_scale: large scale d̃ of the inputs that act in the record; None if the arm trains no twin, or the record
             is a part of an episode.
         realisations: samples of the exogenous process of the record; None as ``large_scale``.
@@ -53,7 +54,6 @@ class Snapshot:
     ) -> "Snapshot":
         """The snapshot of an algorithm after an episode; its realisations are drawn with a generator of its own."""
         record, twin = algorithm.short_term[-1], algorithm.twin
-        replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None], start=record.start)
         n, flight = len(record.actions), algorithm.flights.latest
         # An episode of which only a part is sound has no process; that of one that ended early goes on to the horizon.
         whole = algorithm.short_term.whole(twin.plant.n_steps, latest=1) or (flight is not None and flight.ended)
@@ -63,13 +63,22 @@ class Snapshot:
         return cls(
             plant=twin.plant,
             known=algorithm.env.closure is not None,
-            closure=twin.closure,
+            closure=twin.believed_law,
             initial_closure=initial_closure,
             policies=algorithm.policies,
             live=algorithm.referee.live,
             record=record,
-            replay=replay.states[0],
+            replay=replayed(twin, record),
             large_scale=None if process is None else process.mean[:n],
             realisations=None if process is None else process.sample(5, generator)[:, :n],
             episodes=episodes,
         )
+
+
+@torch.no_grad()
+def replayed(twin: DigitalTwin, record: Trajectory) -> Float[Tensor, "samples n_s"]:
+    """States of the believed twin with a record's actions and exogenous input, as sensors read them."""
+    believed = twin.believed
+    begins = believed.plant.at_rest(record.states[:1])
+    flown = believed.replay(begins, record.exogenous[None], record.actions[None], start=record.start)
+    return flown.states[0, :, : record.states.shape[-1]]

@@ -39,10 +39,12 @@ class LoadedRun:
         physics: physics of the twin, which policies are made for; the plant itself unless the twin is wrong about it.
         policies: trained policies by role: ``model_based`` and ``model_free``. Model predictive control in the place of
             ``model_based`` plans on ``closure``.
-        closure: trained closure of the twin.
+        closure: trained closure of the twin alone, which a hypothesis that explains the records better does not share.
         initial_closure: closure that the training started from.
         twin: the twin with the trained closure; with hypotheses a :class:`TwinEnsemble` with their trained closures and
-            weights, whose ``twins`` are those of the hypotheses by name.
+            weights, whose ``twins`` are those of the hypotheses by name. ``twin.believed`` is the twin that is most
+            likely to be right, with its ``plant`` and its ``closure``, and ``twin.hypothesis`` the name of what it has
+            beside the plant, None for nothing.
         folder: folder of the run.
     """
 
@@ -98,11 +100,15 @@ class LoadedRun:
     ) -> Trajectory:
         """Fly a policy on the real system in simulation, or on the twin; see :func:`what_if.simulate`.
 
+        The twin is ``twin.believed``, that of the likeliest hypothesis. States of the trajectory are those of the plant
+        that flies, of which sensors read the first ones; its cost is ``control_cost(run.twin.believed.plant, flown)``.
+
         Args:
             policy: policy of an observation, such as ``run.policy("model_based")``, or a :class:`ClassicalController`.
             exogenous: exogenous inputs, ``*batch n n_z``, a row for each control interval; None draws an episode.
-            initial_state: states to start from, ``*batch n_s``; None draws them.
-            on: real for the system with its true closure as it is at the end of the training, or twin.
+            initial_state: states to start from, ``*batch n_s``, or those of them that sensors read; None draws them.
+            on: real for the system with its true closure as it is at the end of the training, or twin for the twin
+                that is most likely to be right.
             seed: seed of what is drawn.
 
         Raises:

@@ -65,9 +65,10 @@ def summarise(
     """The entry ``summary`` of ``metrics.json``.
 
     Every ratio is a cost on the unseen episodes after training over the same cost before. J_p before and after belong
-    to the same episodes, which the final live policy has flown.
+    to the same episodes, which the final live policy has flown. What is said of the twin is said of the one that is
+    most likely to be right; ``believed`` names its hypothesis, and is None where it is the twin alone.
     """
-    closure, live = algorithm.twin.closure, algorithm.referee.live
+    closure, live = algorithm.twin.believed_law, algorithm.referee.live
     laws = {"found": closure, "true": unseen.closure, "start": initial_closure}
     before = of_each_role(initial_policies, unseen.control_costs)
     J_p, J_p_before = twin_costs(unseen, algorithm, initial_closure, flights[live])
@@ -90,6 +91,7 @@ def summarise(
         | {"described": described_weights(closure)},
         "closure_error": closure_errors(algorithm, initial_closure, unseen.closure),
         "hypotheses": hypotheses_of(algorithm.twin),
+        "believed": algorithm.twin.hypothesis,
         "seconds": seconds_per_step(episodes),
     }
 
@@ -118,9 +120,10 @@ def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"]
 def twin_costs(
     unseen: UnseenEpisodes, algorithm: ReinforcementTwinning, initial_closure: nn.Module, flown: Trajectory
 ) -> list[Float[Tensor, " count"]]:
-    """J_p of the twin with its present and with its initial closure, on the unseen episodes as flown."""
-    twin = algorithm.twin
-    return [unseen.identification_costs(twin.plant, closure, flown) for closure in (twin.closure, initial_closure)]
+    """J_p of the believed twin, and of the twin with its initial closure, on the unseen episodes as flown."""
+    believed, plant = algorithm.twin.believed, algorithm.twin.plant
+    laws = ((believed.plant, believed.closure), (plant, initial_closure))
+    return [unseen.identification_costs(physics, closure, flown) for physics, closure in laws]
 
 
 def results(unseen: UnseenEpisodes, judged: dict[str, Judged]) -> dict[str, Any]:
@@ -148,7 +151,7 @@ def closure_errors(
     """
     if true is None:
         return None
-    laws = {"found": algorithm.twin.closure, "start": start}
+    laws = {"found": algorithm.twin.believed_law, "start": start}
     features = visited_features(algorithm.twin.plant, algorithm.short_term[-1])
     return {name: rms_error(law, true, features).tolist() for name, law in laws.items()}
 

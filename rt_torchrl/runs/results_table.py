@@ -52,7 +52,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
     lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
-    lines += hypothesis_lines(found.get("hypotheses", {}))
+    lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
     lines += alarm_lines(metrics["episodes"])
     room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next
     lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room))
@@ -132,7 +132,7 @@ def closure_lines(closure: dict[str, Any], most: int = 1000) -> list[str]:
         chosen = [name for name in chosen if name in moved]
     for name in chosen:
         value = closure["found"][name]
-        weights = [closure["start"][name], value, *([true.get(name)] if true else [])]
+        weights = [closure["start"].get(name), value, *([true.get(name)] if true else [])]
         about = described.get(name, {"unit": "", "meaning": ""})
         label = f"{name} [{about['unit']}]" if about["unit"] else name
         shown = "".join(f"{_number(weight, '.5g'):>12}" for weight in weights)
@@ -142,14 +142,20 @@ def closure_lines(closure: dict[str, Any], most: int = 1000) -> list[str]:
     return lines
 
 
-def hypothesis_lines(hypotheses: dict[str, Any]) -> list[str]:
-    """Lines with what the twin lacks, as the hypotheses that explain the records have found it."""
+def hypothesis_lines(hypotheses: dict[str, Any], believed: str | None = None) -> list[str]:
+    """Lines with what the twin lacks, as the hypotheses that explain the records have found it.
+
+    Args:
+        hypotheses: entry ``hypotheses`` of the summary.
+        believed: name of the likeliest, whose J_p and closure the table shows.
+    """
     lines = []
     for name, one in hypotheses.items():
         named = {key: value for key, value in one["weights"].items() if isinstance(value, float)}
         units = {key: one["described"].get(key, {}).get("unit", "") for key in named}
         found = ", ".join(f"{key} = {value:.4g} {units[key]}".strip() for key, value in named.items())
-        lines.append(f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else ""))
+        line = f"  beside the twin: {name}, weight {one['weight']:.2f}" + (f", {found}" if found else "")
+        lines.append(line + ("; J_p and closure weights are its own" if name == believed else ""))
     return lines
 
 
@@ -196,21 +202,26 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     elif found["better"] != live:
         steps.append(f"the idle policy is the better one ({found['better'].replace('_', '-')}): export that role")
     else:
-        steps += _taking_away(live, folder, None if config is None else config.twinning.planner.method, alone=alone)
+        planner = None if config is None else config.twinning.planner.method
+        steps += _taking_away(live, folder, planner, found.get("believed"), alone=alone)
     return "\n".join(f"  next: {step}" for step in steps)
 
 
-def _taking_away(live: str, folder: Path, planner: str | None, *, alone: bool) -> list[str]:
-    """What to do with the live policy; model predictive control acts from here, and its model can be exported."""
+def _taking_away(live: str, folder: Path, planner: str | None, believed: str | None, *, alone: bool) -> list[str]:
+    """What to do with the live policy; model predictive control acts from here, and its model can be exported.
+
+    Model predictive control plans on the twin alone, also where a hypothesis explains the records better.
+    """
     planned = live == "model_based" and planner == "receding_horizon"
     if not alone:
         model = "take the model that is planned on away: rt_torchrl.export_twin(run.closure, 'it.c', plant)"
         law = f"take the controller away: rt_torchrl.export_controller(run.policy({live!r}), 'it.c', plant)"
         return [model if planned else law]
     if planned:
+        model = "model that it plans on" if believed is None else f"twin with {believed}, on which it does not plan,"
         return [
             f"let model predictive control act: {call_of('real_time')} {folder}",
-            f"take the model that it plans on away: {call_of('export')} {folder} --what twin",
+            f"take the {model} away: {call_of('export')} {folder} --what twin",
         ]
     role = "" if live == "model_based" else " --role model_free"
     return [f"take the controller away: {call_of('export')} {folder}{role}"]

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
-from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.figures.snapshot import Snapshot, replayed
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -37,8 +37,8 @@ def simulate(
         run: the finished run.
         policy: module of an observation, or one that flies by itself, such as a classical controller.
         exogenous: acting inputs, or all inputs with their previews; None draws those of an episode.
-        initial_state: initial states; None draws them.
-        on: real or twin.
+        initial_state: initial states, or those of them that sensors read, with the others at rest; None draws them.
+        on: real, or twin for the twin that is most likely to be right, ``run.twin.believed``.
         seed: seed of the draws.
 
     Raises:
@@ -48,14 +48,15 @@ def simulate(
         raise ValueError(f"on={on!r} must be real or twin.")
     if not isinstance(policy, nn.Module | StateFeedback):
         raise ValueError(f"policy={policy!r} must be an nn.Module from observations to actions, or a controller.")
-    plant, closure = (run.plant, true_closure(run)) if on == "real" else (run.physics, run.closure)
+    believed = run.twin.believed
+    plant, closure = (run.plant, true_closure(run)) if on == "real" else (believed.plant, believed.closure)
     generator = torch.Generator().manual_seed(seed)
     single = all(given is None or given.dim() == rank for given, rank in ((exogenous, 2), (initial_state, 1)))
     batches = ((exogenous, 3), (initial_state, 2))
     count = max([len(given) for given, rank in batches if given is not None and given.dim() == rank], default=1)
     # States first, as the unseen episodes are drawn, so that the same seed is the same episode.
     drawn = plant.draw_initial_state(count, generator)
-    start = drawn if initial_state is None else _rows(initial_state, "initial_state", count, (len(plant.states),))
+    start = drawn if initial_state is None else _start(plant, initial_state, count)
     inputs = plant.draw_exogenous(count, generator) if exogenous is None else _inputs(plant, exogenous, count)
     if isinstance(policy, StateFeedback | ClassicalController):
         flown = policy.fly(start, inputs, closure, plant=plant)
@@ -68,6 +69,13 @@ def true_closure(run: "LoadedRun") -> nn.Module:
     """The real system's closure at the end of the training: a system that wears is not what it was."""
     wear = run.config.wear(run.plant)
     return run.plant.closure if wear is None else wear(run.config.effective().episodes - 1)
+
+
+def _start(plant: Plant, given: Tensor, count: int) -> Tensor:
+    """Given initial states, of which the unread ones may be left out."""
+    if given.shape[-1:] == (len(plant.readings),):
+        return plant.at_rest(_rows(given, "initial_state", count, (len(plant.readings),)))
+    return _rows(given, "initial_state", count, (len(plant.states),))
 
 
 def _rows(given: Tensor, name: str, count: int, shape: tuple[int, ...]) -> Tensor:
@@ -111,7 +119,7 @@ def snapshot_of(run: "LoadedRun", flown: Trajectory | None) -> Snapshot:
     record = simulate(run, run.policy(live), None, None, on="real", seed=UNSEEN_SEED) if flown is None else flown
     record = record if record.states.dim() == 2 else record.each()[0]
     read = record._replace(states=run.physics.at_rest(record.states[..., : len(run.plant.readings)]))
-    replay = run.twin.replay(read.states[:1], read.exogenous[None], read.actions[None]).states[0]
+    replay = replayed(run.twin, read)
     process, signals = None, run.physics.acting_inputs
     if run.config.twinning.arm != "model_free" and signals:
         acted = read.exogenous[:, : len(signals)]
@@ -119,7 +127,7 @@ def snapshot_of(run: "LoadedRun", flown: Trajectory | None) -> Snapshot:
     return Snapshot(
         plant=run.physics,
         known=run.physics is run.plant,
-        closure=run.closure,
+        closure=run.twin.believed_law,
         initial_closure=run.initial_closure,
         policies={role: run.policy(role) for role in ("model_free", "model_based")},
         live=live,

@@ -111,6 +111,16 @@ class DigitalTwin:
         """The twin that is most likely to be right; a twin that is alone is."""
         return self
 
+    @property
+    def hypothesis(self) -> str | None:
+        """Name of the hypothesis that :attr:`believed` is of; None if that has nothing beside the plant."""
+        return None
+
+    @property
+    def believed_law(self) -> nn.Module:
+        """Closure of :attr:`plant` in :attr:`believed`, without the parameters that a hypothesis has beside it."""
+        return self.closure
+
     def explanation(self) -> str:
         """What the twin says about itself that may explain a wrong prediction; a twin that is alone says nothing."""
         return ""

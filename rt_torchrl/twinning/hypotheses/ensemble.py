@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.extensions.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine
-from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -84,6 +84,19 @@ class TwinEnsemble(DigitalTwin):
         """The twin of the likeliest hypothesis."""
         return self.twins[self.likeliest]
 
+    @property
+    def hypothesis(self) -> str | None:
+        """Name of the likeliest hypothesis; None if that is the twin alone."""
+        return None if self.likeliest == ALONE else self.likeliest
+
+    @property
+    def believed_law(self) -> nn.Module:
+        """Closure of the ensemble's plant as the likeliest hypothesis has found it."""
+        plant, closure = self.believed.plant, self.believed.closure
+        while plant is not self.plant and isinstance(plant, Extension):
+            closure, plant = plant.of_base(closure), plant.base
+        return closure
+
     def explanation(self) -> str:
         """The hypothesis that replays the records best."""
         return f"{self.likeliest!r} explains the records best"
@@ -132,12 +145,11 @@ class TwinEnsemble(DigitalTwin):
     def episode_costs(
         self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
     ) -> Float[Tensor, " batch"]:
-        """J_a of each virtual episode over the hypotheses; that of state feedback is the twin's own.
+        """J_a of each virtual episode over the hypotheses.
 
-        State feedback plans on the twin itself, and its flights take too long for all hypotheses.
+        State feedback plans on the twin alone, and is flown under every hypothesis as a policy is, so that the costs of
+        both can be compared.
         """
-        if isinstance(policy, StateFeedback):
-            return super().episode_costs(policy, initial_state, exogenous)
         twins = [self.twins[name] for name in self._shares]
         each = torch.stack([twin.episode_costs(policy, twin.plant.at_rest(initial_state), exogenous) for twin in twins])
         shares, worst = each.new_tensor(list(self._shares.values())), each[each.detach().mean(1).argmax()]

@@ -1,0 +1,185 @@
+"""What is said of a twin with hypotheses is said of the likeliest one: simulations, results, exports and prices."""
+
+import dataclasses
+
+import pytest
+import torch
+from c_build import c_array, library, needs_compiler
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from small_runs import SMALL
+from test_export_recipe import recipe
+from test_hypotheses import PLANT, Suspecting, ensemble
+
+from rt_torchrl import Run, control_cost, export_twin, load_run
+from rt_torchrl.figures.snapshot import replayed
+from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.runs.results_table import hypothesis_lines, results_table
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.hypotheses.choice import extended
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE
+
+LAG = 0.35
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(RunConfig):
+    """A system whose actuator lags, and a twin that suspects lag and dead time."""
+
+    def plant(self):
+        return LaggedActuator(Suspecting(horizon=4.0), "force", LAG)
+
+    def believed(self):
+        return Suspecting(horizon=4.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A training of one episode, in which the right hypothesis takes over."""
+    folder = tmp_path_factory.mktemp("believed")
+    assimilation = dataclasses.replace(SMALL.assimilation, method="levenberg_marquardt", inputs="record")
+    hypotheses = HypothesesConfig(call=0.0, names=("lags",))
+    twinning = dataclasses.replace(SMALL, hypotheses=hypotheses, assimilation=assimilation)
+    options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
+    config = Config(episodes=1, log_dir=folder, twinning=twinning, **options)
+    Run(config, config.plant(), believed=config.believed()).train()
+    return load_run(folder, Config)
+
+
+def stepped(plant, closure, state, exogenous, act):
+    """States of a plant that is stepped by hand."""
+    states = [state]
+    with torch.no_grad():
+        for k, z in enumerate(exogenous):
+            t = torch.tensor(k * plant.dt, dtype=torch.float64)
+            states.append(plant.step(t, states[-1], act(k, t, states[-1], z), z, closure).state)
+    return torch.stack(states)
+
+
+def test_the_twin_that_is_flown_is_the_likeliest_hypothesis(run):
+    believed, policy = run.twin.believed, run.policy(run.live)
+    assert run.twin.hypothesis == "lags" and believed.plant.states != run.physics.states
+    start, z = torch.tensor([0.5, -0.2]).double(), torch.full((40, 1), 0.3, dtype=torch.float64)
+    flown = run.simulate(policy, z, start, on="twin")
+    expected = stepped(
+        believed.plant,
+        believed.closure,
+        believed.plant.at_rest(start),
+        z,
+        lambda k, t, s, w: policy(believed.plant.observe(t, s, w)),
+    )
+    torch.testing.assert_close(flown.states, expected, rtol=1e-9, atol=1e-9)
+    assert torch.equal(run.simulate(policy, z, expected[0], on="twin").states, flown.states)
+    batch = start.expand(1, 2), z[None]
+    with torch.no_grad():
+        cost = run.twin.cost(policy, *batch)
+    torch.testing.assert_close(
+        control_cost(believed.plant, run.simulate(policy, batch[1], batch[0], on="twin")).mean(), cost
+    )
+    alone = DigitalTwin(run.physics, run.closure).control(policy, *batch).states[0]
+    assert (alone - flown.states[:, :2]).abs().max() > 1e-3
+
+
+def test_without_a_hypothesis_the_twin_alone_flies_as_before(run):
+    alone = dataclasses.replace(run, twin=DigitalTwin(run.physics, run.closure))
+    policy = run.policy(run.live)
+    flown = alone.simulate(policy, seed=2, on="twin")
+    expected = run.physics.draw_initial_state(1, generator := torch.Generator().manual_seed(2))
+    z = run.physics.draw_exogenous(1, generator)
+    with torch.no_grad():
+        assert torch.equal(flown.states, alone.twin.control(policy, expected, z).states[0])
+    assert alone.twin.hypothesis is None and alone.twin.believed_law is run.closure
+
+
+def test_the_summary_is_that_of_the_likeliest_and_names_it(run):
+    summary = run.metrics["summary"]
+    assert summary["believed"] == "lags"
+    believed = run.twin.believed
+    law = believed.closure.base
+    assert run.twin.believed_law is law and not torch.equal(law.matrix, run.closure.matrix)
+    found = torch.tensor(list(summary["closure"]["found"].values()), dtype=torch.float64)
+    torch.testing.assert_close(found.reshape(2, 2), law.matrix.detach())
+    # The real system is the hypothesis, which replays what it has not seen; the twin alone cannot.
+    unseen_J_p = summary["unseen"]["J_p"]["mean"]
+    flown = run.simulate(run.policy(run.live), seed=5)
+    misfits = {}
+    for name, twin in (("lags", believed), (ALONE, DigitalTwin(run.physics, run.closure))):
+        start = twin.plant.at_rest(flown.states[0, :2])
+        states = stepped(twin.plant, twin.closure, start, flown.exogenous, lambda k, t, s, w: flown.actions[k])
+        misfits[name] = twin.plant.dt * run.physics.discrepancy(states[1:, :2], flown.states[1:, :2]).sum().item()
+    assert misfits["lags"] < 0.1 * misfits[ALONE] and unseen_J_p < 0.1 * misfits[ALONE]
+    table = results_table(run.metrics)
+    assert "beside the twin: lags" in table and "; J_p and closure weights are its own" in table
+    one = {"lags": {"weight": 0.6, "weights": {}, "described": {}}}
+    assert hypothesis_lines(one) == ["  beside the twin: lags, weight 0.60"]
+
+
+def test_figures_replay_the_likeliest(run):
+    flown = run.simulate(run.policy(run.live), seed=5)
+    read = flown._replace(states=flown.states[:, :2])
+    believed = run.twin.believed
+    expected = stepped(
+        believed.plant,
+        believed.closure,
+        believed.plant.at_rest(read.states[0]),
+        read.exogenous,
+        lambda k, t, s, w: read.actions[k],
+    )
+    torch.testing.assert_close(replayed(run.twin, read), expected[:, :2], rtol=1e-9, atol=1e-9)
+
+
+@needs_compiler
+def test_the_recipe_exports_the_likeliest_and_says_so(run, tmp_path, capsys, monkeypatch):
+    export = recipe("export")
+    monkeypatch.setattr(export, "load_run", lambda folder, given: load_run(folder, Config))
+    export.main(export.Config(run=run.folder, what=("twin",), output=tmp_path, name="it"))
+    assert "the twin with lags, which explains the records best" in capsys.readouterr().out
+
+
+@needs_compiler
+def test_unread_states_are_started_in_c(tmp_path):
+    """An actuator at rest stands at zero; a sensor's bias shows from the first interval on."""
+    plant = BiasedSensor(LaggedActuator(LinearQuadratic(), "force", LAG), "position", 0.5, scale=1.0)
+    closure = extended(plant, LinearClosure([[0.05, 0.0], [-0.4, 0.2]]))
+    assert export_twin(closure, tmp_path / "it.c", plant, name="it") < 1e-9
+    assert "void it_rest(const double *read, double *state);" in (tmp_path / "it.h").read_text()
+    states = c_array([0.7, -0.4, 9.0, 9.0])
+    library(tmp_path / "it.c").it_rest(states, states)
+    assert list(states) == pytest.approx([0.7, -0.4, 0.0, 0.5], abs=1e-12)
+    export_twin(LinearClosure([[0.0, 0.0], [0.0, 0.0]]), tmp_path / "plain.c", LinearQuadratic(), name="plain")
+    assert "_rest" not in (tmp_path / "plain.h").read_text()
+
+
+def test_state_feedback_is_priced_on_the_twins_that_policies_are_priced_on():
+    """The price is the weighted sum of flights under each hypothesis, and that of a policy likewise."""
+    plant = Suspecting(horizon=1.0)
+    twin, _ = ensemble(plant)
+    twin.weights = {ALONE: 0.25, "late": 0.75}
+    generator = torch.Generator().manual_seed(0)
+    start, z = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)
+    controller = PredictiveControl(plant, twin.closure, PredictiveConfig(horizon=0.5, forecast="held"))
+    expected = []
+    for name in (ALONE, "late"):
+        one = twin.twins[name]
+        flown = controller.fly(one.plant.at_rest(start), z, one.closure, plant=one.plant)
+        expected.append(control_cost(one.plant, flown))
+    assert not torch.allclose(*expected)
+    torch.testing.assert_close(twin.episode_costs(controller, start, z), 0.25 * expected[0] + 0.75 * expected[1])
+    # The same commands cost the same, whoever gives them.
+    twin.weights = {"late": 1.0}
+    policy = LinearGain([[0.3, 0.2]])
+    torch.testing.assert_close(
+        twin.episode_costs(policy, start, z),
+        control_cost(twin.believed.plant, twin.believed.control(policy, twin.believed.plant.at_rest(start), z)),
+    )
+
+
+def test_a_hypothesis_without_parameters_has_the_closure_of_the_twin():
+    twin, _ = ensemble(PLANT)
+    twin.weights = {"late": 1.0}
+    assert twin.hypothesis == "late" and twin.believed_law is twin.twins["late"].closure
+    twin.weights = {ALONE: 1.0}
+    assert twin.hypothesis is None and twin.believed_law is twin.closure
