@@ -47,9 +47,9 @@ class NeuralResidual(Extension):
     .. math:: \dot s_i = f_i(t, s, a, z, g(s; w_p)) + r_i c_i\tanh N_i(\hat x; w)
 
     It begins as the plant itself, because the last layer of N is zero at first, and no rate is ever off by more than
-    r_i c_i. A plant that takes a Runge-Kutta step of its vector field takes one of the sum. The scheme of another plant,
-    such as an extension with hidden states, acts between two halves of the network's own step, each by the midpoint
-    rule (Strang splitting, second order).
+    r_i c_i. A plant that takes a Runge-Kutta step of its vector field takes one of the sum. The scheme of another
+    plant, such as an extension with hidden states, acts between two halves of the network's own step, each by the
+    midpoint rule (Strang splitting, second order).
 
     An angle, which is periodic, reaches the network as its cosine and sine. A name that an action shares with a state
     means the action. Hypotheses hold the weights w near their first values; see ``docs/hypotheses.md``.
@@ -85,11 +85,13 @@ class NeuralResidual(Extension):
         spare = [name for name in given if name not in inputs]
         if spare:
             raise ValueError(f"ranges: {_quoted(spare)} are not among inputs={tuple(inputs)}; leave them out.")
-        scaled = [part for name, (_, signal) in zip(inputs, signals, strict=True) for part in _scaled(signal, given.get(name))]
+        scaled: list[Range] = []
+        for name, (_, signal) in zip(inputs, signals, strict=True):
+            scaled += _scaled(signal, given.get(name))
         own = ResidualRates(scaled, bounds, tuple(hidden), seed)
         super().__init__(base, [], own.requires_grad_(False))
         self.own_scheme, self._whole = base.own_scheme, type(base).advance is Plant.advance
-        self._seen = [(place, signal) for place, signal in signals]
+        self._seen = signals
         names = [state.name for state in base.states]
         placed = torch.zeros(len(bounds), len(names), dtype=torch.float64)
         for k, name in enumerate(greatest):
@@ -179,8 +181,8 @@ def _signals(base: Plant, inputs: Sequence[str]) -> list[tuple[int, Signal]]:
     missing = [name for name in inputs if name not in known]
     if missing or not inputs or len(set(inputs)) < len(inputs):
         raise ValueError(
-            f"inputs={tuple(inputs)} of the residual must name signals of plant {base.name!r}, each once; choose some of "
-            f"{_quoted(list(known))}."
+            f"inputs={tuple(inputs)} of the residual must name signals of plant {base.name!r}, each once; choose some "
+            f"of {_quoted(list(known))}."
         )
     return [known[name] for name in inputs]
 

@@ -32,6 +32,8 @@ HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
+HELD = 0.1
+"""Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one."""
 MORE = 3.0
 """Ratio of misfits of two episodes beyond which one round has not been enough."""
 FAR = 10.0
@@ -106,13 +108,12 @@ class Fit:
         return least
 
     def _hold(self, least: float) -> None:
-        """Hold the weights of a neural residual: a change of one costs half the misfit of a segment.
+        """Hold the weights of a neural residual by a prior whose unit is the present misfit; see ``HELD``.
 
-        Without a prior, many weights would follow the noise of a record. If the misfit were noise that does not depend
-        on the weights, this were a prior of standard deviation one, with as many independent samples as segments.
+        Without it the weights that the records hardly show spoil the steps, and many weights follow noise.
         """
         for stage in self.stages.values() if self._held and math.isfinite(least) else ():
-            stage.prior.stiffness = least
+            stage.prior.stiffness = HELD * least
 
     def due(self) -> bool:
         """Whether the fit is due, which a hopeless hypothesis is in ever fewer episodes."""

@@ -54,9 +54,7 @@ class TwinEnsemble(DigitalTwin):
     ):
         super().__init__(plant, closure, engine=engine, compiled=compiled)
         if suspects.keys() != closures.keys():
-            raise ValueError(
-                f"suspects {quoted(suspects)} and closures {quoted(closures)} must have equal names."
-            )
+            raise ValueError(f"suspects {quoted(suspects)} and closures {quoted(closures)} must have equal names.")
         for name, suspect in suspects.items():
             if suspect.readings != plant.states or suspect.dt != plant.dt:
                 raise ValueError(
