@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
 from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
 from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
-from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 
 if TYPE_CHECKING:
