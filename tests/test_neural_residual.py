@@ -123,7 +123,7 @@ def test_around_another_scheme_it_is_of_second_order():
     with torch.no_grad():
         reference = end(LinearQuadratic, 0.01)
         coarse, fine = ((end(Exact, dt) - reference).norm().item() for dt in (0.2, 0.1))
-    assert coarse / fine == pytest.approx(4.0, rel=0.15) and fine < 2e-3
+    assert coarse / fine == pytest.approx(4.0, rel=0.15) and fine < 5e-3
 
 
 @pytest.mark.parametrize("name", ["whole", "around an extension"])
@@ -278,6 +278,14 @@ def test_noise_does_not_call_for_it_where_the_plant_is_right():
     assert twin.weights == {ALONE: 1.0} and misfits[FORCE] == pytest.approx(misfits[ALONE], rel=0.05)
 
 
+STATES = {
+    "wind_turbine": {"rotor_speed"},
+    "flapping_wing": {"forward_speed", "climb_speed"},
+    "cryogenic_tank": {"pressure"},
+}
+"""States that the residual of each shipped plant moves."""
+
+
 @pytest.mark.parametrize(
     "plant, name", [(WindTurbine, "unknown torque"), (FlappingWing, FORCE), (CryogenicTank, "unknown heat")]
 )
@@ -293,10 +301,8 @@ def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
     steps = [p.step(t, state, command, exogenous, c).state for p, c in ((twin.plant, twin.closure), (plant, closure))]
     assert torch.equal(*steps)
     other = twin.plant.step(t, state, command, exogenous, stirred(twin.closure)).state
-    moved = [
-        signal.name for signal, change in zip(plant.states, (other - steps[0]).abs().amax(0), strict=True) if change
-    ]
-    assert set(moved) >= set(name for name in moved if name not in plant.controller_states) != set()
+    moved = {s.name for s, change in zip(plant.states, (other - steps[0]).abs().amax(0), strict=True) if change}
+    assert moved - set(plant.controller_states) >= STATES[plant.name]
 
 
 @pytest.mark.parametrize(
