@@ -3,6 +3,18 @@
 # Plants and their parts
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
 from .plants.disturbance import require_request
+from .plants.extensions.actuator_coefficients import ActuatorCoefficients
+from .plants.extensions.biased_sensor import BiasedSensor
+from .plants.extensions.delayed_actuator import DelayedActuator
+from .plants.extensions.extension import ExtendedClosure, Extension, OwnParameters
+from .plants.extensions.lagged_actuator import LaggedActuator
+from .plants.extensions.lagged_coefficients import LaggedCoefficients
+from .plants.extensions.neural_residual import NeuralResidual
+from .plants.extensions.resonant_actuator import ResonantActuator
+from .plants.extensions.scaled_actuator import ScaledActuator
+from .plants.extensions.scaled_coefficients import ScaledCoefficients
+from .plants.extensions.slow_actuator import SlowActuator
+from .plants.extensions.unread_input import UnreadInput
 from .plants.integrators import rk4_step
 from .plants.measurement import Component, Measurement, Phase, Preview
 from .plants.plant import Plant, Transition
@@ -58,6 +70,7 @@ from .optimisers.descent import Descended, DescentConfig
 from .twinning.algorithm import ReinforcementTwinning
 from .twinning.assimilation import AssimilationConfig
 from .twinning.hypotheses.config import HypothesesConfig
+from .twinning.hypotheses.ensemble import TwinEnsemble
 from .twinning.config import TwinningConfig
 from .twinning.distillation import DistillationConfig
 from .twinning.exogenous import ExogenousConfig
@@ -81,7 +94,7 @@ from .twinning.planners import (
     ShortHorizonConfig,
     WholeEpisodes,
 )
-from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
+from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio, WeightOfEvidence
 from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
@@ -110,7 +123,9 @@ __all__ = [
     "ActingController",
     "ActorCritic",
     "Actuation",
+    "ActuatorCoefficients",
     "AssimilationConfig",
+    "BiasedSensor",
     "BoundedPerceptron",
     "CallingSimulator",
     "Clairvoyant",
@@ -121,6 +136,7 @@ __all__ = [
     "ContractReport",
     "Decaying",
     "DecisionTree",
+    "DelayedActuator",
     "Descended",
     "DescentConfig",
     "DigitalTwin",
@@ -137,6 +153,8 @@ __all__ = [
     "ExogenousConfig",
     "ExplorationConfig",
     "ExportedPolicy",
+    "ExtendedClosure",
+    "Extension",
     "FMUEnvironment",
     "FMUError",
     "FaultySystem",
@@ -151,6 +169,8 @@ __all__ = [
     "IncrementalTD3",
     "IncrementalTD3Config",
     "Injection",
+    "LaggedActuator",
+    "LaggedCoefficients",
     "Learner",
     "LearnerConfig",
     "LimitConfig",
@@ -161,10 +181,12 @@ __all__ = [
     "LongTermMemoryConfig",
     "Measurement",
     "ModbusLink",
+    "NeuralResidual",
     "OpcUaLink",
     "OperatingLimits",
     "OperatingLimitsConfig",
     "OperationConfig",
+    "OwnParameters",
     "Phase",
     "Planner",
     "PlannerConfig",
@@ -186,6 +208,7 @@ __all__ = [
     "RefereeConfig",
     "ReinforcementTwinning",
     "Relay",
+    "ResonantActuator",
     "Rollout",
     "Run",
     "RunConfig",
@@ -195,6 +218,8 @@ __all__ = [
     "SafetyReport",
     "SaturatedAffine",
     "SaturatedMLP",
+    "ScaledActuator",
+    "ScaledCoefficients",
     "Scattered",
     "Scenario",
     "Sensor",
@@ -204,6 +229,7 @@ __all__ = [
     "ShortHorizonConfig",
     "Signal",
     "SimulatedTwin",
+    "SlowActuator",
     "SmoothClip",
     "Snapshot",
     "Start",
@@ -212,8 +238,11 @@ __all__ = [
     "Trajectory",
     "Transition",
     "TrustRatio",
+    "TwinEnsemble",
     "TwinningConfig",
     "Uncertainty",
+    "UnreadInput",
+    "WeightOfEvidence",
     "WholeEpisodes",
     "begin_loading",
     "check_options",

@@ -17,7 +17,7 @@ from rt_torchrl.envs.cryogenic_tank.mixture import Conditions, evaporation_heat,
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients, CubicVentLaw
 from rt_torchrl.envs.cryogenic_tank.neural import first_neural_guess
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
-from rt_torchrl.envs.cryogenic_tank.suspects import suspects
+from rt_torchrl.envs.cryogenic_tank.suspects import further_suspects, suspects
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
 from rt_torchrl.plants.integrators import rk4_step
@@ -277,7 +277,7 @@ class CryogenicTank(Plant):
         return (((state - measured) / self.error_sizes) ** 2).sum(-1) / self.horizon
 
     merit, setpoints, make_neural_closure = judgement.merit, judgement.setpoints, first_neural_guess
-    suspects = suspects
+    suspects, further_suspects = suspects, further_suspects
 
     # Randomness
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 
 if TYPE_CHECKING:
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
 
 VALVE_LAG = 600.0  # [s]; with which the identification begins
 PRESSURE_ERROR = 10e3  # [Pa]; an error of 2 % of the set point counts as one
+UNKNOWN_RATE = 0.2  # [Pa/s]; about the standard deviation of the pressure's rate under a moving valve
 
 
 def suspects(plant: "CryogenicTank") -> Mapping[str, Plant]:
@@ -29,3 +31,15 @@ def suspects(plant: "CryogenicTank") -> Mapping[str, Plant]:
         "valve lags": lagging(plant),
         "pressure sensor, valve lags": lagging(biased(plant)),
     }
+
+
+def further_suspects(plant: "CryogenicTank") -> Mapping[str, Plant]:
+    """A rate of the pressure of unknown form that depends on pressure, liquid, valve and heat load."""
+    (valve,) = plant.actions
+    rate = NeuralResidual(
+        plant,
+        {"pressure": UNKNOWN_RATE},
+        inputs=("pressure", "liquid_volume", valve.name, "heat_load"),
+        ranges={"heat_load": (0.0, 400.0)},
+    )
+    return {"unknown heat": rate}

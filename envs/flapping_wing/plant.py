@@ -14,7 +14,7 @@ from rt_torchrl.envs.flapping_wing.costs import TrackingCost, needs_memory, requ
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
-from rt_torchrl.envs.flapping_wing.suspects import suspects
+from rt_torchrl.envs.flapping_wing.suspects import further_suspects, suspects
 from rt_torchrl.envs.flapping_wing.wings import Wings
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.cost import RunningCost
@@ -253,12 +253,13 @@ class FlappingWing(Plant):
         return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
 
     latch, controller_start, seen_velocity = memory.latch, memory.started, memory.seen_velocity
-    merit, setpoints, categories, make_neural_closure, suspects = (
+    merit, setpoints, categories, make_neural_closure, suspects, further_suspects = (
         judgement.merit,
         judgement.setpoints,
         judgement.categories,
         drawn_neural_polar,
         suspects,
+        further_suspects,
     )
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
 from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
 from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
 from rt_torchrl.plants.plant import Plant
@@ -15,6 +16,7 @@ LAG = 0.05  # [s]; one wing beat, with which the identification begins
 DEAD_TIME = 0.1  # [s]
 FREQUENCY, DAMPING = 10.0, 0.5  # [rad/s], [-]; an elastic mount that settles within some tenths of a second
 SHORT_DEAD_TIME = 0.02  # [s]; of a link that the mount follows
+UNKNOWN_ACCELERATION = 2.0  # [m/s²]; a fifth of gravity
 AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
 
 
@@ -41,3 +43,14 @@ def suspects(plant: "FlappingWing") -> Mapping[str, Plant]:
         "plane swings, late": after(swinging(plant), PLANE),
         "plane swings, both late": late(late(swinging(plant), PLANE), AMPLITUDE),
     }
+
+
+def further_suspects(plant: "FlappingWing") -> Mapping[str, Plant]:
+    """A force of unknown form that depends on the velocity, both actuators and the headwind."""
+    force = NeuralResidual(
+        plant,
+        {"forward_speed": UNKNOWN_ACCELERATION, "climb_speed": UNKNOWN_ACCELERATION},
+        inputs=("forward_speed", "climb_speed", AMPLITUDE, PLANE, "headwind"),
+        ranges={"forward_speed": (-3.0, 3.0), "climb_speed": (-3.0, 3.0), "headwind": (-3.0, 3.0)},
+    )
+    return {"unknown force": force}

@@ -16,7 +16,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
-from rt_torchrl.envs.wind_turbine.suspects import suspects
+from rt_torchrl.envs.wind_turbine.suspects import further_suspects, suspects
 from rt_torchrl.plants.cost import RunningCost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedAffine
@@ -259,7 +259,8 @@ class WindTurbine(Plant):
         """The discrepancy ½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
         return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
 
-    merit, setpoints, controller_start, suspects = judgement.merit, judgement.setpoints, started, suspects
+    merit, setpoints, controller_start = judgement.merit, judgement.setpoints, started
+    suspects, further_suspects = suspects, further_suspects
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """All states from the rotor speed: the filters start settled, and the last actions are those of the record."""

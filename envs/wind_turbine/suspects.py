@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 
 if TYPE_CHECKING:
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
 
 PITCH_LAG = 0.7  # [s]; guess with which the identification begins
 INFLOW_LAG = 6.0  # [s]; about D/u at rated wind speed, 126 m/11.4 m/s = 11 s, within a factor of two
+UNKNOWN_ACCELERATION = 0.02  # [rad/s²]; about a fifth of what the rated torque gives the rotor
 
 
 def suspects(plant: "WindTurbine") -> Mapping[str, Plant]:
@@ -37,3 +39,14 @@ def suspects(plant: "WindTurbine") -> Mapping[str, Plant]:
         "inflow": inflow(),
         "inflow, pitch lag, late by 2": late(lagging(inflow()), 2),
     }
+
+
+def further_suspects(plant: "WindTurbine") -> Mapping[str, Plant]:
+    """A torque of unknown form that depends on the speed of the rotor, the pitch and the wind."""
+    torque = NeuralResidual(
+        plant,
+        {"rotor_speed": UNKNOWN_ACCELERATION},
+        inputs=("rotor_speed", "blade_pitch", "wind_speed"),
+        ranges={"rotor_speed": (0.0, 1.6), "wind_speed": (3.0, 25.0)},
+    )
+    return {"unknown torque": torque}

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.contract.calls import Arguments, Calls, Method
 from rt_torchrl.contract.draws import seeded
+from rt_torchrl.plants.closures import BoundedPerceptron
 
 MANY = 5
 STEP = 1e-6
@@ -65,7 +66,7 @@ def _by_weights(calls: Calls, method: Method, arguments: Arguments) -> Iterator[
     measure = _measure(method, arguments, calls.seed)
     weights = {name: w for name, w in calls.closure.named_parameters() if w.requires_grad}
     reached, gradient = _gradient(lambda: measure(arguments).sum(), list(weights.values()))
-    generator = seeded(calls.seed)
+    generator, dormant = seeded(calls.seed), _dormant(calls.closure)
     for (name, weight), slope in zip(weights.items(), gradient, strict=True):
         direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
         direction *= 1e-3 + weight.detach().abs().max()
@@ -73,11 +74,19 @@ def _by_weights(calls: Calls, method: Method, arguments: Arguments) -> Iterator[
         found = _Derivative((slope * direction).sum(), differences, reached)
         of_all = list(_verdict(method.name, f"closure weight {name!r}", found))
         yield from of_all
-        if not of_all and method.name == "vector_field" and not slope.any() and not differences.any():
+        matters = slope.any() or differences.any() or id(weight) in dormant
+        if not of_all and method.name == "vector_field" and not matters:
             yield (
                 f"vector_field: closure weight {name!r} changes it at none of {measure(arguments).numel()} states; "
                 "leave the weight out, or start it where it matters."
             )
+
+
+def _dormant(closure: nn.Module) -> set[int]:
+    """Weights of hidden layers that matter as soon as the last layer of their perceptron is no longer zero."""
+    found = [m.network for m in closure.modules() if isinstance(m, BoundedPerceptron)]
+    asleep = [network for network in found if not network[-1].get_parameter("weight").any()]
+    return {id(weight) for network in asleep for layer in network[:-1] for weight in layer.parameters()}
 
 
 @torch.no_grad()

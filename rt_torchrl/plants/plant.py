@@ -279,6 +279,10 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
         """Plants that extend this one by what the real system may have beside it, by name; by default none."""
         return {}
 
+    def further_suspects(self) -> Mapping[str, "Plant"]:
+        """Suspects that hypotheses take only by name, such as a :class:`NeuralResidual`; by default none."""
+        return {}
+
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The policy that both controllers start from, w_a⁰; by default a saturated affine law of the observation."""
         return SaturatedAffine(len(self.observations), self.actions, generator=generator)

@@ -11,6 +11,7 @@ import torch
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.plants.extensions.neural_residual import ResidualRates
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -31,6 +32,8 @@ HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
+HELD = 0.1
+"""Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one."""
 MORE = 3.0
 """Ratio of misfits of two episodes beyond which one round has not been enough."""
 FAR = 10.0
@@ -66,6 +69,7 @@ class Fit:
             "whole": Assimilation(twin, measured),
         }
         self.least, self.waiting, self.pause = math.inf, 0, 1
+        self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
         """Fit the records, in more rounds the first time, and where one round leaves more over than the last time.
@@ -84,6 +88,7 @@ class Fit:
         """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
+        self._hold(least)
         taken = {"short": [reread(record, plant, self.segment) for record in records]}
         taken["whole"] = [at_rest(record, plant) for record in records]
         for name in count * list(self.stages):
@@ -101,6 +106,14 @@ class Fit:
                 break
         closure.load_state_dict(best)
         return least
+
+    def _hold(self, least: float) -> None:
+        """Hold the weights of a neural residual by a prior whose unit is the present misfit; see ``HELD``.
+
+        Without it the weights that the records hardly show spoil the steps, and many weights follow noise.
+        """
+        for stage in self.stages.values() if self._held and math.isfinite(least) else ():
+            stage.prior.stiffness = HELD * least
 
     def due(self) -> bool:
         """Whether the fit is due, which a hopeless hypothesis is in ever fewer episodes."""

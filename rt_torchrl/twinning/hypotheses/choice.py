@@ -12,7 +12,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble, quoted
 from rt_torchrl.twinning.sensor_assimilation import SensorAssimilation
 
 
@@ -26,15 +26,19 @@ def make_twin(
 ) -> DigitalTwin:
     """The twin of a plant, with the hypotheses that a configuration asks for; each begins with a copy of the closure.
 
+    A configuration that names none takes all suspects of the plant; one that names some may name further ones, too.
+
     Raises:
         ValueError: if the plant suspects nothing of a name that the configuration lists.
     """
     suspects = plant.suspects() if config.which == "automatic" else {}
+    if config.names:
+        suspects = {**suspects, **plant.further_suspects()}
     unknown = [name for name in config.names if name not in suspects]
     if unknown:
         raise ValueError(
-            f"hypotheses.names: plant {plant.name!r} does not suspect {', '.join(unknown)}; choose among "
-            f"{', '.join(suspects) or '(nothing)'}, or give a TwinEnsemble of your own."
+            f"hypotheses.names: plant {plant.name!r} does not suspect {quoted(unknown)}; choose among "
+            f"{quoted(suspects) or '(nothing)'}, or give a TwinEnsemble of your own."
         )
     taken = {name: suspect for name, suspect in suspects.items() if not config.names or name in config.names}
     if not taken:

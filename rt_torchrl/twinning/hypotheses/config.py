@@ -17,7 +17,8 @@ class HypothesesConfig:
         call: size of the paired difference log J − log Ĵ of a real episode, beyond what exploration explains, above
             which the hypotheses are fitted; until then the twin is trained alone, which takes less time. 0 fits them
             always.
-        names: names of the suspects that are taken; all if there are none.
+        names: names of the suspects that are taken, also of those that are taken only by name
+            (:meth:`Plant.further_suspects`); all of the others if there are none.
         prior: prior weight p_h of every addition, as a share of that of the twin alone. A small one asks for evidence
             before anything is added.
         sharpness: exponent κ, which stands for the number of independent samples in the records.

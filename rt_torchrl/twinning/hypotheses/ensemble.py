@@ -1,6 +1,6 @@
 """Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -15,6 +15,11 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 ALONE = "as the twin"
 """Name of the hypothesis that the real system has nothing beside its twin."""
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Names of hypotheses in quotes, because some contain commas."""
+    return ", ".join(repr(name) for name in names)
 
 
 class TwinEnsemble(DigitalTwin):
@@ -49,9 +54,7 @@ class TwinEnsemble(DigitalTwin):
     ):
         super().__init__(plant, closure, engine=engine, compiled=compiled)
         if suspects.keys() != closures.keys():
-            raise ValueError(
-                f"suspects {', '.join(suspects)} and closures {', '.join(closures)} must have equal names."
-            )
+            raise ValueError(f"suspects {quoted(suspects)} and closures {quoted(closures)} must have equal names.")
         for name, suspect in suspects.items():
             if suspect.readings != plant.states or suspect.dt != plant.dt:
                 raise ValueError(
@@ -115,7 +118,7 @@ class TwinEnsemble(DigitalTwin):
         closures, own = state["closures"], [name for name in self.twins if name != ALONE]
         if closures.keys() != set(own):
             raise ValueError(
-                f"hypotheses {', '.join(closures)} of the state are not those of the twin, {', '.join(own)}; plant "
+                f"hypotheses {quoted(closures)} of the state are not those of the twin, {quoted(own)}; plant "
                 f"{self.plant.name!r} must suspect what it suspected then."
             )
         for name in own:

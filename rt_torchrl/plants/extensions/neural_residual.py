@@ -1,0 +1,200 @@
+"""Dynamics of which nobody knows the form: a small network adds to the rates of some states."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.plants.extensions.extension import Extension, OwnParameters
+from rt_torchrl.plants.innermost import innermost
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+
+Range = tuple[float, float]
+
+
+class ResidualRates(OwnParameters):
+    """The network of a :class:`NeuralResidual`; its weights have no names and no units.
+
+    Args:
+        ranges: range of each feature, which is scaled to [−1, 1].
+        bounds: greatest absolute value of each rate.
+        hidden: width of each hidden layer.
+        seed: seed of the first weights; those of the last layer are zero.
+    """
+
+    def __init__(self, ranges: Sequence[Range], bounds: Sequence[float], hidden: Sequence[int], seed: int):
+        super().__init__()
+        self._arguments = ranges, bounds, hidden, seed
+        generator = torch.Generator().manual_seed(seed)
+        self.network = BoundedPerceptron(ranges, bounds, hidden=hidden, generator=generator)
+
+    def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch m"]:
+        """The rates."""
+        return self.network(features)
+
+    def fresh(self) -> "ResidualRates":
+        """The network as it began, whose rates are zero, to be trained."""
+        return ResidualRates(*self._arguments)
+
+
+class NeuralResidual(Extension):
+    r"""A plant with a network N in its vector field, which stands for forces or flows of a form that nobody knows.
+
+    .. math:: \dot s_i = f_i(t, s, a, z, g(s; w_p)) + r_i c_i\tanh N_i(\hat x; w)
+
+    It begins as the plant itself, because the last layer of N is zero at first, and no rate is ever off by more than
+    r_i c_i. A plant that takes a Runge-Kutta step of its vector field takes one of the sum. The scheme of another
+    plant, such as an extension with hidden states, acts between two halves of the network's own step, each by the
+    midpoint rule (Strang splitting, second order).
+
+    An angle, which is periodic, reaches the network as its cosine and sine. A name that an action shares with a state
+    means the action. Hypotheses hold the weights w near their first values; see ``docs/hypotheses.md``.
+
+    Args:
+        base: the plant.
+        greatest: greatest residual r_i of each state that has one, in units of :attr:`Plant.state_sizes` per second, by
+            name of the state; the sizes c_i are ones in a plant that gives none.
+        inputs: names of the states, actions and inputs of which N is a function.
+        ranges: range of each of them that has no finite one of its own, by name; it does not limit the signal.
+        hidden: width of each hidden layer of N.
+        seed: seed of the first weights of N.
+
+    Raises:
+        ValueError: if a name does not exist or stands twice, a residual is not positive and finite, a range is missing
+            or empty, or a state is computed by the controller or read by no sensor.
+    """
+
+    placed: Tensor
+
+    def __init__(
+        self,
+        base: Plant,
+        greatest: Mapping[str, float],
+        *,
+        inputs: Sequence[str],
+        ranges: Mapping[str, Range] | None = None,
+        hidden: Sequence[int] = (8,),
+        seed: int = 0,
+    ):
+        bounds = _bounds(base, greatest)
+        signals, given = _signals(base, inputs), dict(ranges or {})
+        spare = [name for name in given if name not in inputs]
+        if spare:
+            raise ValueError(f"ranges: {_quoted(spare)} are not among inputs={tuple(inputs)}; leave them out.")
+        scaled: list[Range] = []
+        for name, (_, signal) in zip(inputs, signals, strict=True):
+            scaled += _scaled(signal, given.get(name))
+        own = ResidualRates(scaled, bounds, tuple(hidden), seed)
+        super().__init__(base, [], own.requires_grad_(False))
+        self.own_scheme, self._whole = base.own_scheme, type(base).advance is Plant.advance
+        self._seen = signals
+        names = [state.name for state in base.states]
+        placed = torch.zeros(len(bounds), len(names), dtype=torch.float64)
+        for k, name in enumerate(greatest):
+            placed[k, names.index(name)] = 1.0
+        self.register_buffer("placed", placed)
+
+    def residual(
+        self,
+        state: Float[Tensor, "*batch n_s"],
+        action: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        """What the network adds to the rates of all states [state unit / s]."""
+        met = exogenous + torch.zeros_like(state[..., :1])
+        values, features = torch.cat([action, state, met], -1), []
+        for place, signal in self._seen:
+            value = values[..., place]
+            if signal.periodic:
+                phase = (2.0 * math.pi / signal.period) * value
+                features += [torch.cos(phase), torch.sin(phase)]
+            else:
+                features.append(value)
+        return closure.get_submodule("own")(torch.stack(features, -1)) @ self.placed
+
+    def vector_field(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        action: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        field = self.base.vector_field(t, state, action, exogenous, self.of_base(closure))
+        return field + self.residual(state, action, exogenous, closure)
+
+    def advance(
+        self,
+        t: Float[Tensor, "*#batch"],
+        state: Float[Tensor, "*batch n_s"],
+        applied: Float[Tensor, "*batch n_a"],
+        exogenous: Float[Tensor, "*#batch n_z"],
+        closure: nn.Module,
+    ) -> Float[Tensor, "*batch n_s"]:
+        """One Runge-Kutta step of the sum, or the plant's own scheme between two halves of the residual's step."""
+        if self._whole:
+            return Plant.advance(self, t, state, applied, exogenous, closure)
+        half = 0.5 * self.dt
+
+        def pushed(s: Tensor) -> Tensor:
+            middle = s + 0.5 * half * self.residual(s, applied, exogenous, closure)
+            return s + half * self.residual(middle, applied, exogenous, closure)
+
+        return pushed(self.base.advance(t, pushed(state), applied, exogenous, self.of_base(closure)))
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(repr(name) for name in names)
+
+
+def _bounds(base: Plant, greatest: Mapping[str, float]) -> list[float]:
+    """Greatest residual of each state that has one [state unit / s]."""
+    names, inner = [state.name for state in base.readings], innermost(base)
+    sizes = dict(zip((state.name for state in inner.states), inner.state_sizes, strict=False))
+    if not greatest:
+        raise ValueError(f"greatest names no state of plant {base.name!r}; choose some of {_quoted(names)}.")
+    for name, value in greatest.items():
+        if name not in names:
+            raise ValueError(
+                f"greatest: no sensor of plant {base.name!r} reads a state {name!r}; choose some of {_quoted(names)}."
+            )
+        if name in base.controller_states:
+            raise ValueError(
+                f"greatest: the controller of plant {base.name!r} computes {name!r}, and knows it exactly; choose "
+                f"another of {_quoted(names)}."
+            )
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"greatest={value} of {name!r} must be positive and finite, in sizes per second.")
+    return [value * sizes.get(name, 1.0) for name, value in greatest.items()]
+
+
+def _signals(base: Plant, inputs: Sequence[str]) -> list[tuple[int, Signal]]:
+    """The signals of these names, with their places among actions, states and inputs."""
+    known: dict[str, tuple[int, Signal]] = {}
+    for place, signal in enumerate((*base.actions, *base.states, *base.acting_inputs)):
+        known.setdefault(signal.name, (place, signal))
+    missing = [name for name in inputs if name not in known]
+    if missing or not inputs or len(set(inputs)) < len(inputs):
+        raise ValueError(
+            f"inputs={tuple(inputs)} of the residual must name signals of plant {base.name!r}, each once; choose some "
+            f"of {_quoted(list(known))}."
+        )
+    return [known[name] for name in inputs]
+
+
+def _scaled(signal: Signal, given: Range | None) -> list[Range]:
+    """Ranges of the features that a signal becomes."""
+    if signal.periodic:
+        return [(-1.0, 1.0), (-1.0, 1.0)]
+    low, high = given or (signal.low, signal.high)
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ValueError(
+            f"{signal.name!r} of the residual goes from {low} to {high} {signal.unit}; give "
+            f"ranges={{{signal.name!r}: (low, high)}} with finite numbers, low below high."
+        )
+    return [(low, high)]

@@ -1,0 +1,345 @@
+"""A network in the vector field: against closed forms, in every engine, and as a hypothesis beside others."""
+
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from scipy.linalg import expm
+
+from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, check_plant
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE
+
+RANGES = {"position": (-3.0, 3.0), "velocity": (-3.0, 3.0)}
+FORCE = "unknown force"
+
+
+def pushed(base, **options):
+    return NeuralResidual(base, {"velocity": 4.0}, inputs=("position", "velocity"), ranges=RANGES, **options)
+
+
+class Exact(LinearQuadratic):
+    """The oscillator with the solution of its linear equations as a scheme of its own."""
+
+    own_scheme = True
+
+    def advance(self, t, state, applied, exogenous, closure):
+        joint = torch.zeros(4, 4, dtype=torch.float64)
+        joint[:2] = torch.cat([self._A + closure.matrix.detach(), self._B, self._D], -1)
+        held = torch.as_tensor(expm((joint * self.dt).numpy()))[:2]
+        return torch.cat([state, applied, exogenous + torch.zeros_like(applied)], -1) @ held.T
+
+
+SCHEMES = {
+    "whole": lambda: pushed(LinearQuadratic()),
+    "around an extension": lambda: pushed(LaggedActuator(LinearQuadratic(), "force", 0.4)),
+    "within an extension": lambda: LaggedActuator(pushed(LinearQuadratic()), "force", 0.4),
+    "periodic": lambda: NeuralResidual(Pendulum(), {"angular_speed": 1.0}, inputs=("angle", "torque")),
+}
+
+
+def stirred(closure, scale=0.5):
+    """The closure with other weights in its network, whose last layer is zero at first."""
+    generator = torch.Generator().manual_seed(2)
+    (network,) = (m for m in closure.modules() if isinstance(m, BoundedPerceptron))
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.add_(scale * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
+    return closure
+
+
+def flight(plant, steps=30, batch=2):
+    generator = torch.Generator().manual_seed(3)
+    state = plant.draw_initial_state(batch, generator)
+    exogenous = plant.draw_exogenous(batch, generator)[:, :steps]
+    return state, exogenous, 2.0 * torch.rand(batch, steps, 1, generator=generator, dtype=torch.float64) - 1.0
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_a_plant_with_a_residual_fulfils_the_contract(name):
+    check_plant(SCHEMES[name](), steps=20, traced=False)  # run-time checks of annotations are no part of a graph
+
+
+def test_a_network_that_matters_nowhere_is_still_refused():
+    class Deaf(LinearClosure):
+        def __init__(self, matrix):
+            super().__init__(matrix)
+            generator = torch.Generator().manual_seed(0)
+            self.network = BoundedPerceptron([(-1.0, 1.0)], [1.0], hidden=(2,), generator=generator)
+
+    class Plant(LinearQuadratic):
+        def make_closure(self, generator):
+            return Deaf(super().make_closure(generator).matrix.detach())
+
+    with pytest.raises(ValueError, match=r"'network.network.2.weight' changes it at none") as raised:
+        check_plant(Plant(), steps=20, traced=False)
+    assert "network.0" not in str(raised.value)  # it matters once the last layer does
+
+
+def test_the_residual_is_the_bounded_network_in_the_units_of_the_plant():
+    class Sized(LinearQuadratic):
+        state_sizes = (1.0, 0.5)
+
+    plant = NeuralResidual(Sized(), {"velocity": 3.0}, inputs=("force", "position"), ranges={"position": (0.0, 4.0)})
+    closure = stirred(plant.make_closure(torch.Generator().manual_seed(1)))
+    first, last = (closure.own.network.network[k] for k in (0, 2))
+    state = torch.tensor([[1.0, 0.2], [9.0, -3.0]], dtype=torch.float64)
+    action = torch.tensor([[0.7], [-2.0]], dtype=torch.float64)
+    hat = torch.cat([action / 2.0, (state[:, :1] - 2.0) / 2.0], -1)  # the force goes from −2 to 2 N
+    expected = 1.5 * torch.tanh(torch.tanh(hat @ first.weight.T + first.bias) @ last.weight.T + last.bias)
+    nothing = torch.zeros(2, 1, dtype=torch.float64)
+    added = plant.vector_field(torch.zeros(2), state, action, nothing, closure) - Sized().vector_field(
+        torch.zeros(2), state, action, nothing, closure.base
+    )
+    torch.testing.assert_close(added, torch.cat([nothing, expected], -1))
+
+
+@pytest.mark.parametrize("base", [LinearQuadratic(), Exact(), LaggedActuator(LinearQuadratic(), "force", 0.4)])
+def test_it_begins_as_the_plant_itself(base):
+    plant = pushed(base)
+    state, exogenous, command = flight(base)
+    flown = [Rollout(p, p.closure, engine="autograd")(state, exogenous, command).states for p in (plant, base)]
+    assert torch.equal(*flown)
+    assert plant.states == base.states and plant.unread == base.unread and plant.own_scheme == base.own_scheme
+
+
+def test_around_another_scheme_it_is_of_second_order():
+    def end(kind, dt):
+        plant = pushed(kind(dt=dt, horizon=4.0))
+        closure = stirred(plant.extended(LinearClosure(LinearQuadratic.true_closure)))
+        state, (n, steps) = torch.tensor([[1.0, -0.5]], dtype=torch.float64), (1, plant.n_steps)
+        held = torch.full((n, steps, 1), 0.3, dtype=torch.float64)
+        return Rollout(plant, closure, engine="autograd")(state, 0.0 * held, held).states[0, -1]
+
+    with torch.no_grad():
+        reference = end(LinearQuadratic, 0.01)
+        coarse, fine = ((end(Exact, dt) - reference).norm().item() for dt in (0.2, 0.1))
+    assert coarse / fine == pytest.approx(4.0, rel=0.15) and fine < 5e-3
+
+
+@pytest.mark.parametrize("name", ["whole", "around an extension"])
+def test_gradients_are_those_of_backpropagation(name):
+    plant = SCHEMES[name]()
+    generator = torch.Generator().manual_seed(1)
+    closure, policy = stirred(plant.make_closure(generator)), plant.make_policy(generator)
+    state, exogenous, _ = flight(plant)
+    weights = [w for module in (closure, policy) for w in module.parameters()]
+
+    def gradient(engine):
+        cost = Rollout(plant, closure, policy, engine=engine).costs(state, exogenous).sum()
+        return torch.cat([g.flatten() for g in torch.autograd.grad(cost, weights)])
+
+    reference = gradient("autograd")
+    assert (reference != 0.0).all()
+    for engine in ("native", "parallel"):
+        torch.testing.assert_close(gradient(engine), reference, rtol=1e-9, atol=1e-11)
+    if plant.own_scheme:
+        with pytest.raises(ValueError, match="scheme of its own"):
+            gradient("odeint_adjoint")
+    else:  # the continuous adjoint errs by O(dt)
+        assert (gradient("odeint_adjoint") - reference).norm() < 0.02 * reference.norm()
+
+
+def test_an_angle_turns_without_a_jump():
+    plant = SCHEMES["periodic"]()
+    closure = stirred(plant.make_closure(torch.Generator().manual_seed(1)))
+    low, high = (torch.tensor([[sign * torch.pi, 1.0]], dtype=torch.float64) for sign in (-1.0, 1.0))
+    action, nothing = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
+    found = [plant.residual(state, action, nothing, closure) for state in (low, high)]
+    torch.testing.assert_close(*found, rtol=0.0, atol=1e-12)
+    assert found[0][0, 1] != 0.0
+
+
+# As a hypothesis
+
+
+class Suspecting(LinearQuadratic):
+    def suspects(self):
+        return {
+            "lags": LaggedActuator(self, "force", 0.2),
+            "late, twice": DelayedActuator(self, "force", 0.2),
+            "position sensor": BiasedSensor(self, "position", 0.0, scale=0.2),
+        }
+
+    def further_suspects(self):
+        return {FORCE: pushed(self)}
+
+
+class Real(Suspecting):
+    """The oscillator with a force that its twin does not know."""
+
+    def __init__(self, force, **options):
+        super().__init__(**options)
+        self.force = force
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        field = super().vector_field(t, state, action, exogenous, closure)
+        return torch.stack([field[..., 0], field[..., 1] + self.force(*state.unbind(-1))], -1)
+
+
+FORCES = {
+    "magnets, −2 sin 2x": lambda x, v: -2.0 * torch.sin(2.0 * x),
+    "strong magnets, −3 sin 2x": lambda x, v: -3.0 * torch.sin(2.0 * x),
+    "cubic damping, −0.3 v³": lambda x, v: -0.3 * v**3,
+    "flutter, 0.8 v − 0.3 v³": lambda x, v: 0.8 * v - 0.3 * v**3,
+    "dry friction, −0.8 tanh 5v": lambda x, v: -0.8 * torch.tanh(5.0 * v),
+    "nothing": lambda x, v: 0.0 * x,
+}
+ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")
+NAMES = ("lags", "late, twice", "position sensor")
+
+
+def records(real, noise, count=3):
+    """Flights under random commands, which hold for ten intervals, as noisy sensors read them."""
+    generator = torch.Generator().manual_seed(5)
+    for _ in range(count):
+        state, exogenous = real.draw_initial_state(1, generator), torch.zeros(1, real.n_steps, 1, dtype=torch.float64)
+        held = 4.0 * torch.rand(1, real.n_steps // 10, 1, generator=generator, dtype=torch.float64) - 2.0
+        flown = Rollout(real, real.closure)(state, exogenous, held.repeat_interleave(10, 1))
+        drawn = torch.randn(flown.states[0].shape, generator=generator, dtype=torch.float64)
+        yield Trajectory(flown.states[0] + noise * drawn, flown.actions[0], exogenous[0])
+
+
+def learned(real, names, noise=0.0):
+    plant, config = Suspecting(horizon=real.horizon), HypothesesConfig(call=0.0, names=names)
+    twin = make_twin(plant, LinearClosure([[0.0, 0.0], [0.0, 0.0]]), config)
+    assimilation = make_assimilation(twin, ASSIMILATION, config)
+    assimilation.update(list(records(real, noise)), (), 1, torch.Generator())
+    return twin, assimilation.misfits
+
+
+def drawn(plant, count, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return plant.draw_initial_state(count, generator), plant.draw_exogenous(count, generator)
+
+
+def planned(twin, episodes):
+    policy = LinearGain([[1.0, 1.0]])
+    descent = torch.optim.LBFGS(policy.parameters(), max_iter=30, line_search_fn="strong_wolfe")
+
+    def cost():
+        descent.zero_grad()
+        found = twin.cost(policy, *episodes)
+        found.backward()
+        return found
+
+    descent.step(cost)
+    return policy
+
+
+def compared(force, noise=0.0):
+    """Cost of plans on unseen episodes of the real system, and the misfits, with and without the residual."""
+    real = Real(FORCES[force], horizon=10.0)
+    truth, costs, misfits = DigitalTwin(real, real.closure), {}, {}
+    episodes, unseen = drawn(real, 40, seed=1), drawn(real, 200, seed=2)
+    shares = {}
+    twins = {"optimum": (truth, {})}
+    for label, names in (("others", NAMES), ("with it", (*NAMES, FORCE))):
+        twins[label] = learned(real, names, noise)
+    twins["alone"] = twins["others"][0].twins[ALONE], {}
+    for label, (twin, found) in twins.items():
+        costs[label] = truth.cost(planned(twin, episodes), *unseen).item()
+        misfits |= found
+        shares[label] = getattr(twin, "weights", {})
+    print(f"\n{force}, noise {noise}: " + ", ".join(f"{name} {cost:.4f}" for name, cost in costs.items()))
+    print("  misfits: " + ", ".join(f"{name} {value:.2g}" for name, value in misfits.items()))
+    return costs, misfits, shares["with it"]
+
+
+def test_it_explains_a_force_that_no_other_hypothesis_explains():
+    costs, misfits, weights = compared("magnets, −2 sin 2x")
+    assert weights == {FORCE: 1.0}
+    assert misfits[FORCE] < 0.1 * min(value for name, value in misfits.items() if name != FORCE)
+    gaps = {name: cost / costs["optimum"] - 1.0 for name, cost in costs.items()}
+    assert gaps["with it"] < 0.005 and gaps["others"] > 0.02 and gaps["alone"] > 0.1
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+@pytest.mark.parametrize("force", list(FORCES)[1:])
+def test_its_plans_are_hardly_ever_worse(force, noise):
+    costs, _, weights = compared(force, noise)
+    assert costs["with it"] < 1.02 * min(costs["others"], costs["alone"])
+    assert (weights == {ALONE: 1.0}) == (force == "nothing")
+
+
+def test_noise_does_not_call_for_it_where_the_plant_is_right():
+    real = Real(FORCES["nothing"], horizon=10.0)
+    twin, misfits = learned(real, (FORCE,), noise=0.03)
+    assert twin.weights == {ALONE: 1.0} and misfits[FORCE] == pytest.approx(misfits[ALONE], rel=0.05)
+
+
+STATES = {
+    "wind_turbine": {"rotor_speed"},
+    "flapping_wing": {"forward_speed", "climb_speed"},
+    "cryogenic_tank": {"pressure"},
+}
+"""States that the residual of each shipped plant moves."""
+
+
+@pytest.mark.parametrize(
+    "plant, name", [(WindTurbine, "unknown torque"), (FlappingWing, FORCE), (CryogenicTank, "unknown heat")]
+)
+def test_shipped_plants_have_one_that_is_taken_only_by_name(plant, name):
+    plant = plant()
+    closure = plant.make_closure(torch.Generator().manual_seed(0))
+    assert name not in make_twin(plant, closure, HypothesesConfig()).twins
+    twin = make_twin(plant, closure, HypothesesConfig(names=(name,))).twins[name]
+    generator = torch.Generator().manual_seed(1)
+    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, 0]
+    low, high = (torch.tensor([getattr(a, end) for a in plant.actions]).double() for end in ("low", "high"))
+    command, t = (0.5 * (low + high)).expand(2, -1), torch.zeros(2, dtype=torch.float64)
+    steps = [p.step(t, state, command, exogenous, c).state for p, c in ((twin.plant, twin.closure), (plant, closure))]
+    assert torch.equal(*steps)
+    other = twin.plant.step(t, state, command, exogenous, stirred(twin.closure)).state
+    moved = {s.name for s, change in zip(plant.states, (other - steps[0]).abs().amax(0), strict=True) if change}
+    assert moved - set(plant.controller_states) >= STATES[plant.name]
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda base: NeuralResidual(base, {}, inputs=("force",)), r"names no state.*'position', 'velocity'"),
+        (lambda base: NeuralResidual(base, {"height": 1.0}, inputs=("force",)), r"reads a state 'height'"),
+        (lambda base: NeuralResidual(base, {"velocity": 0.0}, inputs=("force",)), r"greatest=0.0 of 'velocity'"),
+        (lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("speed",)), r"inputs=\('speed',\).*'force'"),
+        (lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=()), r"inputs=\(\)"),
+        (
+            lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("position",)),
+            r"'position' of the residual goes from -inf to inf m; give ranges=\{'position': \(low, high\)\}",
+        ),
+        (
+            lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("force",), ranges={"mass": (0.0, 1.0)}),
+            r"ranges: 'mass' are not among inputs=\('force',\)",
+        ),
+        (
+            lambda base: NeuralResidual(LaggedActuator(base, "force", 1.0), {"lagged_force": 1.0}, inputs=("force",)),
+            r"no sensor.*reads a state 'lagged_force'",
+        ),
+        (
+            lambda base: NeuralResidual(WindTurbine(), {"blade_pitch": 1.0}, inputs=("blade_pitch",)),
+            r"the controller of plant 'wind_turbine' computes 'blade_pitch'",
+        ),
+        (
+            lambda base: make_twin(base, base.closure, HypothesesConfig(names=("no, never",))),
+            r"does not suspect 'no, ne",
+        ),
+    ],
+)
+def test_what_makes_no_residual_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make(Suspecting())
+
+
+def test_names_with_commas_are_quoted():
+    with pytest.raises(ValueError, match=r"choose among 'lags', 'late, twice', 'position sensor', 'unknown force'"):
+        make_twin(Suspecting(), None, HypothesesConfig(names=("inflow",)))
