@@ -144,7 +144,8 @@ class Config:
         options = self.options(system)
         judged = int(options[options.index("--unseen") + 1])
         compute = partial(oracle, self.recipe, options, unseen=judged, **effort)
-        return Yardstick(self.kept / system / "oracle.json", compute)
+        kept = "oracle.json" if self.unseen is None else f"oracle-{judged}.json"
+        return Yardstick(self.kept / system / kept, compute)
 
     @property
     def recipe(self) -> Path:
