@@ -68,14 +68,13 @@ class Training:
         """Options of the recipe. They resume a run that was interrupted after its first episode."""
         begun = (self.folder / "checkpoint.pt").exists()
         place = ["--log-dir", str(self.folder), "--resume" if begun else "--overwrite"]
-        return ["--seed", str(self.seed), *self._of_every_seed(), *place]
+        return ["--seed", str(self.seed), *self._usual(), *place, *VARIANTS[self.variant], *self.options]
 
-    def _of_every_seed(self) -> list[str]:
+    def _usual(self) -> list[str]:
         options = ["--twinning.arm", self.arm, "--episodes", str(self.episodes)]
         # The report compares costs with the start of each seed, not with random starts.
         options += ["--figures-every", "0", "--untrained", "0", "--threads", "1"]
-        options += [] if self.figures else ["--no-figures"]
-        return [*options, *VARIANTS[self.variant], *self.options]
+        return [*options, *([] if self.figures else ["--no-figures"])]
 
     def command(self) -> str:
         """The same as a command line."""
@@ -96,7 +95,8 @@ class Training:
         """Refuse results that a page would mix with those of these options; results by hand have no options."""
         if not (self.folder / FILE).is_file():
             return
-        asked = replace(options_of(self.recipe, tuple(self._of_every_seed())), seed=self.seed)
+        of_every_seed = (*self._usual(), *VARIANTS[self.variant], *self.options)
+        asked = replace(options_of(self.recipe, of_every_seed), seed=self.seed)
         if found := differences(self.folder, asked):
             raise ValueError(
                 f"{self.folder} holds the results of other options: {'; '.join(found)}. Give the options of the run, "
