@@ -19,6 +19,7 @@ from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.learners.config import IncrementalTD3Config
@@ -291,6 +292,14 @@ def test_trust_without_a_twin_is_refused():
         learner(own={"trust": 0.5}, twin=False).update()
     with pytest.raises(ValueError, match=r"trust=1.5 in the twin must lie in \[0, 1\]"):
         learner().trust = 1.5
+
+
+def test_trust_in_an_arm_without_a_twin_is_refused_before_an_episode_is_flown():
+    taught = LearnerConfig(algorithm="incremental_td3", incremental=IncrementalTD3Config(trust=0.5))
+    with pytest.raises(ValueError, match=r"learner.incremental.trust=0.5 needs a twin, which arm='model_free' has not"):
+        TwinningConfig(arm="model_free", learner=taught)
+    for arm, learning in (("twinning", taught), ("model_free", LearnerConfig(algorithm="incremental_td3"))):
+        assert TwinningConfig(arm=arm, learner=learning).learner is learning
 
 
 def test_the_likeliest_hypothesis_teaches_with_its_hidden_states():

@@ -86,6 +86,12 @@ class TwinningConfig:
                 f"assimilation.drift={self.assimilation.drift} keeps what earlier episodes told, and would count them "
                 f"twice with records={self.records} and informative={self.informative}; use 1 and 0."
             )
+        own = self.learner.incremental
+        if self.arm == "model_free" and self.learner.algorithm == "incremental_td3" and own.trust:
+            raise ValueError(
+                f"learner.incremental.trust={own.trust} needs a twin, which arm='model_free' has not; use 0, or "
+                "arm='twinning'."
+            )
         if self.limits and self.exploration.redrawn:
             raise ValueError(
                 f"exploration.redrawn={self.exploration.redrawn} draws weights that no twin has checked; leave it at 0 "
