@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+import os
 
 import pytest
 from test_export_recipe import recipe
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.study.room import Room, room_table, write_into
+from rt_torchrl.study.room import Room, require_page, room_table, write_into
 from rt_torchrl.study.training import Training
 from rt_torchrl.study.yardsticks import Yardstick
 
@@ -35,6 +36,29 @@ def test_a_page_takes_each_table_once(tmp_path):
     assert page.read_text().startswith("# Page\n\ntext\n\n<!-- turbine -->")
     with pytest.raises(ValueError, match=r"gone\.md cannot be read"):
         write_into(tmp_path / "gone.md", "drone", "text")
+
+
+@pytest.mark.parametrize("name", ["unknown", "worth"])
+def test_a_page_that_cannot_be_written_is_refused_before_any_work(name, tmp_path, monkeypatch):
+    made, page = recipe(name), tmp_path / "pages" / "page.md"
+    options = {"plant": "wind_turbine"} if name == "unknown" else {"plants": ("wind_turbine",)}
+    config = made.Config(**options, folder=tmp_path / "kept", page=page)
+    worked = []
+    monkeypatch.setattr(made, "on_this_machine", lambda tasks, jobs: worked.append(tasks))
+    with pytest.raises(ValueError, match=r"page.md cannot be read .*; give a text that exists"):
+        made.main(config)
+    page.parent.mkdir()
+    page.write_bytes(b"\xff")
+    with pytest.raises(ValueError, match=r"page.md cannot be read .*; give a text that exists"):
+        made.main(config)
+    page.write_text("# Page\n")
+    with monkeypatch.context() as patched:  # to the superuser, who may run this, no folder is closed
+        patched.setattr(os, "access", lambda path, mode: path != page.parent)
+        with pytest.raises(ValueError, match=r"page.md cannot be written, because the folder .*pages cannot"):
+            require_page(page)
+    require_page(page)
+    require_page(None)
+    assert not worked and page.read_text() == "# Page\n"
 
 
 @pytest.mark.parametrize(
