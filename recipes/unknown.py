@@ -18,7 +18,7 @@ from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.runs.results_file import make_folder, write_results
-from rt_torchrl.study.room import Room, room_table, write_into
+from rt_torchrl.study.room import Room, require_page, room_table, write_into
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.study.yardsticks import Yardstick, oracle
@@ -144,7 +144,8 @@ class Config:
         options = self.options(system)
         judged = int(options[options.index("--unseen") + 1])
         compute = partial(oracle, self.recipe, options, unseen=judged, **effort)
-        return Yardstick(self.kept / system / "oracle.json", compute)
+        kept = "oracle.json" if self.unseen is None else f"oracle-{judged}.json"
+        return Yardstick(self.kept / system / kept, compute)
 
     @property
     def recipe(self) -> Path:
@@ -190,6 +191,7 @@ def command(config: Config) -> str:
 
 def main(config: Config) -> None:
     make_folder("folder", config.kept)
+    require_page(config.page)
     tasks = [task for system in config.rows() for task in config.tasks(system)]
     on_this_machine(tasks, config.jobs)
     rows = [row(config, system) for system in config.rows()]

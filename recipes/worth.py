@@ -21,7 +21,7 @@ from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.arms import SystemResult, classical_arms, trained_arm
 from rt_torchrl.study.results import yardstick_entry
-from rt_torchrl.study.room import write_into
+from rt_torchrl.study.room import require_page, write_into
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.study.worth import WHOLE, findings_page
@@ -289,6 +289,7 @@ def write(config: Config) -> Path:
 
 def main(config: Config) -> None:
     make_folder("folder", config.folder)
+    require_page(config.page)
     if not config.finished:
         tasks = config.tasks()
         on_this_machine(tasks, config.jobs)

@@ -1,6 +1,8 @@
 """Incremental TD3: increments, decisions, the loss and its formulas, slopes of a twin, recovery."""
 
 import copy
+import inspect
+import re
 
 import pytest
 import torch
@@ -19,9 +21,10 @@ from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.learners.config import IncrementalTD3Config
+from rt_torchrl.twinning.learners.config import IncrementalTD3Config, LongTermMemoryConfig
 from rt_torchrl.twinning.learners.episode_memory import decision_intervals
 from rt_torchrl.twinning.learners.explicit import row_function
 from rt_torchrl.twinning.learners.explicit.critic_formulas import symexp, symlog
@@ -291,6 +294,34 @@ def test_trust_without_a_twin_is_refused():
         learner(own={"trust": 0.5}, twin=False).update()
     with pytest.raises(ValueError, match=r"trust=1.5 in the twin must lie in \[0, 1\]"):
         learner().trust = 1.5
+
+
+def test_what_other_learners_read_changes_nothing_and_the_help_says_so():
+    others = {"reward_scale": 1e-3, "actor_rate": 0.5, "memory": LongTermMemoryConfig(capacity=7, prioritisation=0.1)}
+    one, other = learner(critic_iterations=30), learner(critic_iterations=30, **others)
+    for each in (one, other):
+        each.update()
+    assert_same(whole(one), whole(other))
+    said = {name: text for name, _, text in (part.partition(": ") for part in described(LearnerConfig))}
+    for name, sentence in (
+        ("reward_scale", "Incremental TD3 does not read it"),
+        ("memory", "Incremental TD3 reads none of them"),
+    ):
+        assert sentence in said[name]
+
+
+def described(config):
+    """The description of each argument, with its name."""
+    text = inspect.getdoc(config).split("Args:\n")[1]
+    return [" ".join(part.split()) for part in re.split(r"\n    (?=\w+: )", "\n" + text) if part.strip()]
+
+
+def test_trust_in_an_arm_without_a_twin_is_refused_before_an_episode_is_flown():
+    taught = LearnerConfig(algorithm="incremental_td3", incremental=IncrementalTD3Config(trust=0.5))
+    with pytest.raises(ValueError, match=r"learner.incremental.trust=0.5 needs a twin, which arm='model_free' has not"):
+        TwinningConfig(arm="model_free", learner=taught)
+    for arm, learning in (("twinning", taught), ("model_free", LearnerConfig(algorithm="incremental_td3"))):
+        assert TwinningConfig(arm=arm, learner=learning).learner is learning
 
 
 def test_the_likeliest_hypothesis_teaches_with_its_hidden_states():

@@ -214,7 +214,7 @@ def test_recipes_that_cannot_be_found_are_told(tmp_path):
 
 
 def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
-    hypotheses = dataclasses.replace(SMALL, hypotheses=HypothesesConfig(call=0.0))
+    hypotheses = dataclasses.replace(SMALL, hypotheses=HypothesesConfig(call=0.0, risk=0.25))
     options = {"compiled": False, "unseen": 3, "untrained": 0, "figures": False, "figures_every": 0}
     run = Run(RunConfig(episodes=1, log_dir=tmp_path, twinning=hypotheses, **options), Suspecting(horizon=2.0))
     run.train()
@@ -222,6 +222,12 @@ def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):
     found = load_run(tmp_path, RunConfig, plant=Suspecting(horizon=2.0)).twin
     assert isinstance(found, TwinEnsemble) and found.weights == trained.weights
     assert found.twins.keys() == trained.twins.keys() == {ALONE, "late", "lags"}
+    drawn = torch.Generator().manual_seed(0)
+    episodes = trained.plant.draw_initial_state(2, drawn), trained.plant.draw_exogenous(2, drawn)
+    for twin in (found, trained):
+        twin.weights = {ALONE: 0.5, "late": 0.5}  # the worst one counts by its risk
+    policy = run.algorithm.policies["model_based"]
+    assert found.risk == 0.25 and found.cost(policy, *episodes) == trained.cost(policy, *episodes)
     for name, twin in trained.twins.items():
         expected, its = twin.closure.state_dict(), found.twins[name].closure.state_dict()
         assert its.keys() == expected.keys() and all(torch.equal(its[key], value) for key, value in expected.items())

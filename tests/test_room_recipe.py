@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+import os
 
 import pytest
 from test_export_recipe import recipe
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.study.room import Room, room_table, write_into
+from rt_torchrl.study.room import Room, require_page, room_table, write_into
 from rt_torchrl.study.training import Training
 from rt_torchrl.study.yardsticks import Yardstick
 
@@ -37,6 +38,29 @@ def test_a_page_takes_each_table_once(tmp_path):
         write_into(tmp_path / "gone.md", "drone", "text")
 
 
+@pytest.mark.parametrize("name", ["unknown", "worth"])
+def test_a_page_that_cannot_be_written_is_refused_before_any_work(name, tmp_path, monkeypatch):
+    made, page = recipe(name), tmp_path / "pages" / "page.md"
+    options = {"plant": "wind_turbine"} if name == "unknown" else {"plants": ("wind_turbine",)}
+    config = made.Config(**options, folder=tmp_path / "kept", page=page)
+    worked = []
+    monkeypatch.setattr(made, "on_this_machine", lambda tasks, jobs: worked.append(tasks))
+    with pytest.raises(ValueError, match=r"page.md cannot be read .*; give a text that exists"):
+        made.main(config)
+    page.parent.mkdir()
+    page.write_bytes(b"\xff")
+    with pytest.raises(ValueError, match=r"page.md cannot be read .*; give a text that exists"):
+        made.main(config)
+    page.write_text("# Page\n")
+    with monkeypatch.context() as patched:  # to the superuser, who may run this, no folder is closed
+        patched.setattr(os, "access", lambda path, mode: path != page.parent)
+        with pytest.raises(ValueError, match=r"page.md cannot be written, because the folder .*pages cannot"):
+            require_page(page)
+    require_page(page)
+    require_page(None)
+    assert not worked and page.read_text() == "# Page\n"
+
+
 @pytest.mark.parametrize(
     ("options", "system", "unknown"),
     [
@@ -53,7 +77,10 @@ def test_trainings_and_optimum_are_of_the_recipe_with_the_unknown_system(options
     assert [training.seed for training in trainings] == [0, 1]
     found = from_command_line(load_recipe(config.recipe).Config, trainings[1].arguments())
     assert found.unknown == unknown and found.twinning.arm == "model_based" and found.episodes == 3
-    assert found.unseen == config.optimum(system).compute.keywords["unseen"]
+    optimum = config.optimum(system)
+    assert found.unseen == optimum.compute.keywords["unseen"]
+    # Optima of different numbers of episodes are kept apart.
+    assert optimum.path.name == ("oracle-4.json" if "--unseen" in options else "oracle.json")
 
 
 def test_a_row_is_made_of_what_is_kept(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Trainings of the study: their commands, what counts as finished, and the recipes' options for their variants."""
 
 import json
+from pathlib import Path
 
 import pytest
 import tyro
@@ -115,6 +116,27 @@ def test_a_training_that_is_interrupted_in_its_first_episode_ends_the_study(tmp_
     found = load_recipe(path)
     with pytest.raises(SystemExit, match="^interrupted before the first episode was done; nothing to report.$"):
         found.main(from_command_line(found.Config, pressed.arguments()))
+
+
+def test_results_of_other_options_are_refused(tmp_path):
+    """A page must not mix results of 3 unseen episodes with those of 4, or of two learners."""
+    kept = {"recipe": Path(__file__).with_name("small_recipe.py"), "episodes": 1}
+    found = training(tmp_path, **kept, options=("--compiled", "False", "--unseen", "3"))
+    found.run()
+    assert found.done() and training(tmp_path, **kept, options=("--unseen", "3", "--patience", "2")).done()
+    metrics = (found.folder / "metrics.json").read_bytes()
+    for options, said in (
+        (("--unseen", "4"), "unseen is 4 here and was 3 in the run"),
+        (("--twinning.learner.discount", "0.9"), "twinning.learner.discount is 0.9 here and was 0.98 in the run"),
+    ):
+        other, following = (training(tmp_path, seed, **kept, options=options) for seed in (0, 1))
+        for ask in (other.done, other.run, lambda tasks=[following, other]: on_this_machine(tasks, 1)):
+            with pytest.raises(ValueError, match=f"seed-0 holds the results of other options: {said}. Give the opt"):
+                ask()
+        assert not following.folder.exists()
+    assert (found.folder / "metrics.json").read_bytes() == metrics
+    (found.folder / "config.json").unlink()
+    assert other.done()  # results by hand
 
 
 def test_a_training_with_damaged_results_runs_again(tmp_path):

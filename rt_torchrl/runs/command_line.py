@@ -33,18 +33,35 @@ def from_command_line(config_class: type[Configuration], arguments: Sequence[str
     """The configuration that a command line asks for.
 
     The command line of a recipe is read twice, because the defaults of some options depend on other options; see
-    :meth:`RunConfig.defaults`. Options that are given stay as they are.
+    :meth:`RunConfig.defaults`. Options that are given stay as they are. The help shows the defaults that hold beside
+    the options that are given.
 
     Args:
         config_class: class of the configuration.
         arguments: words of the command line; by default those of this process.
     """
-    config = tyro.cli(config_class, args=arguments)
-    if not isinstance(config, RunConfig):
-        return config
-    defaults = config.defaults() if config.config is None else of_file(config.config, config)
+    words = sys.argv[1:] if arguments is None else arguments
+    if not issubclass(config_class, RunConfig):
+        return tyro.cli(config_class, args=words)
     # Defaults are of the class of their configuration, which run-time checks cannot read in RunConfig.
-    return tyro.cli(config_class, args=arguments, default=cast(Configuration, defaults))
+    return tyro.cli(config_class, args=words, default=cast(Configuration, _defaults(config_class, words)))
+
+
+HELP = ("-h", "--help")
+"""Words that ask for help."""
+
+
+def _defaults(config_class: type[RunConfig], words: Sequence[str]) -> RunConfig:
+    """The defaults of all options beside those that are given, with which help is asked for or not."""
+    rest = [word for word in words if word not in HELP]
+    helped = len(rest) < len(words)
+    try:
+        config = tyro.cli(config_class, args=rest, console_outputs=not helped)
+        return config.defaults() if config.config is None else of_file(config.config, config)
+    except (SystemExit, ValueError, OSError):
+        if helped:  # beside words that cannot be carried out, too
+            return config_class().defaults()
+        raise
 
 
 OF_THE_CALL = ("config", "log_dir", "resume", "overwrite")

@@ -7,6 +7,7 @@ import platform
 import shlex
 import sys
 import time
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
@@ -74,23 +75,37 @@ def require_same(folder: Path, asked: RunConfig) -> None:
     Raises:
         ValueError: if an option differs; it names each such option with both values.
     """
+    judged = flat(read_settings(folder)).get("unseen_every")
+    if found := differences(folder, asked, HARMLESS if judged else HARMLESS | {"unseen"}):
+        raise ValueError(
+            f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(found)}. Give the run's "
+            "own options, or another folder for a new run."
+        )
+
+
+def differences(folder: Path, asked: RunConfig, harmless: AbstractSet[str] = HARMLESS) -> list[str]:
+    """What differs between the options of a run and those that are asked for, in words.
+
+    Args:
+        folder: run folder.
+        asked: options as they are asked for.
+        harmless: options that may differ.
+
+    Raises:
+        ValueError: if the folder is not a run folder, or its settings are damaged.
+    """
     its = flat(read_settings(folder))
     asks = flat(as_written(asked))
     defaults = flat(as_written(type(asked)()))
-    harmless = HARMLESS | (set() if its.get("unseen_every") else {"unseen"})
     found = []
     for name in sorted(its.keys() | asks.keys()):
-        if name.split(".")[0] in harmless | set(BESIDE):
+        if name.split(".")[0] in {*harmless, *BESIDE}:
             continue
         # A run of an earlier version had, for an option that is new since then, the value that is now its default.
         was, now = its.get(name, defaults.get(name, ABSENT)), asks.get(name, ABSENT)
         if was != now:
             found.append(f"{name} is {now} here and was {was} in the run")
-    if found:
-        raise ValueError(
-            f"log_dir={folder} is to be resumed with other options than its own: {'; '.join(found)}. Give the run's "
-            "own options, or another folder for a new run."
-        )
+    return found
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """How much a policy could cost less than one that is planned on a twin which does not know the real system."""
 
+import os
 import re
 import statistics
 from collections.abc import Sequence
@@ -88,6 +89,26 @@ def room_table(rows: Sequence[Room]) -> str:
 
     header = [*HEADER, *HELPED] if any(row.helped for row in rows) else HEADER
     return table(header, [row.cells() for row in rows])
+
+
+def require_page(page: Path | None) -> None:
+    """Refuse a page that :func:`write_into` could not write, before the work whose findings it is to hold.
+
+    Args:
+        page: page; None for no page.
+
+    Raises:
+        ValueError: if the page cannot be read, or its folder cannot be written.
+    """
+    if page is None:
+        return
+    try:
+        page.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"page={page} cannot be read ({error}); give a text that exists.") from error
+    folder = page.absolute().parent  # in which the new page takes the place of the old one
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"page={page} cannot be written, because the folder {folder} cannot; choose another page.")
 
 
 def write_into(page: Path, title: str, text: str) -> None:

@@ -1,12 +1,16 @@
 """One training of the study, as the command of its recipe."""
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from rt_torchrl.interruption import Interrupted
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.run_settings import differences
+from rt_torchrl.runs.settings import FILE
 from rt_torchrl.study.json_file import read_json
 from rt_torchrl.twinning.config import Arm
 
@@ -63,27 +67,47 @@ class Training:
     def arguments(self) -> list[str]:
         """Options of the recipe. They resume a run that was interrupted after its first episode."""
         begun = (self.folder / "checkpoint.pt").exists()
-        options = ["--seed", str(self.seed), "--twinning.arm", self.arm, "--log-dir", str(self.folder)]
-        options += ["--episodes", str(self.episodes)]
+        place = ["--log-dir", str(self.folder), "--resume" if begun else "--overwrite"]
+        return ["--seed", str(self.seed), *self._usual(), *place, *VARIANTS[self.variant], *self.options]
+
+    def _usual(self) -> list[str]:
+        options = ["--twinning.arm", self.arm, "--episodes", str(self.episodes)]
         # The report compares costs with the start of each seed, not with random starts.
         options += ["--figures-every", "0", "--untrained", "0", "--threads", "1"]
-        options += ["--resume" if begun else "--overwrite"]
-        options += [] if self.figures else ["--no-figures"]
-        return [*options, *VARIANTS[self.variant], *self.options]
+        return [*options, *([] if self.figures else ["--no-figures"])]
 
     def command(self) -> str:
         """The same as a command line."""
         return " ".join(["uv run", str(self.recipe), *self.arguments()])
 
     def done(self) -> bool:
-        """Whether the results of all episodes are there, and the figures if it draws them."""
-        drawn = not self.figures or (self.folder / "figures" / "unseen.png").exists()
-        return drawn and self._results() is not None
+        """Whether the results of all episodes are there, and the figures if it draws them.
+
+        Raises:
+            ValueError: if the results are those of other options.
+        """
+        if self._results() is None:
+            return False
+        self._require_own_options()
+        return not self.figures or (self.folder / "figures" / "unseen.png").exists()
+
+    def _require_own_options(self) -> None:
+        """Refuse results that a page would mix with those of these options; results by hand have no options."""
+        if not (self.folder / FILE).is_file():
+            return
+        of_every_seed = (*self._usual(), *VARIANTS[self.variant], *self.options)
+        asked = replace(options_of(self.recipe, of_every_seed), seed=self.seed)
+        if found := differences(self.folder, asked):
+            raise ValueError(
+                f"{self.folder} holds the results of other options: {'; '.join(found)}. Give the options of the run, "
+                "or another folder; the training of a folder that you remove is made again."
+            )
 
     def run(self) -> None:
         """Train, unless the results are there. ``training.log`` in the folder takes what the recipe prints.
 
         Raises:
+            ValueError: if the results are there and are those of other options.
             RuntimeError: if the recipe fails, with what it said, or ends without the results of all episodes.
             KeyboardInterrupt: if Ctrl-C or SIGTERM ended the training before its last episode.
         """
@@ -134,3 +158,9 @@ class Training:
         found = read_json(self.folder / "metrics.json") or {}
         sound = isinstance(found.get("summary"), dict) and isinstance(found.get("episodes"), list)
         return found if sound else None
+
+
+@cache
+def options_of(recipe: Path, arguments: tuple[str, ...]) -> RunConfig:
+    """The configuration of a recipe's command line, which takes some tenths of a second to read."""
+    return from_command_line(load_recipe(recipe).Config, arguments)

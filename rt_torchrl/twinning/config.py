@@ -89,11 +89,20 @@ class TwinningConfig:
                 f"assimilation.drift={self.assimilation.drift} keeps what earlier episodes told, and would count them "
                 f"twice with records={self.records} and informative={self.informative}; use 1 and 0."
             )
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
         whole = self.planner.method in (None, "whole_episodes") and not self.planner.short_horizon.window
         if self.corrected_descents and not (self.corrected_plans and whole):
             raise ValueError(
                 "corrected_descents=True needs corrected_plans=True, and plans over whole episodes: leave "
                 "planner.method and short_horizon.window as they are, or leave it out."
+            )
+        own = self.learner.incremental
+        if self.arm == "model_free" and self.learner.algorithm == "incremental_td3" and own.trust:
+            raise ValueError(
+                f"learner.incremental.trust={own.trust} needs a twin, which arm='model_free' has not; use 0, or "
+                "arm='twinning'."
             )
         if self.limits and self.exploration.redrawn:
             raise ValueError(

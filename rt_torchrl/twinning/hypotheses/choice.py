@@ -24,7 +24,9 @@ def make_twin(
     engine: Engine = "native",
     compiled: bool = False,
 ) -> DigitalTwin:
-    """The twin of a plant, with the hypotheses that a configuration asks for; each begins with a copy of the closure.
+    """The twin of a plant, with the hypotheses and the risk that a configuration asks for.
+
+    Each hypothesis begins with a copy of the closure.
 
     A configuration that names none takes all suspects of the plant; one that names some may name further ones, too.
 
@@ -45,7 +47,9 @@ def make_twin(
         return DigitalTwin(plant, closure, engine=engine, compiled=compiled)
     device = next((w.device for w in closure.parameters()), torch.device("cpu"))
     closures = {name: extended(suspect, copy.deepcopy(closure)).to(device) for name, suspect in taken.items()}
-    return TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
+    twin = TwinEnsemble(plant, closure, taken, closures, engine=engine, compiled=compiled)
+    twin.risk = config.risk
+    return twin
 
 
 def extended(suspect: Plant, closure: nn.Module) -> nn.Module:

@@ -11,11 +11,11 @@ LearnerName = Literal["ddpg", "td3", "incremental_td3"]
 
 @dataclass(frozen=True, kw_only=True)
 class LongTermMemoryConfig:
-    """Parameters of D_L.
+    """Parameters of D_L, which incremental TD3 has not.
 
     Args:
-        capacity: number n_L of transitions that the memory keeps.
-        prioritisation: exponent α* of the sampling probability; 0 samples uniformly.
+        capacity: number n_L of transitions that the memory keeps; incremental TD3 keeps whole episodes instead.
+        prioritisation: exponent α* of the sampling probability; 0 samples uniformly, as incremental TD3 always does.
         correction: exponent of the importance weights; 1 removes the bias of the prioritised sampling.
         offset: number tol that is added to every |δ|.
     """
@@ -70,7 +70,7 @@ class IncrementalTD3Config:
         actor_episodes: number of latest real episodes in whose states the policy is improved.
         return_episodes: number of latest real episodes whose targets sum ``return_steps`` rewards; those of older ones,
             which other policies flew, sum the rewards of a single decision.
-        episodes: number of latest real episodes that are kept.
+        episodes: number of latest real episodes that are kept, in the place of the other learners' long-term memory.
         actor_rate: learning rate of the policy (Adam), which takes the place of that of the other learners.
         cooling: number of updates after which the policy's learning rate is half as large, as 1/(1 + updates/cooling);
             infinity keeps it. A restart begins anew.
@@ -136,14 +136,16 @@ class LearnerConfig:
             Where a control interval is short beside the dynamics, one action matters less than the critic's error; a
             sum over more intervals mends that.
         reward_scale: factor on the rewards that the critic learns from. A value is about the mean reward over 1 − γ;
-            scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled.
+            scaled to the order of ten, a perceptron reaches it within an episode. Reports are unscaled. Incremental TD3
+            does not read it, because it counts rewards in the mean cost of the cheapest episode.
         target_rate: rate τ at which the target critic, and TD3's target policy, follow; those of incremental TD3 follow
             faster where few iterations would not carry values through the horizon.
         critic_rate: learning rate of the critic (Adam).
         actor_rate: learning rate of the policy (Adam).
         gradient_limit: greatest norm of the policy's gradient; infinity does not limit it.
         critic_hidden: widths of the critic's hidden layers.
-        memory: parameters of the long-term memory D_L.
+        memory: parameters of the long-term memory D_L of DDPG and TD3. Incremental TD3 reads none of them, and keeps
+            ``incremental.episodes`` whole episodes instead.
         td3: parameters of TD3 that DDPG does not have.
         incremental: parameters of incremental TD3 that the other learners do not have.
         update: way to compute an update: ``explicit`` for gradients by formula, several times as fast, or ``torchrl``
