@@ -342,4 +342,4 @@ def test_what_makes_no_residual_is_refused(make, message):
 
 def test_names_with_commas_are_quoted():
     with pytest.raises(ValueError, match=r"choose among 'lags', 'late, twice', 'position sensor', 'unknown force'"):
-        make_twin(Suspecting(), None, HypothesesConfig(names=("inflow",)))
+        make_twin(Suspecting(), LinearClosure([[0.0, 0.0], [0.0, 0.0]]), HypothesesConfig(names=("inflow",)))
