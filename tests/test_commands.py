@@ -111,6 +111,7 @@ def test_checks_that_are_printed_are_what_ci_runs():
     assert any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
     rest = [command for command in commands() if command not in OF_A_RECIPE]
     known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow", "uv run pytest -m nightly"}
+    known |= {'uv run pytest tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run quadrotor.py", "uv run heated_room.py"}  # tests/test_own_plants.py
     known |= {"uv run pytest -m faults", "uv run --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
     assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs", BUILD}

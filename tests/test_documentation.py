@@ -13,7 +13,14 @@ from printed_commands import ROOT, TEXTS, blocks
 from test_export_recipe import leave_run
 
 import rt_torchrl
+from rt_torchrl import check_plant
 from rt_torchrl.atomic_file import write_json
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import ALONE
 
 RUN_HERE = ["finished_run.md", "gallery.md", "habits.md", "hypotheses.md", "unknown_systems.md"]
 
@@ -47,12 +54,39 @@ def test_the_code_of_a_finished_run_runs(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "states.png").exists() and (tmp_path / "learning.png").exists()
 
 
-def test_the_suspects_of_the_tutorial_plant_are_plants():
+def tutorial_with_suspects():
+    """What the plant of the tutorial and the page of hypotheses define."""
     scope = {"__name__": "tutorial"}
     exec(compile(blocks("own_plant.md", "python")[0], "docs/own_plant.md", "exec"), scope)
     exec(compile("\n".join(blocks("hypotheses.md", "python")), "docs/hypotheses.md", "exec"), scope)
+    return scope
+
+
+def test_the_suspects_of_the_tutorial_plant_are_plants():
+    scope = tutorial_with_suspects()
     found = scope["Tank"]().suspects()
     assert list(found) == ["pump lags", "pump late"] and all(len(plant.states) > 2 for plant in found.values())
+    assert list(scope["LeakyTank"]().suspects()) == [*found, "leaks"]
+    tank = scope["SuspiciousTank"]()
+    twin = make_twin(tank, tank.closure, HypothesesConfig(names=("unknown flow", "pump lags")))
+    assert set(twin.twins) == {ALONE, "unknown flow", "pump lags"}
+
+
+def test_the_extension_of_the_documentation_finds_a_leak():
+    scope = tutorial_with_suspects()
+    real, tank = scope["Leak"](scope["TwoTanks"](), 4e-3), scope["LeakyTank"]()
+    check_plant(tank.suspects()["leaks"], steps=10, traced=False)
+    generator = torch.Generator().manual_seed(0)
+    commands = 2e-4 * torch.rand(1, tank.n_steps, 1, generator=generator, dtype=torch.float64)
+    drawn = real.draw_initial_state(1, generator), real.draw_exogenous(1, generator)
+    record = [part[0] for part in Rollout(real, real.closure)(*drawn, commands)[:3]]
+    config = HypothesesConfig(call=0.0, names=("leaks", "pump lags"))
+    twin = make_twin(tank, tank.make_closure(generator), config)
+    fit = AssimilationConfig(method="levenberg_marquardt", inputs="record")
+    make_assimilation(twin, fit, config).update([Trajectory(*record)], (), 1, generator)
+    found = twin.twins["leaks"].closure.named_coefficients()
+    assert twin.weights == {"leaks": 1.0} and found["leak"].item() == pytest.approx(4e-3, rel=1e-3)
+    assert found["lower_outlet"].item() == pytest.approx(4e-5, rel=1e-2)
 
 
 def test_the_real_turbine_has_what_its_twin_does_not_know():

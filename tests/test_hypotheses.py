@@ -283,7 +283,7 @@ def test_hypotheses_are_chosen_by_name():
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: ensemble(PLANT, names=("inflow",)), r"does not suspect inflow; choose among late, lags"),
+        (lambda: ensemble(PLANT, names=("inflow",)), r"does not suspect 'inflow'; choose among 'late', 'lags'"),
         (lambda: HypothesesConfig(which="none", names=("late",)), r"which='automatic'"),
         (lambda: HypothesesConfig(call=float("nan")), r"call=nan"),
         (lambda: HypothesesConfig(prior=0.0), r"prior=0.0"),

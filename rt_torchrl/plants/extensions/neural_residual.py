@@ -68,8 +68,6 @@ class NeuralResidual(Extension):
             or empty, or a state is computed by the controller or read by no sensor.
     """
 
-    placed: Tensor
-
     def __init__(
         self,
         base: Plant,
@@ -92,11 +90,8 @@ class NeuralResidual(Extension):
         super().__init__(base, [], own.requires_grad_(False))
         self.own_scheme, self._whole = base.own_scheme, type(base).advance is Plant.advance
         self._seen = signals
-        names = [state.name for state in base.states]
-        placed = torch.zeros(len(bounds), len(names), dtype=torch.float64)
-        for k, name in enumerate(greatest):
-            placed[k, names.index(name)] = 1.0
-        self.register_buffer("placed", placed)
+        names = list(greatest)
+        self._rates = [names.index(s.name) if s.name in names else None for s in base.states]
 
     def residual(
         self,
@@ -115,7 +110,8 @@ class NeuralResidual(Extension):
                 features += [torch.cos(phase), torch.sin(phase)]
             else:
                 features.append(value)
-        return closure.get_submodule("own")(torch.stack(features, -1)) @ self.placed
+        rates, zero = closure.get_submodule("own")(torch.stack(features, -1)), torch.zeros_like(state[..., 0])
+        return torch.stack([zero if k is None else rates[..., k] for k in self._rates], -1)
 
     def vector_field(
         self,
