@@ -13,6 +13,7 @@ from torch.utils._pytree import tree_leaves
 
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.plants.increments import Increments, greatest_increments
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
@@ -68,7 +69,17 @@ def test_real_system_short_horizon_and_td3(train):
     assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
 
 
-@pytest.mark.parametrize("update", ["explicit", pytest.param("torchrl", marks=pytest.mark.slow)])
+def test_increments_are_asked_of_a_plant_elsewhere():
+    with pretend_device() as device:
+        plant = WindTurbine(horizon=5.0)
+        expected = greatest_increments(plant).tolist()
+        found = greatest_increments(plant.to(device))
+        assert found.device == device and found.tolist() == expected
+        assert all(part.device == device for part in Increments(plant, device=device).buffers())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("update", ["explicit", "torchrl"])
 def test_incremental_td3_with_a_twin_that_teaches(train, update):
     learner = dataclasses.replace(INCREMENTAL, update=update)
     assert not train("pendulum", horizon=0.5, twinning={"learner": learner})

@@ -216,13 +216,13 @@ def with_all_parts(folder, episodes, **options):
 
 
 def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, monkeypatch):
-    whole = with_all_parts(tmp_path / "whole", 4)
+    whole = with_all_parts(tmp_path / "whole", 3)
     started = [weight.clone() for weight in whole.algorithm.policies["model_free"].parameters()]
     found = whole.train()
-    interrupted_in(2, monkeypatch)
-    assert len(with_all_parts(tmp_path / "parts", 4).train()["episodes"]) == 2
+    interrupted_in(1, monkeypatch)
+    assert len(with_all_parts(tmp_path / "parts", 3).train()["episodes"]) == 1
     monkeypatch.undo()
-    resumed = with_all_parts(tmp_path / "parts", 4, resume=True)
+    resumed = with_all_parts(tmp_path / "parts", 3, resume=True)
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
     assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].pause > 1
     assert resumed.algorithm.learner.trust not in (0.0, 1.0)  # it was measured
