@@ -34,6 +34,9 @@ def clone(tmp_path_factory):
         shutil.copy(ROOT / name, folder / name)
     for name in ("rt_torchrl", "envs", "recipes"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "docs").mkdir()
+    for page in (ROOT / "docs").glob("*.md"):  # some commands write their findings into a page
+        shutil.copy(page, folder / "docs" / page.name)
     return folder
 
 

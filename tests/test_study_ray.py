@@ -30,8 +30,9 @@ TRAIN = f"""
     from small_runs import small_run
     options = dict(seed=config.seed, overwrite=config.overwrite, resume=config.resume, untrained=0)
     small_run(config.log_dir, config.episodes, **options).train()
+    (config.log_dir / "config.json").unlink()
 """
-"""Main of a recipe that trains for seconds, and says in which processes."""
+"""Main of a recipe that trains for seconds, and says in which processes; its options are not those of the recipe."""
 
 
 @pytest.fixture(scope="module")
