@@ -89,8 +89,8 @@ def main(config: Config) -> None:
     run = load_run(config.run, config.recipe or beside)
     policy = run.policy(config.role)
     if isinstance(policy, StateFeedback) and {"policy", "controller"} & set(config.what):
-        beside = run.twin.hypothesis
-        model = "the model that it plans on" if beside is None else f"the twin with {beside}, on which it does not plan"
+        name = run.twin.hypothesis
+        model = "the model that it plans on" if name is None else f"the twin with {name}, on which it does not plan"
         raise ValueError(
             f"role={config.role!r} of this run plans its actions by model predictive control and cannot be exported. "
             f"Export the model-free policy, which has learned from its records: --role model_free; or --what twin, "

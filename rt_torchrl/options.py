@@ -5,7 +5,7 @@ import math
 import numbers
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -188,6 +188,11 @@ def array_of(name: str, values: Any) -> np.ndarray:
         return found.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} must be an array of numbers: {error}.") from error
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Names in quotes, because some contain commas."""
+    return ", ".join(repr(name) for name in names)
 
 
 def _is(value: Any, kind: type) -> bool:

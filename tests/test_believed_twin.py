@@ -11,7 +11,6 @@ from test_export_recipe import recipe
 from test_hypotheses import PLANT, Suspecting, ensemble
 
 from rt_torchrl import Run, control_cost, export_twin, load_run
-from rt_torchrl.figures.snapshot import replayed
 from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
@@ -128,7 +127,7 @@ def test_figures_replay_the_likeliest(run):
         read.exogenous,
         lambda k, t, s, w: read.actions[k],
     )
-    torch.testing.assert_close(replayed(run.twin, read), expected[:, :2], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(run.twin.replayed(read), expected[:, :2], rtol=1e-9, atol=1e-9)
 
 
 @needs_compiler

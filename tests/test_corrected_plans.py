@@ -7,9 +7,10 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from test_algorithm import twinning
+from test_evidence import Content
 from torch import nn
 
-from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
@@ -83,19 +84,8 @@ class Planner:
     state_dict = load_state_dict = restart
 
 
-class Uncorrected:
+class Uncorrected(Content):
     """A planner of one's own, which knows nothing of corrections."""
-
-    def __init__(self, policy):
-        self.policy = policy
-
-    def plan(self, episodes):
-        return Descended(1.0, 1.0, 0.0, 0)
-
-    def refuse(self):
-        pass
-
-    restart = state_dict = load_state_dict = refuse
 
 
 def judge_of(gains, differences):

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
@@ -68,17 +67,8 @@ class Snapshot:
             policies=algorithm.policies,
             live=algorithm.referee.live,
             record=record,
-            replay=replayed(twin, record),
+            replay=twin.replayed(record),
             large_scale=None if process is None else process.mean[:n],
             realisations=None if process is None else process.sample(5, generator)[:, :n],
             episodes=episodes,
         )
-
-
-@torch.no_grad()
-def replayed(twin: DigitalTwin, record: Trajectory) -> Float[Tensor, "samples n_s"]:
-    """States of the believed twin with a record's actions and exogenous input, as sensors read them."""
-    believed = twin.believed
-    begins = believed.plant.at_rest(record.states[:1])
-    flown = believed.replay(begins, record.exogenous[None], record.actions[None], start=record.start)
-    return flown.states[0, :, : record.states.shape[-1]]

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.optimisers.norm import norm_of
+
 
 def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], limit: float) -> Float[Tensor, ""]:
     r"""The mean of costs, with a limit for the gradient of each.
@@ -34,7 +36,7 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
     each = [torch.autograd.grad(cost, weights, retain_graph=True, materialize_grads=True) for cost in costs]
     slopes = [torch.stack(parts) for parts in zip(*each, strict=True)]
     norms = torch.stack([part.reshape(len(costs), -1).norm(dim=1) for part in slopes]).norm(dim=0)
-    allowed = limit * costs.detach().abs() / norm_of(weights)
+    allowed = limit * costs.detach().abs() / norm_of([weight.detach() for weight in weights])
     # A cost of zero says nothing about what is long.
     shares = torch.where((norms > allowed) & (allowed > 0.0), allowed / norms, 1.0)
     found = costs.detach().mean()
@@ -42,8 +44,3 @@ def limited_mean(costs: Float[Tensor, " episodes"], weights: Iterable[Tensor], l
         slope = torch.tensordot(shares, part, 1) / len(costs)
         found = found + ((weight - weight.detach()) * slope).sum()
     return found
-
-
-def norm_of(weights: Iterable[Tensor]) -> Float[Tensor, ""]:
-    """The norm of all weights together."""
-    return torch.stack([weight.detach().norm() for weight in weights]).norm()

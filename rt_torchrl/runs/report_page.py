@@ -137,8 +137,7 @@ def plots_of(run: LoadedRun, metrics: dict[str, Any]) -> "list[tuple[str, str, g
     live = run.live
     record = flown[live]
     read = run.physics.at_rest(record.states[..., : len(run.plant.readings)])
-    with torch.no_grad():
-        replay = run.twin.replay(read[:1], record.exogenous[None], record.actions[None]).states[0]
+    replay = run.twin.replayed(record._replace(states=read))
     found = [
         ("Cost", "What each real episode cost, by who acted, beside the twin's view of both policies.", costs(metrics)),
         ("Cost on unseen episodes", "A box for each controller, over the same episodes.", boxes(metrics)),

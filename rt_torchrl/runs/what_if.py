@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
-from rt_torchrl.figures.snapshot import Snapshot, replayed
+from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -119,7 +119,7 @@ def snapshot_of(run: "LoadedRun", flown: Trajectory | None) -> Snapshot:
     record = simulate(run, run.policy(live), None, None, on="real", seed=UNSEEN_SEED) if flown is None else flown
     record = record if record.states.dim() == 2 else record.each()[0]
     read = record._replace(states=run.physics.at_rest(record.states[..., : len(run.plant.readings)]))
-    replay = replayed(run.twin, read)
+    replay = run.twin.replayed(read)
     process, signals = None, run.physics.acting_inputs
     if run.config.twinning.arm != "model_free" and signals:
         acted = read.exogenous[:, : len(signals)]

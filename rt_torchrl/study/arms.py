@@ -1,6 +1,5 @@
 """Arms on systems that the twin knows and on others: what they cost, what learning has paid, and when alarms rose."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,12 +9,11 @@ from jaxtyping import Float
 from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.results import Entry, arm_entry
 from rt_torchrl.study.training import Training
+from rt_torchrl.twinning.evidence import alarm
 from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 
 MATTERS = 0.1
 """Gap over the oracle from which an alarm is missed if it does not rise."""
-MUCH = math.log(1.0 + MATTERS)
-"""Paired difference from which the twin is wrong about a policy."""
 SETTLED = 5
 """Number of first episodes in which no alarm is missed."""
 NO_WORTH = 0.02
@@ -143,9 +141,10 @@ def trained_arm(name: str, trainings: Sequence[Training]) -> Arm:
     alarms = [[bool(one["alarm"]) for one in seed] for seed in found] if watched else []
     # An episode too short for the test has no whiteness.
     correlated = [[one.get("whiteness", 1.0) < SIGNIFICANT for one in seed] for seed in found] if watched else []
-    off = [[abs(one.get("paired_difference", 0.0)) > MUCH for one in seed] for seed in found] if watched else []
+    differences = [[one.get("paired_difference", 0.0) for one in seed] for seed in found] if watched else []
+    wrong = [[abs(d) > alarm.MATTERS for d in seed] for seed in differences]
     entry = arm_entry(name, list(trainings))
-    return Arm(entry=entry, paid=paid, alarms=alarms, correlated=correlated, wrong=off)
+    return Arm(entry=entry, paid=paid, alarms=alarms, correlated=correlated, wrong=wrong)
 
 
 def classical_arms(training: Training) -> list[Arm]:

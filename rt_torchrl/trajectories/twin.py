@@ -4,6 +4,7 @@ import copy
 from operator import is_
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -60,6 +61,14 @@ class DigitalTwin:
     ) -> Trajectory:
         """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
         return self._replay(initial_state, exogenous, actions, start=start)
+
+    @torch.no_grad()
+    def replayed(self, record: Trajectory) -> Float[Tensor, "samples n_s"]:
+        """States of the believed twin with the actions and inputs of a whole record, as sensors read them."""
+        believed = self.believed
+        begins = believed.plant.at_rest(record.states[:1])
+        flown = believed.replay(begins, record.exogenous[None], record.actions[None], start=record.start)
+        return flown.states[0, :, : record.states.shape[-1]]
 
     def control(
         self,

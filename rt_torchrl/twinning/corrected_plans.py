@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.paired_differences import REACH
@@ -120,9 +120,10 @@ class CorrectedPlans:
                 go(policy, weights, origin, way, judge.shares)
             cost = self.virtual.price(policy, episodes).item() * judge.factor(policy).item()
             found.append((cost, parameters_to_vector(weights).clone()))
-        vector_to_parameters(min(found, key=lambda each: each[0])[1], weights)
+        place(min(found, key=lambda each: each[0])[1], weights)
 
 
+@torch.no_grad()
 def go(
     policy: nn.Module,
     weights: list[nn.Parameter],
@@ -139,12 +140,18 @@ def go(
         way: direction.
         shares: function that gives the actions of a policy, in shares of half their ranges.
     """
-    vector_to_parameters(origin, weights)
+    place(origin, weights)
     first, distance = shares(policy), 1e-3
     for _ in range(STEPS):
-        vector_to_parameters(origin + distance * way, weights)
+        place(origin + distance * way, weights)
         moved = (shares(policy) - first).square().mean().sqrt().item()
         if abs(moved / REACH - 1.0) < NEAR:
             break
         # Actions that saturate move little at first, and then all at once.
         distance *= min(10.0, max(0.1, REACH / moved)) if moved > 0.0 else 10.0
+
+
+def place(values: Tensor, weights: list[nn.Parameter]) -> None:
+    """Give weights these values; in place, because ``vector_to_parameters`` would make them views of one vector."""
+    for weight, part in zip(weights, values.split([w.numel() for w in weights]), strict=True):
+        weight.copy_(part.view_as(weight))

@@ -131,13 +131,11 @@ class Differences(NamedTuple):
     exploration: list[float]
     flown: Sequence[Flown] = ()
 
-    def learned(self, plant: Plant, record: Trajectory, **options: float) -> PairedDifferences:
-        """The belief about all policies, compared in the observations of a record, with these options of it."""
+    def learned(self, plant: Plant, record: Trajectory) -> PairedDifferences:
+        """The belief about all policies, which are compared in the observations of a record."""
         actions = [shares(policy, plant, record) for policy in self.policies]
         stacked = torch.stack(actions) if actions else record.states.new_empty(0, 1)
-        return PairedDifferences(
-            stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration), **options
-        )
+        return PairedDifferences(stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration))
 
 
 def shares(policy: nn.Module, plant: Plant, record: Trajectory) -> Float[Tensor, " m"]:

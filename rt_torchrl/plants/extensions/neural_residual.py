@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.options import quoted
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.extensions.extension import Extension, OwnParameters
 from rt_torchrl.plants.innermost import innermost
@@ -82,7 +83,7 @@ class NeuralResidual(Extension):
         signals, given = _signals(base, inputs), dict(ranges or {})
         spare = [name for name in given if name not in inputs]
         if spare:
-            raise ValueError(f"ranges: {_quoted(spare)} are not among inputs={tuple(inputs)}; leave them out.")
+            raise ValueError(f"ranges: {quoted(spare)} are not among inputs={tuple(inputs)}; leave them out.")
         scaled: list[Range] = []
         for name, (_, signal) in zip(inputs, signals, strict=True):
             scaled += _scaled(signal, given.get(name))
@@ -144,25 +145,21 @@ class NeuralResidual(Extension):
         return pushed(self.base.advance(t, pushed(state), applied, exogenous, self.of_base(closure)))
 
 
-def _quoted(names: Sequence[str]) -> str:
-    return ", ".join(repr(name) for name in names)
-
-
 def _bounds(base: Plant, greatest: Mapping[str, float]) -> list[float]:
     """Greatest residual of each state that has one [state unit / s]."""
     names, inner = [state.name for state in base.readings], innermost(base)
     sizes = dict(zip((state.name for state in inner.states), inner.state_sizes, strict=False))
     if not greatest:
-        raise ValueError(f"greatest names no state of plant {base.name!r}; choose some of {_quoted(names)}.")
+        raise ValueError(f"greatest names no state of plant {base.name!r}; choose some of {quoted(names)}.")
     for name, value in greatest.items():
         if name not in names:
             raise ValueError(
-                f"greatest: no sensor of plant {base.name!r} reads a state {name!r}; choose some of {_quoted(names)}."
+                f"greatest: no sensor of plant {base.name!r} reads a state {name!r}; choose some of {quoted(names)}."
             )
         if name in base.controller_states:
             raise ValueError(
                 f"greatest: the controller of plant {base.name!r} computes {name!r}, and knows it exactly; choose "
-                f"another of {_quoted(names)}."
+                f"another of {quoted(names)}."
             )
         if not 0.0 < value < math.inf:
             raise ValueError(f"greatest={value} of {name!r} must be positive and finite, in sizes per second.")
@@ -178,7 +175,7 @@ def _signals(base: Plant, inputs: Sequence[str]) -> list[tuple[int, Signal]]:
     if missing or not inputs or len(set(inputs)) < len(inputs):
         raise ValueError(
             f"inputs={tuple(inputs)} of the residual must name signals of plant {base.name!r}, each once; choose some "
-            f"of {_quoted(list(known))}."
+            f"of {quoted(list(known))}."
         )
     return [known[name] for name in inputs]
 

@@ -81,14 +81,13 @@ class Examination:
 
     def _white(self) -> float:
         """Whiteness of what the replay of the latest real episode leaves over, by the likeliest twin."""
-        record, twin = self.track_record.latest_record, self.virtual.twin.believed
-        start = twin.plant.at_rest(record.states[:1])
+        record = self.track_record.latest_record
         try:
-            flown = twin.replay(start, record.exogenous[None], record.actions[None], start=record.start)
+            replay = self.virtual.twin.replayed(record)
         except DivergenceError:
             return 0.0
         read = record.states[1:]
-        return whiteness(flown.states[0, 1:, : read.shape[-1]] - read, read)
+        return whiteness(replay[1:] - read, read)
 
     def explained(self, assimilation: Assimilation, generator: torch.Generator) -> TensorDict:
         """As :meth:`examine`, once step 4 has sought what explains the difference."""

@@ -73,7 +73,7 @@ class PairedDifferences:
             )
         self.actions = actions.detach()
         self.differences = differences.detach().clamp(least, LARGEST)
-        self.noise = noise
+        self.exploration, self.noise = exploration, noise
         covariance = self._kernel(self.actions) + torch.diag(noise**2 + (EXPLORED * exploration) ** 2)
         self._root = torch.linalg.cholesky(covariance)
         self._weights = torch.cholesky_solve(self.differences.unsqueeze(-1), self._root)

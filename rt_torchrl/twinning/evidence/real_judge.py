@@ -57,8 +57,9 @@ class RealJudge:
     @cached_property
     def limited(self) -> PairedDifferences:
         """The belief that follows from paired differences of at least ``LEAST``, with the likeliest noise."""
-        plant = self.virtual.twin.plant
-        found = [self.differences.learned(plant, self.record, least=LEAST, noise=noise) for noise in NOISES]
+        known = self.learned
+        flights = (known.actions, known.differences, known.exploration)
+        found = [PairedDifferences(*flights, least=LEAST, noise=noise) for noise in NOISES]
         return max(found, key=lambda one: one.log_likelihood() - 0.5 * math.log2(one.noise / NOISE) ** 2)
 
     def factor(self, policy: nn.Module) -> Tensor:

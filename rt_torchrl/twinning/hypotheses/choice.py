@@ -5,6 +5,7 @@ import copy
 import torch
 from torch import nn
 
+from rt_torchrl.options import quoted
 from rt_torchrl.plants.extensions.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine
@@ -12,7 +13,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble, quoted
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.sensor_assimilation import SensorAssimilation
 
 

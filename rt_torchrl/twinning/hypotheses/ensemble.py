@@ -1,12 +1,13 @@
 """Several twins side by side: the twin itself, and one for each hypothesis of what the real system has beside it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.options import quoted
 from rt_torchrl.plants.extensions.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine
@@ -15,11 +16,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 
 ALONE = "as the twin"
 """Name of the hypothesis that the real system has nothing beside its twin."""
-
-
-def quoted(names: Iterable[str]) -> str:
-    """Names of hypotheses in quotes, because some contain commas."""
-    return ", ".join(repr(name) for name in names)
 
 
 class TwinEnsemble(DigitalTwin):

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent
-from rt_torchrl.optimisers.limited_mean import limited_mean, norm_of
+from rt_torchrl.optimisers.limited_mean import limited_mean
+from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints import Constraints
@@ -52,7 +53,7 @@ class WholeEpisodes:
 
     def _stalled(self, found: Descended, limit: float) -> bool:
         """Whether a descent gained nothing although its first gradient is longer than the limit."""
-        size = norm_of(w for w in self.policy.parameters() if w.requires_grad).item()
+        size = norm_of([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
         gained = found.start - found.best > NOTHING * abs(found.start)
         return not gained and found.gradient * size > limit * abs(found.start)
 

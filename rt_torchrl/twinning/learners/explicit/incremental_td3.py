@@ -9,9 +9,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.twinning.learners.explicit.adam import AdamSteps
 from rt_torchrl.twinning.learners.explicit.critic_formulas import RescaledAscent
-from rt_torchrl.twinning.learners.explicit.iterations import TINY, norm_of
+from rt_torchrl.twinning.learners.explicit.iterations import TINY
 from rt_torchrl.twinning.learners.explicit.policy import differentiable
 from rt_torchrl.twinning.learners.explicit.row_function import RowFunction
 from rt_torchrl.twinning.learners.explicit.slope_formulas import REACH, SlopeDifferences

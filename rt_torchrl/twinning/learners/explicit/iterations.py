@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.twinning.learners.actor_critic import ActorCritic
 from rt_torchrl.twinning.learners.explicit.adam import AdamSteps
 from rt_torchrl.twinning.learners.explicit.critic_formulas import Ascent
@@ -118,9 +119,3 @@ class ExplicitIterations(ABC):
         torch._foreach_mul_(gradients, (self.config.gradient_limit / (norm + TINY)).clamp_(max=1.0))
         self._actor_adam.step(weights, gradients)
         return value.sum(), norm
-
-
-def norm_of(parts: list[Tensor]) -> Tensor:
-    """The norm of a vector in parts."""
-    norms = torch._foreach_norm(parts)
-    return norms[0] if len(norms) == 1 else torch.linalg.vector_norm(torch.stack(norms))
