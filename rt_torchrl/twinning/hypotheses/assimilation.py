@@ -34,10 +34,8 @@ LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
 HELD = 0.1
 """Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one."""
-MORE = 3.0
-"""Ratio of misfits of two episodes beyond which one round has not been enough."""
 FAR = 10.0
-"""Ratio of misfits beyond which a stage has gone astray."""
+"""Ratio of misfits beyond which a stage has gone astray, or the weights of the last episode have."""
 
 
 class Fit:
@@ -69,20 +67,34 @@ class Fit:
             "whole": Assimilation(twin, measured),
         }
         self.least, self.waiting, self.pause = math.inf, 0, 1
+        self._first = copy.deepcopy(twin.closure.state_dict())
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        """Fit the records, in more rounds the first time, and where one round leaves more over than the last time.
+        """Fit the records, in more rounds the first time.
+
+        Where much more is left over than the last time, the fit also begins anew from the first weights: those of the
+        last episode may explode on these records, and no step leads back from there.
 
         Returns:
             The misfit of the best weights, which the closure has then.
         """
         rounds = FIRST_ROUNDS if math.isinf(self.least) else 1
         least = self._rounds(records, rounds, generator)
-        if rounds == 1 and not least < MORE * self.least:
-            least = self._rounds(records, FIRST_ROUNDS, generator)
+        if rounds == 1 and not least < FAR * self.least:
+            least = self._anew(records, least, generator)
         self.least = least
         return least
+
+    def _anew(self, records: Sequence[Trajectory], least: float, generator: torch.Generator) -> float:
+        """Fit from the first weights; the present ones stay unless their misfit is greater."""
+        closure = self.twin.closure
+        present = copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(self._first)
+        found = self._rounds(records, FIRST_ROUNDS, generator)
+        if not found < least:
+            closure.load_state_dict(present)
+        return min(found, least)
 
     def _rounds(self, records: Sequence[Trajectory], count: int, generator: torch.Generator) -> float:
         """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
@@ -91,7 +103,7 @@ class Fit:
         self._hold(least)
         taken = {"short": [reread(record, plant, self.segment) for record in records]}
         taken["whole"] = [at_rest(record, plant) for record in records]
-        for name in count * list(self.stages):
+        for name in count * list(self.stages) if count > 1 else ["short"]:
             safe_point()
             steps = STEPS
             # A twin that diverges on the way only loses the stage.
