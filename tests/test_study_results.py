@@ -40,3 +40,8 @@ def test_differences_are_paired_by_episode():
 def test_a_closure_of_another_kind_has_no_weight_error():
     assert weight_error({"found": {"a": 1.0}, "true": {"c1": 2.0}}) is None
     assert weight_error({"found": {"a": 1.0}, "true": None}) is None
+
+
+def test_weights_that_the_real_system_has_beside_those_of_the_closure_count_for_nothing():
+    """Such as the offset of a sensor, of which the plant's own closure knows nothing."""
+    assert weight_error({"found": {"a": 1.1}, "true": {"a": 1.0, "pressure_offset": 15e3}}) == pytest.approx(0.1)
