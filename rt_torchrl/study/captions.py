@@ -137,7 +137,9 @@ def of_run(plant: str, metrics: dict[str, Any]) -> dict[str, str]:
     """
     found = RUN | PLANT[plant]
     found["learning_curves"] += " " + events(metrics)
-    found["states"] += f" J_p is {metrics['episodes'][-1]['J_p']:.2g} over the records in memory."
+    J_p = metrics["episodes"][-1]["J_p"]
+    error = "The twin diverges on" if J_p is None else f"J_p is {J_p:.2g} over"
+    found["states"] += f" {error} the records in memory."
     found["unseen"] += " " + cheaper(metrics)
     for name in CLOSURES:
         if name in found:

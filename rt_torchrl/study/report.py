@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import markdown
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from rt_torchrl.atomic_file import finite
 from rt_torchrl.study.names import shown, title
 from rt_torchrl.study.results import HALVES, Entry, Results, difference, named
 from rt_torchrl.study.tables import nominal_table, paper_table, variant_table
@@ -66,7 +67,7 @@ def write(
     source, page = folder / "README.md", folder / "report.html"
     source.write_text(text)
     page.write_text(templates.get_template("report.html.jinja").render(body=body))
-    (folder / "study.json").write_text(json.dumps(numbers(results, made["unknown"]), indent=2) + "\n")
+    (folder / "study.json").write_text(json.dumps(finite(numbers(results, made["unknown"])), indent=2) + "\n")
     return source, page
 
 
