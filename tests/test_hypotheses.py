@@ -360,3 +360,24 @@ def test_options_are_those_of_the_algorithm(which, tmp_path):
     if which == "automatic":
         assert list(algorithm.twin.twins) == [ALONE, "late"] and algorithm.twin.risk == 0.1
         assert algorithm.assimilation.hypotheses == hypotheses and not algorithm.assimilation.called
+
+
+@pytest.mark.slow
+def test_a_run_shows_the_twin_that_is_believed(tmp_path, capsys):
+    """In the metrics of each episode, on the dashboard and on the terminal."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    known = Suspecting(horizon=4.0)
+    twinning = dataclasses.replace(
+        SMALL, arm="model_based", assimilation=ASSIMILATION, hypotheses=HypothesesConfig(call=0.0, names=("lags",))
+    )
+    options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
+    run = Run(RunConfig(log_dir=tmp_path, **options), LaggedActuator(known, "force", LAG), believed=known)
+    (episode,) = run.train()["episodes"]
+    lagged, record = run.algorithm.twin.twins["lags"], run.algorithm.short_term[-1]
+    assert episode["believed"] == "lags" and episode["closure"] == named_weights(lagged.closure.base)
+    assert episode["J_p"] == pytest.approx(whole_cost(lagged, record), rel=1e-6)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.value for event in events.Scalars("twin/J_p after assimilation")] == pytest.approx([episode["J_p"]])
+    assert events.Tensors("believed/text_summary")[0].tensor_proto.string_val == [b"lags"]
+    assert "episode 1: the twin with 'lags' is the likeliest" in capsys.readouterr().out
