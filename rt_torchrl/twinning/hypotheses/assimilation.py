@@ -127,6 +127,10 @@ class Fit:
         for stage in self.stages.values() if self._held and math.isfinite(least) else ():
             stage.prior.stiffness = HELD * least
 
+    def cost(self, records: Sequence[Trajectory]) -> float:
+        """J_p of whole records under their measured inputs; infinite if the twin diverges on them."""
+        return self.stages["whole"].cost_of(batch_of([at_rest(record, self.twin.plant) for record in records]))
+
     def due(self) -> bool:
         """Whether the fit is due, which a hopeless hypothesis is in ever fewer episodes."""
         self.waiting -= 1
@@ -171,6 +175,7 @@ class EnsembleAssimilation(Assimilation):
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call
         self._records: Sequence[Trajectory] = ()
+        self._before: float | None = None
 
     def update(
         self,
@@ -179,7 +184,8 @@ class EnsembleAssimilation(Assimilation):
         count: int,
         generator: torch.Generator,
     ) -> Descended:
-        """As :meth:`Assimilation.update`, whose report is that of the twin alone, and fit the hypotheses if called."""
+        """As :meth:`Assimilation.update`, whose result is that of the twin alone, and fit the hypotheses if called."""
+        self._before = self._believed_cost(records) if self.ensemble.hypothesis else None
         found = super().update(records, processes, count, generator)
         self._records = records
         if self.called:
@@ -217,10 +223,25 @@ class EnsembleAssimilation(Assimilation):
     def _misfit(self, fit: "Fit", records: Sequence[Trajectory], generator: torch.Generator) -> float:
         return fit.update(records, generator) if fit.due() else misfit(fit.twin, records, self.segment)
 
-    def report(self) -> dict[str, float]:
-        """The weight and the misfit of every hypothesis."""
-        shares = {f"hypothesis/{name}": self.ensemble.weights.get(name, 0.0) for name in self.ensemble.twins}
-        return shares | {f"misfit/{name}": value for name, value in self.misfits.items()}
+    def _believed_cost(self, records: Sequence[Trajectory]) -> float:
+        """J_p of the likeliest hypothesis, which is not the twin alone, over whole records."""
+        return self.fits[self.ensemble.likeliest].cost(records)
+
+    def report(self) -> dict[str, float | str]:
+        """The weight and the misfit of every hypothesis, and what is said of the twin where a hypothesis is believed.
+
+        ``J_p`` is then that of the likeliest hypothesis, whose name is ``believed``, over the records of the last
+        update; ``J_p_before`` is that of the one that was the likeliest before, as it was then.
+        """
+        found: dict[str, float | str] = {}
+        for name in self.ensemble.twins:
+            found[f"hypothesis/{name}"] = self.ensemble.weights.get(name, 0.0)
+        found |= {f"misfit/{name}": value for name, value in self.misfits.items()}
+        if self._before is not None:
+            found["J_p_before"] = self._before
+        if self.ensemble.hypothesis is not None and self._records:
+            found |= {"J_p": self._believed_cost(self._records), "believed": self.ensemble.hypothesis}
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
