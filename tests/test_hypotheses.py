@@ -21,7 +21,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.hypotheses.assimilation import FIRST_ROUNDS, EnsembleAssimilation, evidence, misfit
+from rt_torchrl.twinning.hypotheses.assimilation import AGAIN, FIRST, EnsembleAssimilation, evidence, misfit
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -100,16 +100,47 @@ def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_state
     torch.testing.assert_close(flown[:, 2], hidden.states[:, 2], rtol=1e-12, atol=1e-12)
 
 
-def test_a_hypothesis_that_suddenly_leaves_more_over_is_fitted_in_more_rounds():
-    real = LaggedActuator(PLANT, "force", LAG)
-    twin, assimilation = fitted(real, PLANT)
-    fit, (record, _) = assimilation.fits["lags"], recorded(real)
-    rounds, run = [], fit._rounds
-    fit._rounds = lambda records, count, generator: rounds.append(count) or run(records, count, generator)
-    fit.update([record], torch.Generator())
+def watched(fit):
+    """The stages of every run of a fit."""
+    stages, run = [], fit._run
+    fit._run = lambda records, names, generator: stages.append(names) or run(records, names, generator)
+    return stages
+
+
+def test_a_hypothesis_whose_weights_explode_on_a_record_is_fitted_anew():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    (record, _), fit, least = recorded(LaggedActuator(PLANT, "force", LAG)), assimilation.fits["lags"], 1e-3
+    fit.least, stages = least, watched(fit)
+    with torch.no_grad():
+        fit.twin.closure.base.matrix.fill_(300.0)
+    assert 1e50 < misfit(fit.twin, [record], fit.segment) < float("inf")
+    found = fit.update([record], torch.Generator())
+    assert stages == [AGAIN, FIRST]
+    assert found == fit.least == misfit(fit.twin, [record], fit.segment) < least
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_what_a_fit_anew_has_found_stays_if_it_is_better(better):
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    fit = assimilation.fits["lags"]
+    costs = {AGAIN: 100.0, FIRST: 50.0 if better else 200.0}
+
+    def run(records, names, generator):
+        fit.twin.closure.base.matrix.data.fill_(costs[names])
+        return costs[names], False
+
+    fit._run, fit.least = run, 1.0
+    assert fit.update([], torch.Generator()) == (50.0 if better else 100.0)
+    assert (fit.twin.closure.base.matrix == (50.0 if better else 100.0)).all()
+
+
+def test_a_fit_that_has_arrived_goes_over_segments_once_and_not_anew():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    (record, _), fit = recorded(LaggedActuator(PLANT, "force", LAG)), assimilation.fits["lags"]
+    stages = watched(fit)
     fit.least *= 1e-9
     fit.update([record], torch.Generator())
-    assert rounds == [1, 1, FIRST_ROUNDS]
+    assert stages == [AGAIN]
 
 
 def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():

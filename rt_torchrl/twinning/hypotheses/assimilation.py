@@ -24,10 +24,12 @@ from rt_torchrl.twinning.hypotheses.reread import Reread, at_rest, reread
 
 SEGMENTS = 60
 """Number of segments of an episode by default."""
-FIRST_ROUNDS = 3
-"""Greatest number of rounds of the first fit."""
+FIRST = 3 * ("short", "whole")
+"""Stages of the first fit: steps over segments, and over whole records."""
+AGAIN = ("short",)
+"""Stages of every further fit, in which whole records have hardly ever found more."""
 STEPS = 10
-"""Greatest number of Levenberg-Marquardt steps over segments in a round."""
+"""Greatest number of Levenberg-Marquardt steps over segments in a stage."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 LONGEST_PAUSE = 8
@@ -39,7 +41,7 @@ FAR = 10.0
 
 
 class Fit:
-    """The fit of one hypothesis: rounds of steps over segments, then over whole records; the best weights stay.
+    """The fit of one hypothesis: steps over segments, at first in turns with whole records; the best weights stay.
 
     Over a whole record of a system that oscillates nearly every weight has local minima. Over segments that begin with
     what was read (multiple shooting) it has few; the hidden states go on through all segments, with their derivatives.
@@ -71,17 +73,17 @@ class Fit:
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        """Fit the records, in more rounds the first time.
+        """Fit the records: by both stages in turn the first time, by steps over segments from then on.
 
-        Where much more is left over than the last time, the fit also begins anew from the first weights: those of the
-        last episode may explode on these records, and no step leads back from there.
+        Where these have not arrived, and much more is left over than the last time, the fit also begins anew from the
+        first weights: those of the last episode may explode on these records, and no step leads back from there.
 
         Returns:
             The misfit of the best weights, which the closure has then.
         """
-        rounds = FIRST_ROUNDS if math.isinf(self.least) else 1
-        least = self._rounds(records, rounds, generator)
-        if rounds == 1 and not least < FAR * self.least:
+        first = math.isinf(self.least)
+        least, arrived = self._run(records, FIRST if first else AGAIN, generator)
+        if not (first or arrived or least < FAR * self.least):
             least = self._anew(records, least, generator)
         self.least = least
         return least
@@ -91,19 +93,26 @@ class Fit:
         closure = self.twin.closure
         present = copy.deepcopy(closure.state_dict())
         closure.load_state_dict(self._first)
-        found = self._rounds(records, FIRST_ROUNDS, generator)
+        found, _ = self._run(records, FIRST, generator)
         if not found < least:
             closure.load_state_dict(present)
         return min(found, least)
 
-    def _rounds(self, records: Sequence[Trajectory], count: int, generator: torch.Generator) -> float:
-        """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
+    def _run(
+        self, records: Sequence[Trajectory], stages: Sequence[str], generator: torch.Generator
+    ) -> tuple[float, bool]:
+        """Go through stages until steps over segments have arrived.
+
+        Returns:
+            The misfit of the best weights, which the closure has then, and whether the steps have arrived.
+        """
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
         self._hold(least)
         taken = {"short": [reread(record, plant, self.segment) for record in records]}
         taken["whole"] = [at_rest(record, plant) for record in records]
-        for name in count * list(self.stages) if count > 1 else ["short"]:
+        arrived = False
+        for name in stages:
             safe_point()
             steps = STEPS
             # A twin that diverges on the way only loses the stage.
@@ -114,10 +123,11 @@ class Fit:
                 least, best = found, copy.deepcopy(closure.state_dict())
             elif not found < FAR * least:
                 closure.load_state_dict(best)
-            if name == "short" and steps < STEPS:
+            arrived = name == "short" and steps < STEPS
+            if arrived:
                 break
         closure.load_state_dict(best)
-        return least
+        return least, arrived
 
     def _hold(self, least: float) -> None:
         """Hold the weights of a neural residual by a prior whose unit is the present misfit; see ``HELD``.
