@@ -15,8 +15,11 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import ClassicalController, main_of
+from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
+from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.wind_turbine import unknown as turbines
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
 from rt_torchrl.study import captions
@@ -25,6 +28,7 @@ from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.task import Task
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
+from rt_torchrl.study.unknown import by_plant
 from rt_torchrl.study.yardsticks import (
     Yardstick,
     classical,
@@ -45,6 +49,8 @@ CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "flapping_wing": {"PD": TrimmedPD},
     "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
 }
+SYSTEMS = {"wind_turbine": turbines.SYSTEMS, "flapping_wing": drones.SYSTEMS, "cryogenic_tank": tanks.SYSTEMS}
+"""What the real system of each plant may have beside its twin, by name."""
 OWN_POLICY: dict[str, tuple[str, ...]] = {
     "wind_turbine": ("--start", "random", "--policy", "paper"),
     "flapping_wing": ("--start", "random", "--policy", "paper"),
@@ -91,6 +97,9 @@ class Config:
     Args:
         plants: all, or some of wind_turbine, flapping_wing, cryogenic_tank.
         seeds: number of trainings of every arm.
+        unknown: what the real systems have beside their twins, as names of --unknown of the plants' recipes. A name
+            counts for every plant that has it, and each plant needs one. Model error, another real system, is then left
+            out. The results lie in folders of their own.
         variant_seeds: number of trainings of every arm under each sensor noise and model error; 0 leaves them out.
         jobs: number of trainings side by side, one thread each; 0 means one for every core of the machine or cluster.
         backend: loky trains on this machine; ray trains on a Ray cluster and needs the extra ``ray``.
@@ -104,6 +113,7 @@ class Config:
     """
 
     plants: tuple[str, ...] = ("all",)
+    unknown: tuple[str, ...] = ()
     seeds: int = 5
     variant_seeds: int = 1
     jobs: int = 0
@@ -123,15 +133,37 @@ class Config:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least {least}.")
         if self.limit_episodes not in (0, *range(2, self.unseen + 1)):
             raise ValueError(f"limit_episodes={self.limit_episodes} must be 0, or from 2 to unseen={self.unseen}.")
+        self.beside()
 
     def chosen(self) -> list[str]:
         """Names of the plants."""
         return list(CONTROLLERS) if "all" in self.plants else list(self.plants)
 
+    def beside(self) -> dict[str, tuple[str, ...]]:
+        """What the real system of each plant has beside its twin, by names."""
+        return by_plant(self.unknown, {plant: SYSTEMS[plant] for plant in self.chosen()})
+
     @property
     def kept(self) -> Path:
         """Folder of the results; short trainings have their own, or the whole study would take theirs for its own."""
         return self.folder / "quick" if self.quick else self.folder
+
+    def kept_of(self, plant: str, kind: str) -> Path:
+        """Folder of the runs or yardsticks of a plant; each real system has its own."""
+        return self.kept / kind / "+".join((plant, *self.beside()[plant]))
+
+    @property
+    def report(self) -> Path:
+        """Folder of the report; the same names in another order give the same one."""
+        names = sorted({name for of_plant in self.beside().values() for name in of_plant})
+        return self.kept / "unknown" / "+".join(names) if names else self.kept
+
+    def variants(self) -> list[str]:
+        """Variants that are trained beside the nominal one."""
+        if not self.variant_seeds:
+            return []
+        left_out = ("nominal", *((CHANGED,) if self.unknown else ()))
+        return [variant for variant in (QUICK_VARIANTS if self.quick else VARIANTS) if variant not in left_out]
 
     def policies(self, plant: str) -> dict[str, tuple[str, ...]]:
         """Policies that twinning trains beside the plant's own, as options of its recipe."""
@@ -145,12 +177,13 @@ class Config:
     def options_of(self, plant: str) -> tuple[str, ...]:
         """Further options of every training of a plant."""
         size = ("--quick", "--horizon", str(SHORT[plant])) if self.quick else ("--unseen", str(self.unseen))
-        return (*OWN_POLICY[plant], *size)
+        names = self.beside()[plant]
+        return (*OWN_POLICY[plant], *size, *(("--unknown", *names) if names else ()))
 
     def trainings(self, plant: str) -> dict[tuple[str, str], list[Training]]:
         """Trainings of a plant by variant and arm, each a list over the seeds."""
         seeds, others = (1, min(self.variant_seeds, 1)) if self.quick else (self.seeds, self.variant_seeds)
-        base = self.kept / "runs" / plant
+        base = self.kept_of(plant, "runs")
 
         def every(arm: str, variant: str, count: int, *further: str, folder: str = "") -> list[Training]:
             place = base / (folder or variant.replace(" ", "-").replace("%", "percent")) / arm
@@ -165,18 +198,15 @@ class Config:
             found["nominal", name] = every(
                 "twinning", "nominal", seeds, *policy, folder="-".join(policy[:2]).strip("-")
             )
-        if not others:
-            return found
-        harder = QUICK_VARIANTS if self.quick else [variant for variant in VARIANTS if variant != "nominal"]
-        return found | {(variant, arm): every(arm, variant, others) for variant in harder for arm in ARMS}
+        return found | {(variant, arm): every(arm, variant, others) for variant in self.variants() for arm in ARMS}
 
     def yardsticks(self, plant: str) -> dict[str, Yardstick]:
         """The oracle and the classical controllers of a plant."""
-        place = self.kept / "yardsticks" / plant
+        place = self.kept_of(plant, "yardsticks")
         unseen = QUICK_UNSEEN if self.quick else self.unseen
         starts, iterations, evaluations, episodes = (1, 5, 5, 3) if self.quick else (4, 40, 80, 20)
         best = {"unseen": unseen, "starts": starts, "iterations": iterations, "polish": 5 if self.quick else 20}
-        tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations}
+        tuned = {"unseen": unseen, "episodes": episodes, "evaluations": evaluations, "changed": not self.unknown}
         system = recipe_of(plant), ("--episodes", str(self.episodes_of(plant)), *self.options_of(plant))
         found = {"oracle": partial(oracle, *system, **best)}
         found |= {name: partial(classical, *system, kind, **tuned) for name, kind in CONTROLLERS[plant].items()}
@@ -192,7 +222,7 @@ class Config:
         found = {"limit": partial(least_cost, *system, **size, iterations=iterations)}
         if plans(*system):
             found["mpc"] = partial(predictive_control, *system, **size)
-        place = self.kept / "yardsticks" / plant
+        place = self.kept_of(plant, "yardsticks")
         return {name: Yardstick(place / f"{name}-{count}.json", compute) for name, compute in found.items()}
 
     def line(self, plant: str) -> Yardstick | None:
@@ -207,7 +237,7 @@ class Config:
         name, compute = lines[plant]
         unseen = QUICK_UNSEEN if self.quick else self.unseen
         compute = partial(compute, recipe_of(plant), self.options_of(plant), unseen=unseen)
-        return Yardstick(self.kept / "yardsticks" / plant / f"{name}.json", compute)
+        return Yardstick(self.kept_of(plant, "yardsticks") / f"{name}.json", compute)
 
 
 def recipe_of(plant: str) -> Path:
@@ -264,9 +294,8 @@ def entries_of(config: Config, plant: str) -> list[Entry]:
 def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
     """Entries of every arm under every variant; the model error has the classical controllers too."""
     trainings = config.trainings(plant)
-    variants = dict.fromkeys(variant for variant, _ in trainings if variant != "nominal")
-    found = {variant: [arm_entry(arm, trainings[variant, arm]) for arm in ARMS] for variant in variants}
-    if found:
+    found = {variant: [arm_entry(arm, trainings[variant, arm]) for arm in ARMS] for variant in config.variants()}
+    if CHANGED in found:
         tasks = {name: config.yardsticks(plant)[name] for name in CONTROLLERS[plant]}
         found[CHANGED] += [yardstick_entry(name, task.run()["changed"]) for name, task in tasks.items()]
     return found
@@ -289,13 +318,14 @@ def draw(config: Config, results: Results) -> list["CaptionedFigure"]:
     from rt_torchrl.study.report import CaptionedFigure
 
     place = Path("figures")
-    folder = config.kept / place
+    folder = config.report / place
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
     if config.limit_episodes:
         drawn["limits"] = charts.limits(results.entries, results.limits)
-    if config.variant_seeds:
+    if config.variants():
         drawn["variants"] = charts.variants(results.entries, results.variants)
+    if CHANGED in config.variants():
         drawn["following"] = charts.following(results.entries, results.variants)
     texts = {name: captions.STUDY[name](results) for name in drawn}
     for plant in config.chosen():
@@ -322,12 +352,13 @@ def write(config: Config) -> Path:
 
     results = gather(config)
     figures = draw(config, results)
-    return report.write(config.kept, results, figures=figures, quick=config.quick, command=command(config))[1]
+    made = {"quick": config.quick, "command": command(config), "unknown": config.beside()}
+    return report.write(config.report, results, figures=figures, **made)[1]
 
 
 def command(config: Config) -> str:
     """The command line that makes this report."""
-    plants = " ".join(config.plants)
+    plants = " ".join([*config.plants, *(("--unknown", *config.unknown) if config.unknown else ())])
     size = f"--seeds {config.seeds} --variant-seeds {config.variant_seeds} --unseen {config.unseen}"
     limits = "" if config.limit_episodes == 8 else f" --limit-episodes {config.limit_episodes}"
     return f"uv run recipes/study.py --plants {plants} {'--quick' if config.quick else size}{limits}"
@@ -335,6 +366,8 @@ def command(config: Config) -> str:
 
 def main(config: Config) -> None:
     importlib.import_module("rt_torchrl.study.report")  # a package that it lacks is missed now, not after the trainings
+    if config.unknown and config.variant_seeds:
+        print(f"{CHANGED} is left out: with it the real systems are others than with --unknown.", flush=True)
     compute(config)
     print(f"report in {write(config)}")
 

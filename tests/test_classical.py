@@ -13,6 +13,7 @@ from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOn
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
+from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import ROLES, judge
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -96,6 +97,17 @@ def test_tuning_finds_the_riccati_gain():
     flown = controller.fly(state, exogenous)
     assert control_cost(plant, flown).mean().item() == pytest.approx(found.best, rel=1e-12)
     # The simplex ends within 1 % of each gain; the cost is flat beyond that.
+    assert controller.log_gains.tolist() == pytest.approx(best.log_gains.tolist(), abs=0.05)
+
+
+def test_a_controller_is_tuned_on_the_system_that_it_flies():
+    """Half of what is asked for acts on the real system, so that the Riccati gain is asked for twice."""
+    plant = LinearQuadratic(noise=0.0, horizon=15.0)
+    real = ScaledActuator(plant, "force", 0.5)
+    state, exogenous = episodes(plant, size=0.1)
+    twice = tuple(2.0 * gain for gain in optimal_gain(1.0)[0].tolist())
+    controller, best = PD(plant), PD(plant, twice)
+    tune(controller, state, exogenous, evaluations=120, plant=real)
     assert controller.log_gains.tolist() == pytest.approx(best.log_gains.tolist(), abs=0.05)
 
 

@@ -8,7 +8,10 @@ import torch
 from tensordict import TensorDict
 from test_algorithm import twinning, weights
 
+from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.findings import EpisodeReport
 from rt_torchrl.twinning.referees import RefereeConfig
 
 
@@ -127,8 +130,15 @@ def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch
     assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
 
 
-def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record():
-    found = twinning()
+METHODS = [
+    AssimilationConfig(iterations=2, descent=DescentConfig(rate=0.01)),
+    AssimilationConfig(iterations=2, method="levenberg_marquardt"),
+]
+
+
+@pytest.mark.parametrize("assimilation", METHODS, ids=lambda one: one.method)
+def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record(assimilation):
+    found = twinning(assimilation=assimilation)
     found.episode()
     first = found.assimilation._first
     with torch.no_grad():
@@ -138,6 +148,20 @@ def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record():
     assert report["J_p_before"].isinf() and report["J_p"].isfinite()
     assert all(weight.abs().max() < 10.0 for weight in found.twin.closure.parameters())
     assert all(weight.isfinite().all() for weight in first.values())
+
+
+@pytest.mark.parametrize("assimilation", METHODS, ids=lambda one: one.method)
+def test_a_twin_that_diverges_under_its_first_closure_too_says_so_and_keeps_what_it_has(assimilation):
+    found = twinning(assimilation=assimilation)
+    found.episode()
+    with torch.no_grad():
+        for weight in found.twin.closure.parameters():
+            weight.fill_(1e3)
+    found.assimilation._first = {name: torch.full_like(w, 1e4) for name, w in found.assimilation._first.items()}
+    report = found.assimilate()
+    assert report["J_p_before"].isinf() and report["J_p"].isinf()
+    assert all((weight == 1e3).all() for weight in found.twin.closure.parameters())
+    assert "twin: J_p diverges, diverges before assimilation" in repr(EpisodeReport(report))
 
 
 def test_a_twin_goes_back_to_its_first_closure_if_the_earlier_one_diverges_too(monkeypatch):

@@ -7,11 +7,12 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL
 
+from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.extension import ExtendedClosure
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.runs.results import hypotheses_of
-from rt_torchrl.runs.results_table import hypothesis_lines
+from rt_torchrl.runs.results import hypotheses_of, twin_entries
+from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -20,7 +21,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.hypotheses.assimilation import FIRST_ROUNDS, EnsembleAssimilation, evidence, misfit
+from rt_torchrl.twinning.hypotheses.assimilation import AGAIN, FIRST, EnsembleAssimilation, evidence, misfit
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -99,16 +100,47 @@ def test_a_plant_is_read_again_where_a_segment_begins_and_keeps_its_hidden_state
     torch.testing.assert_close(flown[:, 2], hidden.states[:, 2], rtol=1e-12, atol=1e-12)
 
 
-def test_a_hypothesis_that_suddenly_leaves_more_over_is_fitted_in_more_rounds():
-    real = LaggedActuator(PLANT, "force", LAG)
-    twin, assimilation = fitted(real, PLANT)
-    fit, (record, _) = assimilation.fits["lags"], recorded(real)
-    rounds, run = [], fit._rounds
-    fit._rounds = lambda records, count, generator: rounds.append(count) or run(records, count, generator)
-    fit.update([record], torch.Generator())
+def watched(fit):
+    """The stages of every run of a fit."""
+    stages, run = [], fit._run
+    fit._run = lambda records, names, generator: stages.append(names) or run(records, names, generator)
+    return stages
+
+
+def test_a_hypothesis_whose_weights_explode_on_a_record_is_fitted_anew():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    (record, _), fit, least = recorded(LaggedActuator(PLANT, "force", LAG)), assimilation.fits["lags"], 1e-3
+    fit.least, stages = least, watched(fit)
+    with torch.no_grad():
+        fit.twin.closure.base.matrix.fill_(300.0)
+    assert 1e20 < misfit(fit.twin, [record], fit.segment) < float("inf")
+    found = fit.update([record], torch.Generator())
+    assert stages == [AGAIN, FIRST]
+    assert found == fit.least == misfit(fit.twin, [record], fit.segment) < least
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_what_a_fit_anew_has_found_stays_if_it_is_better(better):
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    fit = assimilation.fits["lags"]
+    costs = {AGAIN: 100.0, FIRST: 50.0 if better else 200.0}
+
+    def run(records, names, generator):
+        fit.twin.closure.base.matrix.data.fill_(costs[names])
+        return costs[names], False
+
+    fit._run, fit.least = run, 1.0
+    assert fit.update([], torch.Generator()) == (50.0 if better else 100.0)
+    assert (fit.twin.closure.base.matrix == (50.0 if better else 100.0)).all()
+
+
+def test_a_fit_that_has_arrived_goes_over_segments_once_and_not_anew():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    (record, _), fit = recorded(LaggedActuator(PLANT, "force", LAG)), assimilation.fits["lags"]
+    stages = watched(fit)
     fit.least *= 1e-9
     fit.update([record], torch.Generator())
-    assert rounds == [1, 1, FIRST_ROUNDS]
+    assert stages == [AGAIN]
 
 
 def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
@@ -121,6 +153,53 @@ def test_the_hypothesis_that_is_right_finds_its_parameter_and_takes_over():
     report = assimilation.report()
     assert report["hypothesis/lags"] == 1.0 and report["misfit/lags"] < 1e-3 * report[f"misfit/{ALONE}"]
     assert "'lags' explains the records best" in twin.explanation()
+
+
+def whole_cost(twin, record):
+    """J_p of a whole record, summed here over its samples."""
+    start = twin.plant.at_rest(record.states[:1])
+    flown = Rollout(twin.plant, twin.closure)(start, record.exogenous[None], record.actions[None])
+    read = flown.states[0, 1:, : record.states.shape[-1]]
+    return (PLANT.dt * PLANT.discrepancy(read, record.states[1:])).sum().item()
+
+
+def test_an_episode_reports_the_twin_that_is_believed():
+    """J_p before is that of the closure that was believed before the fit, on the record that it has not seen."""
+    real, generator = LaggedActuator(PLANT, "force", LAG), torch.Generator()
+    (record, _), shorter = recorded(real), recorded(real, steps=50)[0]
+    twin, assimilation = ensemble(PLANT)
+    found = assimilation.update([shorter], (), 1, generator)
+    first, lagged = assimilation.report(), twin.twins["lags"]
+    assert first["believed"] == "lags" and "J_p_before" not in first  # which is that of the twin alone
+    assert first["J_p"] == pytest.approx(whole_cost(lagged, shorter)) and first["J_p"] < 1e-3 * found.best
+    with torch.no_grad():
+        for weight in lagged.closure.own.parameters():
+            weight.add_(0.5)
+    expected = whole_cost(lagged, record)
+    alone = assimilation.update([record], (), 1, generator)
+    second = assimilation.report()
+    assert second["J_p_before"] == pytest.approx(expected) and expected != pytest.approx(alone.start, rel=0.1)
+    assert second["J_p"] == pytest.approx(whole_cost(lagged, record)) and second["J_p"] < 1e-3 * expected
+    entries = twin_entries(twin)
+    assert entries["believed"] == "lags" and entries["closure"] == named_weights(lagged.closure.base)
+    assert entries["closure"] != named_weights(twin.closure)
+
+
+def test_a_believed_twin_that_diverges_on_the_records_says_so():
+    twin, assimilation = fitted(LaggedActuator(PLANT, "force", LAG), PLANT)
+    with torch.no_grad():
+        twin.twins["lags"].closure.base.matrix.fill_(1e3)
+    report = assimilation.report()
+    assert report["believed"] == "lags" and report["J_p"] == float("inf")
+    record = {"episode": 0, "real_cost": 1.0, "live": "model_based", "J_a_model_based": float("nan"), **report}
+    assert progress(record).startswith("J_p diverges, J_a mb not computed, real 1,")
+
+
+def test_a_twin_alone_is_reported_as_it_always_was():
+    twin, assimilation = fitted(PLANT, PLANT)
+    twin.weights = {ALONE: 1.0}
+    assert not {"believed", "J_p", "J_p_before"} & assimilation.report().keys()
+    assert twin_entries(twin) == {"closure": named_weights(twin.closure), "believed": None}
 
 
 def test_a_system_that_is_as_the_twin_keeps_the_twin_alone_or_adds_nothing():
@@ -312,3 +391,24 @@ def test_options_are_those_of_the_algorithm(which, tmp_path):
     if which == "automatic":
         assert list(algorithm.twin.twins) == [ALONE, "late"] and algorithm.twin.risk == 0.1
         assert algorithm.assimilation.hypotheses == hypotheses and not algorithm.assimilation.called
+
+
+@pytest.mark.slow
+def test_a_run_shows_the_twin_that_is_believed(tmp_path, capsys):
+    """In the metrics of each episode, on the dashboard and on the terminal."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    known = Suspecting(horizon=4.0)
+    twinning = dataclasses.replace(
+        SMALL, arm="model_based", assimilation=ASSIMILATION, hypotheses=HypothesesConfig(call=0.0, names=("lags",))
+    )
+    options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
+    run = Run(RunConfig(log_dir=tmp_path, **options), LaggedActuator(known, "force", LAG), believed=known)
+    (episode,) = run.train()["episodes"]
+    lagged, record = run.algorithm.twin.twins["lags"], run.algorithm.short_term[-1]
+    assert episode["believed"] == "lags" and episode["closure"] == named_weights(lagged.closure.base)
+    assert episode["J_p"] == pytest.approx(whole_cost(lagged, record), rel=1e-6)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.value for event in events.Scalars("twin/J_p after assimilation")] == pytest.approx([episode["J_p"]])
+    assert events.Tensors("believed/text_summary")[0].tensor_proto.string_val == [b"lags"]
+    assert "episode 1: the twin with 'lags' is the likeliest" in capsys.readouterr().out

@@ -29,6 +29,18 @@ def test_it_moves_while_a_step_is_under_way(monkeypatch, capsys):
     assert "real 0.25, live model-free; drawing figures" in shown
 
 
+def test_it_says_when_another_twin_is_believed(capsys):
+    record = {"real_cost": 0.25, "live": "model_free", "J_p": 1.0}
+    with Progress(4) as bar:
+        for episode, believed in enumerate((None, "pitch lag, late by 3", "pitch lag, late by 3", None)):
+            bar.episode(record | {"episode": episode, "believed": believed})
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "is the likeliest" in line]
+    assert lines == [
+        "episode 2: the twin with 'pitch lag, late by 3' is the likeliest; J_p and closure are its own",
+        "episode 4: the twin alone is the likeliest; J_p and closure are its own",
+    ]
+
+
 def test_it_says_when_the_compiler_is_at_work(capsys):
     with Progress(1) as bar:
         bar._compilation(True)

@@ -68,6 +68,80 @@ def test_the_plan_of_the_study_counts_seeds_and_variants(tmp_path):
     assert folders.isdisjoint(t.folder for group in short.values() for t in group)
 
 
+ALL = ("wind_turbine", "flapping_wing", "cryogenic_tank")
+
+
+def test_names_of_unknown_systems_belong_to_the_plants_that_have_them():
+    config = recipe("study").Config
+    assert config().beside() == dict.fromkeys(ALL, ())
+    found = config(unknown=("valve_lag", "gust", "inflow", "pitch", "bias_5")).beside()
+    assert found == dict(zip(ALL, (("inflow", "pitch"), ("gust",), ("bias_5", "valve_lag")), strict=True))
+
+
+def test_names_that_a_plant_of_the_study_does_not_have_are_refused():
+    config = recipe("study").Config
+    with pytest.raises(
+        ValueError, match=r"none of them is on wind_turbine, flapping_wing\. Name the plants .*--plants"
+    ):
+        config(unknown=("bias_15",))
+    with pytest.raises(ValueError, match="moon is on none of these plants; choose cryogenic_tank: bias_5, bias_15"):
+        config(unknown=("bias_15", "moon"), plants=("cryogenic_tank",))
+    with pytest.raises(ValueError, match="pitch is on none of these plants"):  # another plant has it
+        config(unknown=("bias_15", "pitch"), plants=("cryogenic_tank",))
+    with pytest.raises(ValueError, match="bias_5 and bias_15 both change the pressure sensor"):
+        config(unknown=("bias_5", "bias_15"), plants=("cryogenic_tank",))
+
+
+def test_everything_of_a_study_is_made_on_the_real_system_that_it_names(tmp_path):
+    study = recipe("study")
+    common = {"plants": ("cryogenic_tank",), "folder": tmp_path}
+    nominal, config = study.Config(**common), study.Config(unknown=("valve_lag", "bias_15"), **common)
+    trainings = [task for task in study.ordered_tasks(config) if isinstance(task, Training)]
+    assert all("--unknown bias_15 valve_lag" in training.command() for training in trainings)
+    yardsticks = [task for task in study.ordered_tasks(config) if not isinstance(task, Training)]
+    assert len(yardsticks) == 5
+    assert all("bias_15" in str(task.compute.args) and "valve_lag" in str(task.compute.args) for task in yardsticks)
+    # Model error would be another real system.
+    assert config.variants() == ["noise 0.5 %", "noise 1 %", "noise 5 %"]
+    assert nominal.variants() == [*config.variants(), "model error"]
+    assert study.command(config).startswith(
+        "uv run recipes/study.py --plants cryogenic_tank --unknown valve_lag bias_15 "
+    )
+    # The same names in another order are the same system; nothing else shares a folder with it.
+    again = study.Config(unknown=("bias_15", "valve_lag"), **common)
+    others = [nominal, study.Config(unknown=("bias_15",), **common), study.Config(quick=True, **common)]
+    assert places(again) == places(config)
+    assert all(places(other).isdisjoint(places(config)) for other in others)
+
+
+def places(config):
+    """Where a study keeps its report and results."""
+    tasks = recipe("study").ordered_tasks(config)
+    return {config.report, *(task.folder if isinstance(task, Training) else task.path for task in tasks)}
+
+
+def test_a_report_is_written_of_a_system_that_its_twin_does_not_know(tmp_path):
+    """Of the turbine without the limit, because its report has no line of costs: nothing is computed."""
+    study = recipe("study")
+    config = study.Config(plants=("wind_turbine",), unknown=("pitch",), quick=True, limit_episodes=0, folder=tmp_path)
+    groups = config.trainings("wind_turbine")
+    for training in (training for group in groups.values() for training in group):
+        finish(training)
+    (drawn := groups["nominal", "twinning"][0].folder / "figures").mkdir()
+    for name in captions.of_run("wind_turbine", groups["nominal", "twinning"][0].metrics()):
+        (drawn / f"{name}.png").write_bytes(b"PNG")
+    for task in study.yardstick_tasks(config, "wind_turbine"):
+        task.path.parent.mkdir(parents=True, exist_ok=True)
+        task.path.write_text(json.dumps({"costs": [1.1] * EPISODES, "merit": {"m [m]": {"mean": 1.0}}}))
+    page = study.write(config)
+    assert page.parent == tmp_path / "quick" / "unknown" / "pitch"
+    text = (page.parent / "README.md").read_text()
+    assert "## Wind turbine with pitch" in text and "| noise 5 % | twinning |" in text
+    assert "| model error |" not in text and "Model error is left\nout" in text and "following.png" not in text
+    assert "The paper's table" not in text  # which is of the plants as their twins know them
+    assert json.loads((page.parent / "study.json").read_text())["wind_turbine"]["unknown"] == ["pitch"]
+
+
 def test_the_report_is_written_from_what_is_kept(tmp_path):
     """A whole quick study of the drone from results written by hand: nothing is computed."""
     study = recipe("study")

@@ -1,9 +1,13 @@
 """Rows of the study and their intervals, from trainings that are written by hand."""
 
+import json
+
 import numpy as np
 import pytest
 from handwritten_study import EPISODES, finished
 
+from rt_torchrl.atomic_file import finite
+from rt_torchrl.study import captions, report
 from rt_torchrl.study.results import Entry, arm_entry, difference, mean_interval, weight_error
 
 
@@ -40,3 +44,21 @@ def test_differences_are_paired_by_episode():
 def test_a_closure_of_another_kind_has_no_weight_error():
     assert weight_error({"found": {"a": 1.0}, "true": {"c1": 2.0}}) is None
     assert weight_error({"found": {"a": 1.0}, "true": None}) is None
+
+
+def test_weights_that_the_real_system_has_beside_those_of_the_closure_count_for_nothing():
+    """Such as the offset of a sensor, of which the plant's own closure knows nothing."""
+    assert weight_error({"found": {"a": 1.1}, "true": {"a": 1.0, "pressure_offset": 15e3}}) == pytest.approx(0.1)
+
+
+def test_a_twin_that_diverges_has_an_infinite_error(tmp_path):
+    """Its J_p is null in the metrics, and in the numbers of the study."""
+    found = finished(tmp_path, 0, 0.0)
+    metrics = found.metrics()
+    metrics["episodes"][-1]["J_p"] = None
+    (found.folder / "metrics.json").write_text(json.dumps(metrics))
+    entry = arm_entry("twinning", [found])
+    assert entry.twin_errors[0][-1] == float("inf") and entry.twin_errors[0][0] == pytest.approx(0.05)
+    caption = captions.of_run("flapping_wing", metrics)["states"]
+    assert "The twin diverges on the records in memory." in caption
+    assert finite(report.numbers_of(entry))["J_p"][0][-1] is None

@@ -4,6 +4,7 @@ import pytest
 import torch
 from handwritten_study import RECIPES
 
+from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.runs.shipped_plants import shipped_plants
@@ -12,6 +13,7 @@ from rt_torchrl.study.results import yardstick_entry
 from rt_torchrl.study.yardsticks import (
     Yardstick,
     changed_closure,
+    classical,
     configured,
     cost_over_episodes,
     least_cost,
@@ -50,6 +52,22 @@ def test_a_system_with_model_error_ends_as_its_recipe_says():
     fouled = changed_closure(tank, recipes[2], ("--episodes", "11"))
     ratio = fouled.log_coefficients.exp() / tank.closure.log_coefficients.exp()
     assert ratio.tolist() == pytest.approx([1.0, 0.98**10, 1.0])
+
+
+def test_a_classical_controller_is_judged_on_what_its_twin_does_not_know(monkeypatch):
+    monkeypatch.setattr(yardsticks, "missing_for_compilation", lambda: "a compiler")
+    short = ("--horizon", "7500", "--command", "drop", "--end-weight", "0")
+    size = {"unseen": 3, "episodes": 2, "evaluations": 3, "changed": False}
+    as_known, real = (
+        classical(RECIPES / "cryogenic_tank.py", (*short, *further), PIValve, **size)
+        for further in ((), ("--unknown", "bias_15"))
+    )
+    assert "changed" not in real  # model error would be another real system
+    plant = configured(RECIPES / "cryogenic_tank.py", (*short, "--unknown", "bias_15")).plant()
+    episodes = UnseenEpisodes(plant, 3)
+    valve = PIValve(configured(RECIPES / "cryogenic_tank.py", short).plant(), tuple(real["gains"].values()))
+    assert real["costs"] == pytest.approx(episodes.judge(episodes.fly_baseline(valve)).control_costs.tolist())
+    assert real["costs"] != pytest.approx(as_known["costs"], rel=0.01)
 
 
 def test_a_plan_on_training_episodes_is_judged_on_unseen_ones(monkeypatch):

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import control_cost
 
 
@@ -27,6 +28,7 @@ def tune(
     *,
     evaluations: int = 80,
     spread: float = 2.0,
+    plant: Plant | None = None,
 ) -> Tuned:
     """Minimise the mean J_a of the episodes over the logarithms of the gains by Nelder and Mead's simplex.
 
@@ -36,6 +38,7 @@ def tune(
         exogenous: exogenous inputs of the episodes.
         evaluations: greatest number of evaluations; each flies all episodes.
         spread: factor on one gain between corners of the first simplex, more than 1.
+        plant: physics of the system that is flown; None for the controller's own plant.
 
     Raises:
         ValueError: if the controller has no gains, or an argument is out of its range.
@@ -47,10 +50,12 @@ def tune(
     if evaluations < 1 or not spread > 1.0:
         raise ValueError(f"evaluations={evaluations} must be at least 1 and spread={spread} more than 1.")
 
+    system = controller.plant if plant is None else plant
+
     @torch.no_grad()
     def cost(log_gains: np.ndarray) -> float:
         controller.log_gains.copy_(torch.as_tensor(log_gains, device=controller.log_gains.device))
-        value = control_cost(controller.plant, controller.fly(initial_state, exogenous)).mean().item()
+        value = control_cost(system, controller.fly(initial_state, exogenous, plant=system)).mean().item()
         # A flight that leaves the finite numbers is worse than any other.
         return value if np.isfinite(value) else np.inf
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.plants.plant import Plant
@@ -185,14 +186,17 @@ class OutputError:
 def discrepancy_derivatives(
     plant: Plant, states: Float[Tensor, "batch n n_s"], measured: Float[Tensor, "batch n n_s"]
 ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_s"]]:
-    """Gradient and Hessian of L_p by the state, in every sample."""
+    """Gradient and Hessian of L_p by the state, in every sample; hidden states, which are not compared, have zeros."""
+    n, hidden = len(plant.readings), states.shape[-1] - len(plant.readings)
 
-    def gradient(state: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
-        found = torch.func.grad(plant.discrepancy)(state, reading)
+    def gradient(read: Tensor, unread: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
+        found = torch.func.grad(lambda own: plant.discrepancy(torch.cat([own, unread]), reading))(read)
         return found, found
 
     samples = torch.func.vmap(torch.func.jacrev(gradient, has_aux=True))
-    curvature, slope = samples(states.flatten(0, 1), measured.flatten(0, 1))
+    read, unread = states.flatten(0, 1).split([n, hidden], -1)
+    curvature, slope = samples(read, unread, measured.flatten(0, 1))
+    slope, curvature = pad(slope, (0, hidden)), pad(curvature, (0, hidden, 0, hidden))
     return slope.unflatten(0, states.shape[:2]), curvature.unflatten(0, states.shape[:2])
 
 

@@ -113,17 +113,22 @@ class Dashboard:
         for key in record:
             if key.startswith(("hypothesis/", "misfit/")):
                 self._scalar(f"hypotheses/{key.replace('hypothesis/', 'weight/')}", record[key], step)
-        if "warning" in record:
-            self._writer.add_text("alarm", str(record["warning"]), step)
+        self._texts(record, step)
+        for key in (key for key in record if key.startswith(("faults/", "violations/", "excess/", "multiplier/"))):
+            self._scalar(key, record[key], step)
+        for name, seconds in record["seconds"].items():
+            self._scalar(f"seconds/{name}", seconds, step)
+
+    def _texts(self, record: Mapping[str, Any], step: int) -> None:
+        """Write what an episode says in words: the alarm, the hypothesis that is believed, and faults."""
+        for tag, key in (("alarm", "warning"), ("believed", "believed")):
+            if record.get(key):
+                self._writer.add_text(tag, str(record[key]), step)
         faults = record.get("faults", ())
         if faults:
             rows = [f"| {fault['time']:g} | {fault['kind']} | {fault['detail']} |" for fault in faults]
             table = "\n".join(["| time in the episode [s] | fault | detail |", "|---|---|---|", *rows])
             self._writer.add_text("faults", table, step)
-        for key in (key for key in record if key.startswith(("faults/", "violations/", "excess/", "multiplier/"))):
-            self._scalar(key, record[key], step)
-        for name, seconds in record["seconds"].items():
-            self._scalar(f"seconds/{name}", seconds, step)
 
     def images(self, images: Mapping[str, np.ndarray], step: int) -> None:
         """Write the figures of an episode, whose number is ``step``, as pixels (height, width, 3) of ``uint8``."""

@@ -41,6 +41,7 @@ class Progress:
         self._interval = ON_TERMINAL if sys.stderr.isatty() else IN_FILE
         self._costs, self._doing, self._since = "", "starting", time.perf_counter()
         self._compiling, self._alarm, self._ended = False, False, threading.Event()
+        self._believed: str | None = None
         self._thread = threading.Thread(target=self._keep_moving, daemon=True)
 
     def __enter__(self) -> "Progress":
@@ -63,13 +64,21 @@ class Progress:
         self._show()
 
     def episode(self, record: dict[str, Any]) -> None:
-        """Count an episode and show its costs; write when the twin's predictions begin or cease to be wrong."""
+        """Count an episode and show its costs.
+
+        A line says when the twin's predictions begin or cease to be wrong, and when another twin is believed.
+        """
         self._costs = progress(record)
         alarm = bool(record.get("alarm", self._alarm))
         if alarm != self._alarm:
             found = record.get("warning", "the twin's predictions hold again")
             self.write(f"episode {record['episode'] + 1}: {found}")
         self._alarm = alarm
+        believed = record.get("believed")
+        if believed != self._believed:
+            said = f"the twin with {believed!r}" if believed else "the twin alone"
+            self.write(f"episode {record['episode'] + 1}: {said} is the likeliest; J_p and closure are its own")
+        self._believed = believed
         self._bar.update()
         self._show()
 

@@ -38,6 +38,15 @@ def episode_record(found: TensorDict, *, episode: int) -> dict[str, Any]:
     return record
 
 
+def twin_entries(twin: DigitalTwin) -> dict[str, Any]:
+    """What the record of an episode says of the twin: named weights of the ``closure``, and whose they are.
+
+    They are those of the twin that is most likely to be right; ``believed`` names its hypothesis, and is None where it
+    is the twin alone.
+    """
+    return {"closure": named_weights(twin.believed_law), "believed": twin.hypothesis}
+
+
 @torch.no_grad()
 def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: dict[str, Baseline]) -> dict[str, Judged]:
     """Judge both policies by their flights, and fly and judge the classical controllers, on the unseen episodes.

@@ -8,6 +8,7 @@ from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
+from rt_torchrl.twinning.findings import in_words
 
 SCREEN = 24
 """Lines of a terminal that need no scrolling."""
@@ -18,7 +19,7 @@ def progress(record: dict[str, Any]) -> str:
     """The costs of an episode and its live policy, as the progress bar shows them."""
     costs = [(name, record.get(key)) for name, key in (("J_p", "J_p"), ("J_a mb", "J_a_model_based"))]
     costs += [("J_a mf", record.get("J_a_model_free")), ("real", record["real_cost"])]
-    shown = [f"{name} {value:.3g}" for name, value in costs if value is not None]
+    shown = [f"{name} {in_words(value)}" for name, value in costs if value is not None]
     return ", ".join([*shown, f"live {record['live'].replace('_', '-')}"])
 
 

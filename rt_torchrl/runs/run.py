@@ -20,7 +20,6 @@ from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
-from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.state_bounds import StateBounds
 from rt_torchrl.runs import checkpoint, reference, results
@@ -248,7 +247,7 @@ class Run:
 
     def _episode(self, dashboard: Dashboard, bar: Progress) -> None:
         record = results.episode_record(self.algorithm.episode(bar.doing), episode=len(self.episodes))
-        record["closure"] = named_weights(self.algorithm.twin.closure)
+        record |= results.twin_entries(self.algorithm.twin)
         if self.algorithm.flights.faults:
             record["faults"] = [fault.entry() for fault in self.algorithm.flights.faults]
             for fault in self.algorithm.flights.faults:

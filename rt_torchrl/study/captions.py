@@ -76,7 +76,9 @@ def limits(results: Results) -> str:
 
 def variants(results: Results) -> str:
     """Caption of the figure of noise and model error: it says where twinning suffers most."""
-    lines = ["Cost of every arm under sensor noise and model error over twinning's nominal cost; each point is a seed."]
+    others = any(CHANGED in harder for harder in results.variants.values())
+    what = f"sensor noise{' and model error' if others else ''}"
+    lines = [f"Cost of every arm under {what} over twinning's nominal cost; each point is a seed."]
     for plant, found in entries_by_name(results):
         harder = {variant: named(entries)["twinning"].mean for variant, entries in results.variants[plant].items()}
         ratios = {variant: mean / found["twinning"].mean for variant, mean in harder.items()}
@@ -135,7 +137,9 @@ def of_run(plant: str, metrics: dict[str, Any]) -> dict[str, str]:
     """
     found = RUN | PLANT[plant]
     found["learning_curves"] += " " + events(metrics)
-    found["states"] += f" J_p is {metrics['episodes'][-1]['J_p']:.2g} over the records in memory."
+    J_p = metrics["episodes"][-1]["J_p"]
+    error = "The twin diverges on" if J_p is None else f"J_p is {J_p:.2g} over"
+    found["states"] += f" {error} the records in memory."
     found["unseen"] += " " + cheaper(metrics)
     for name in CLOSURES:
         if name in found:

@@ -105,7 +105,8 @@ def variants(entries: dict[str, list[Entry]], harder: dict[str, dict[str, list[E
         entries: entries of each plant as it is.
         harder: entries of each plant and variant.
     """
-    title = "Noise and model error: $J_a$ over twinning's nominal mean; a point for each seed"
+    what = "Noise and model error" if any(CHANGED in found for found in harder.values()) else "Noise"
+    title = f"{what}: $J_a$ over twinning's nominal mean; a point for each seed"
     size = (max(7.5, 4.6 * len(entries)), 4.2)
     figure, axes = panels(1, len(entries), title=title, size=size, sharey=True)
     for ax, (plant, nominal) in zip(axes.flat, entries.items(), strict=True):

@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import markdown
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from rt_torchrl.atomic_file import finite
 from rt_torchrl.study.names import shown, title
 from rt_torchrl.study.results import HALVES, Entry, Results, difference, named
 from rt_torchrl.study.tables import nominal_table, paper_table, variant_table
@@ -26,7 +28,13 @@ class CaptionedFigure(NamedTuple):
 
 
 def write(
-    folder: Path, results: Results, *, figures: list[CaptionedFigure], quick: bool, command: str
+    folder: Path,
+    results: Results,
+    *,
+    figures: list[CaptionedFigure],
+    quick: bool,
+    command: str,
+    unknown: Mapping[str, tuple[str, ...]] | None = None,
 ) -> tuple[Path, Path]:
     """Write ``README.md``, ``report.html`` and ``study.json``. ``report.md.jinja`` holds the sentences.
 
@@ -36,6 +44,7 @@ def write(
         figures: figures in the order of the report.
         quick: whether to mark the report as one of short trainings.
         command: the command that makes the report.
+        unknown: what the real system of each plant has beside its twin, by names; None for what the twins know.
 
     Returns:
         Paths of the Markdown and of the page.
@@ -45,14 +54,20 @@ def write(
     templates.filters |= {"shown": shown, "title": title}
     templates.globals |= {"named": named, "compared": compared, "halves": HALVES, "heading": HEADING}
     templates.globals |= {f.__name__: f for f in (nominal_table, variant_table, paper_table)}
-    made = {"command": command, "version": version("rt_torchrl"), "cores": os.cpu_count(), "quick": quick}
+    made: dict[str, Any] = {
+        "command": command,
+        "version": version("rt_torchrl"),
+        "cores": os.cpu_count(),
+        "quick": quick,
+    }
+    made["unknown"] = {plant: (unknown or {}).get(plant, ()) for plant in results.entries}
     text = templates.get_template("report.md.jinja").render(results=results, figures=figures, **made)
     body = markdown.markdown(text, extensions=["tables", "fenced_code"])
     body = re.sub(r'src="([^"]+\.png)"', lambda found: f'src="{embedded(folder / found[1])}"', body)
     source, page = folder / "README.md", folder / "report.html"
     source.write_text(text)
     page.write_text(templates.get_template("report.html.jinja").render(body=body))
-    (folder / "study.json").write_text(json.dumps(numbers(results), indent=2) + "\n")
+    (folder / "study.json").write_text(json.dumps(finite(numbers(results, made["unknown"])), indent=2) + "\n")
     return source, page
 
 
@@ -68,10 +83,11 @@ def embedded(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
-def numbers(results: Results) -> dict[str, Any]:
-    """Content of ``study.json``."""
+def numbers(results: Results, unknown: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    """Content of ``study.json``; ``unknown`` is what the real system of each plant has beside its twin."""
     return {
         plant: {
+            "unknown": unknown[plant],
             "entries": {entry.name: numbers_of(entry) for entry in entries},
             "limits": {entry.name: numbers_of(entry) for entry in results.limits[plant]},
             "variants": {

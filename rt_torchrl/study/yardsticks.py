@@ -99,8 +99,11 @@ def classical(
     unseen: int,
     episodes: int,
     evaluations: int,
+    changed: bool = True,
 ) -> dict[str, Any]:
     """Tune a classical controller by a simplex search on training episodes, and judge it on the unseen episodes.
+
+    It acts on what sensors read of the true system, on which it is tuned and judged.
 
     Args:
         recipe: recipe of the plant.
@@ -109,6 +112,8 @@ def classical(
         unseen: number of unseen episodes.
         episodes: number of training episodes.
         evaluations: number of times that the search may fly all training episodes.
+        changed: whether to judge it on the system with model error, too, with which a system that has dynamics beside
+            its twin does not go.
 
     Returns:
         ``gains``, per-episode ``costs`` and the statistics of :class:`Judged`; ``changed`` holds
@@ -117,20 +122,32 @@ def classical(
     config = configured(recipe, options)
     plant = plant_of(config)
     judged = unseen_episodes(plant, unseen)
-    controller = tuned(kind, physics_of(config), episodes=episodes, evaluations=evaluations)
+    controller = tuned(kind, physics_of(config), plant, episodes=episodes, evaluations=evaluations)
     found = {"gains": controller.named_gains()} | record(judged, controller)
+    if not changed:
+        return found
     judged.closure = changed_closure(plant, recipe, options) or plant.closure
     return found | {"changed": record(judged, controller)}
 
 
-def tuned(kind: type[ClassicalController], plant: Plant, *, episodes: int, evaluations: int) -> ClassicalController:
-    """The controller with the best gains that a search finds on training episodes; one without gains as it is."""
+def tuned(
+    kind: type[ClassicalController], physics: Plant, plant: Plant, *, episodes: int, evaluations: int
+) -> ClassicalController:
+    """The controller with the best gains that a search finds on training episodes; one without gains as it is.
+
+    Args:
+        kind: class of the controller.
+        physics: the plant as it is known, for which the controller is made.
+        plant: the true plant, which it flies.
+        episodes: number of training episodes.
+        evaluations: number of times that the search may fly all of them.
+    """
     start = {"gains": kind.placed_gains} if kind.placed_gains else {}
-    controller = kind(plant, **start, compiled=missing_for_compilation() is None)
+    controller = kind(physics, **start, compiled=missing_for_compilation() is None)
     generator = torch.Generator().manual_seed(TRAINING_SEED)
     if kind.gain_units:
         state = plant.draw_initial_state(episodes, generator)
-        tune(controller, state, plant.draw_exogenous(episodes, generator), evaluations=evaluations)
+        tune(controller, state, plant.draw_exogenous(episodes, generator), evaluations=evaluations, plant=plant)
     return controller
 
 

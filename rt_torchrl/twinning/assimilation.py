@@ -3,7 +3,7 @@
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from rt_torchrl.identification.weight_prior import WeightPrior
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
+from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
@@ -130,8 +131,6 @@ class Assimilation:
     The expectation is over the records in D_S and, for each record, over realisations of its exogenous process. The
     *stored* actions drive all of them.
 
-    Note: the paper replays from the first reading of the sensors; ``initial="estimated"`` also finds the first state.
-
     Args:
         twin: twin whose closure is updated in place; afterwards the closure holds the best weights seen, w_p*.
         config: parameters of step 4.
@@ -168,9 +167,7 @@ class Assimilation:
         Returns:
             J_p of the whole records before and after, without the prior, and the descent's gradient and iterations.
             J_p before is infinite if the twin diverges on the records; the fit then begins anew from the first closure.
-
-        Raises:
-            DivergenceError: if the twin diverges under the first closure, too.
+            Where the twin diverges under that, too, all are infinite, and the closure stays as it is.
         """
         whole = batch_of(records)
         if self.config.inputs == "realisations":
@@ -180,22 +177,25 @@ class Assimilation:
             whole = Trajectory(states, actions, self.twin.plant.with_previews(sampled), start)
         if not self.config.segment:
             return self._descend_anew(whole)
-        before = self._cost_of(whole)
+        before = self.cost_of(whole)
         found = self._descend_anew(whole.segments(min(self.config.segment, whole.actions.shape[1]), self.twin.plant.dt))
-        return found._replace(start=before, best=self._cost_of(whole))
+        return found._replace(start=before, best=self.cost_of(whole))
 
     def _descend_anew(self, replayed: Trajectory) -> Descended:
         """Descend from the present closure, or from the first one if the twin diverges under the present one.
 
         A twin without the dynamics of the real system bends its closure to the records, and the next record may lead to
-        where the bent closure makes no sense.
+        where the bent closure makes no sense. One that makes none of the first closure either keeps what it has.
         """
-        try:
+        present = copy.deepcopy(self.twin.closure.state_dict())
+        with contextlib.suppress(FloatingPointError):
             return self._descend(replayed)
-        except FloatingPointError:
-            self.twin.closure.load_state_dict(self._first)
-            self.descent.restart()
+        self.descent.restart()
+        self.twin.closure.load_state_dict(self._first)
+        with contextlib.suppress(FloatingPointError):
             return self._descend(replayed)._replace(start=math.inf)
+        self.twin.closure.load_state_dict(present)
+        return Descended(math.inf, math.inf, math.inf, self.config.iterations)
 
     def _descend(self, replayed: Trajectory) -> Descended:
         def equations() -> NormalEquations:
@@ -204,8 +204,7 @@ class Assimilation:
         def cost() -> Tensor:
             return self._identification_cost(replayed) + self.prior.cost()
 
-        before = self.prior.cost().item()
-        iterations, stop_below = self.config.iterations, self.config.stop_ratio
+        before, iterations, stop_below = self.prior.cost().item(), self.config.iterations, self.config.stop_ratio
         if self.config.initial == "estimated":
             output_error = self._output_error(replayed)
             method = LevenbergMarquardt(output_error.unknowns, tolerance=NOISE_TOLERANCE)
@@ -214,6 +213,8 @@ class Assimilation:
             found = self._from_starts(equations)
         else:
             found = self.descent.run(cost, iterations, stop_below=stop_below)
+        if math.isinf(found.start):
+            raise FloatingPointError("J_p of finite states overflows")
         return found._replace(start=found.start - before, best=found.best - self.prior.cost().item())
 
     def _from_starts(self, equations: Callable[[], NormalEquations]) -> Descended:
@@ -239,16 +240,15 @@ class Assimilation:
         return identification_cost(self.twin.plant, flown, measured).mean()
 
     @torch.no_grad()
-    def _cost_of(self, whole: Trajectory) -> float:
-        """J_p of whole records; infinite if the closure, which was found on segments of them, diverges."""
-        try:
+    def cost_of(self, whole: Trajectory) -> float:
+        """J_p of whole records under the present closure, without the prior; infinite if the twin diverges on them."""
+        with contextlib.suppress(FloatingPointError):
             if self.config.initial == "measured":
                 return self._identification_cost(whole).item()
             output_error = self._output_error(whole, weights=False)
             output_error.fit_initial_states()
             return output_error.normal_equations().cost.item() / len(whole.states)
-        except FloatingPointError:
-            return float("inf")
+        return math.inf
 
     def _output_error(self, replayed: Trajectory, *, weights: bool = True) -> OutputError:
         """The output error J_p with the first states among its unknowns."""
@@ -262,11 +262,11 @@ class Assimilation:
         return self.prior.added(NormalEquations(*(part / len(output_error.segments) for part in found)))
 
     def normal_equations(self, replayed: Trajectory) -> NormalEquations:
-        """J_p, its gradient and its Gauss-Newton matrix by the closure's weights."""
-        measured, actions, exogenous, start = replayed
+        """J_p, gradient and Gauss-Newton matrix by the closure's weights; DivergenceError if a state is not finite."""
+        (measured, actions, exogenous, start), plant = replayed, self.twin.plant
         states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions, start=start)
-        plant, target = self.twin.plant, measured[:, 1:]
-        share = plant.dt / len(measured)
+        require_finite(plant, states.transpose(0, 1), measured[:, 0], [self.twin.closure], start=start)
+        share, target = plant.dt / len(measured), measured[:, 1:]
         g, H = discrepancy_derivatives(plant, states, target)
         # For a closure of many weights the products below are most of the work; they skip states that L_p ignores.
         seen = compared(H)
@@ -280,14 +280,12 @@ class Assimilation:
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Seek in the records of the last update why real episodes cost other than the twin says.
 
-        A twin alone has nothing to try.
-
         Returns:
-            Whether the twin has changed.
+            Whether the twin has changed; a twin alone has nothing to try.
         """
         return False
 
-    def report(self) -> dict[str, float]:
+    def report(self) -> Mapping[str, float | str]:
         """What the last update has found beside J_p, by name; of one twin, nothing."""
         return {}
 

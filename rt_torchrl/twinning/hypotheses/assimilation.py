@@ -24,24 +24,24 @@ from rt_torchrl.twinning.hypotheses.reread import Reread, at_rest, reread
 
 SEGMENTS = 60
 """Number of segments of an episode by default."""
-FIRST_ROUNDS = 3
-"""Greatest number of rounds of the first fit."""
+FIRST = 3 * ("short", "whole")
+"""Stages of the first fit: steps over segments, and over whole records."""
+AGAIN = ("short",)
+"""Stages of every further fit, in which whole records have hardly ever found more."""
 STEPS = 10
-"""Greatest number of Levenberg-Marquardt steps over segments in a round."""
+"""Greatest number of Levenberg-Marquardt steps over segments in a stage."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
 LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
 HELD = 0.1
 """Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one."""
-MORE = 3.0
-"""Ratio of misfits of two episodes beyond which one round has not been enough."""
 FAR = 10.0
-"""Ratio of misfits beyond which a stage has gone astray."""
+"""Ratio of misfits beyond which a stage has gone astray, or the weights of the last episode have."""
 
 
 class Fit:
-    """The fit of one hypothesis: rounds of steps over segments, then over whole records; the best weights stay.
+    """The fit of one hypothesis: steps over segments, at first in turns with whole records; the best weights stay.
 
     Over a whole record of a system that oscillates nearly every weight has local minima. Over segments that begin with
     what was read (multiple shooting) it has few; the hidden states go on through all segments, with their derivatives.
@@ -69,29 +69,50 @@ class Fit:
             "whole": Assimilation(twin, measured),
         }
         self.least, self.waiting, self.pause = math.inf, 0, 1
+        self._first = copy.deepcopy(twin.closure.state_dict())
         self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
 
     def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        """Fit the records, in more rounds the first time, and where one round leaves more over than the last time.
+        """Fit the records: by both stages in turn the first time, by steps over segments from then on.
+
+        Where these have not arrived, and much more is left over than the last time, the fit also begins anew from the
+        first weights: those of the last episode may explode on these records, and no step leads back from there.
 
         Returns:
             The misfit of the best weights, which the closure has then.
         """
-        rounds = FIRST_ROUNDS if math.isinf(self.least) else 1
-        least = self._rounds(records, rounds, generator)
-        if rounds == 1 and not least < MORE * self.least:
-            least = self._rounds(records, FIRST_ROUNDS, generator)
+        first = math.isinf(self.least)
+        least, arrived = self._run(records, FIRST if first else AGAIN, generator)
+        if not (first or arrived or least < FAR * self.least):
+            least = self._anew(records, least, generator)
         self.least = least
         return least
 
-    def _rounds(self, records: Sequence[Trajectory], count: int, generator: torch.Generator) -> float:
-        """Some rounds of both stages; returns the misfit of the best weights, which the closure has then."""
+    def _anew(self, records: Sequence[Trajectory], least: float, generator: torch.Generator) -> float:
+        """Fit from the first weights; the present ones stay unless their misfit is greater."""
+        closure = self.twin.closure
+        present = copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(self._first)
+        found, _ = self._run(records, FIRST, generator)
+        if not found < least:
+            closure.load_state_dict(present)
+        return min(found, least)
+
+    def _run(
+        self, records: Sequence[Trajectory], stages: Sequence[str], generator: torch.Generator
+    ) -> tuple[float, bool]:
+        """Go through stages until steps over segments have arrived.
+
+        Returns:
+            The misfit of the best weights, which the closure has then, and whether the steps have arrived.
+        """
         plant, closure = self.twin.plant, self.twin.closure
         least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
         self._hold(least)
         taken = {"short": [reread(record, plant, self.segment) for record in records]}
         taken["whole"] = [at_rest(record, plant) for record in records]
-        for name in count * list(self.stages):
+        arrived = False
+        for name in stages:
             safe_point()
             steps = STEPS
             # A twin that diverges on the way only loses the stage.
@@ -102,10 +123,11 @@ class Fit:
                 least, best = found, copy.deepcopy(closure.state_dict())
             elif not found < FAR * least:
                 closure.load_state_dict(best)
-            if name == "short" and steps < STEPS:
+            arrived = name == "short" and steps < STEPS
+            if arrived:
                 break
         closure.load_state_dict(best)
-        return least
+        return least, arrived
 
     def _hold(self, least: float) -> None:
         """Hold the weights of a neural residual by a prior whose unit is the present misfit; see ``HELD``.
@@ -114,6 +136,10 @@ class Fit:
         """
         for stage in self.stages.values() if self._held and math.isfinite(least) else ():
             stage.prior.stiffness = HELD * least
+
+    def cost(self, records: Sequence[Trajectory]) -> float:
+        """J_p of whole records under their measured inputs; infinite if the twin diverges on them."""
+        return self.stages["whole"].cost_of(batch_of([at_rest(record, self.twin.plant) for record in records]))
 
     def due(self) -> bool:
         """Whether the fit is due, which a hopeless hypothesis is in ever fewer episodes."""
@@ -159,6 +185,7 @@ class EnsembleAssimilation(Assimilation):
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call
         self._records: Sequence[Trajectory] = ()
+        self._before: float | None = None
 
     def update(
         self,
@@ -167,7 +194,8 @@ class EnsembleAssimilation(Assimilation):
         count: int,
         generator: torch.Generator,
     ) -> Descended:
-        """As :meth:`Assimilation.update`, whose report is that of the twin alone, and fit the hypotheses if called."""
+        """As :meth:`Assimilation.update`, whose result is that of the twin alone, and fit the hypotheses if called."""
+        self._before = self._believed_cost(records) if self.ensemble.hypothesis else None
         found = super().update(records, processes, count, generator)
         self._records = records
         if self.called:
@@ -205,10 +233,25 @@ class EnsembleAssimilation(Assimilation):
     def _misfit(self, fit: "Fit", records: Sequence[Trajectory], generator: torch.Generator) -> float:
         return fit.update(records, generator) if fit.due() else misfit(fit.twin, records, self.segment)
 
-    def report(self) -> dict[str, float]:
-        """The weight and the misfit of every hypothesis."""
-        shares = {f"hypothesis/{name}": self.ensemble.weights.get(name, 0.0) for name in self.ensemble.twins}
-        return shares | {f"misfit/{name}": value for name, value in self.misfits.items()}
+    def _believed_cost(self, records: Sequence[Trajectory]) -> float:
+        """J_p of the likeliest hypothesis, which is not the twin alone, over whole records."""
+        return self.fits[self.ensemble.likeliest].cost(records)
+
+    def report(self) -> dict[str, float | str]:
+        """The weight and the misfit of every hypothesis, and what is said of the twin where a hypothesis is believed.
+
+        ``J_p`` is then that of the likeliest hypothesis, whose name is ``believed``, over the records of the last
+        update; ``J_p_before`` is that of the one that was the likeliest before, as it was then.
+        """
+        found: dict[str, float | str] = {}
+        for name in self.ensemble.twins:
+            found[f"hypothesis/{name}"] = self.ensemble.weights.get(name, 0.0)
+        found |= {f"misfit/{name}": value for name, value in self.misfits.items()}
+        if self._before is not None:
+            found["J_p_before"] = self._before
+        if self.ensemble.hypothesis is not None and self._records:
+            found |= {"J_p": self._believed_cost(self._records), "believed": self.ensemble.hypothesis}
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
