@@ -11,6 +11,7 @@ from rt_torchrl.plants.closures import named_weights
 from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
 from rt_torchrl.plants.extensions.extension import ExtendedClosure
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
 from rt_torchrl.runs.results import hypotheses_of, twin_entries
 from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
@@ -241,6 +242,21 @@ def test_the_results_say_what_the_twin_lacks():
     assert found["late"] == {"weight": 0.3, "weights": {}, "described": {}}
     lines = hypothesis_lines(found)
     assert lines == ["  beside the twin: lags, weight 0.60, force_lag = 0.2 s", "  beside the twin: late, weight 0.30"]
+
+
+def test_the_results_say_what_all_nested_extensions_have_found():
+    swinging = ResonantActuator(PLANT, "force", 3.0, 0.5)
+    late = DelayedActuator(LaggedActuator(swinging, "force", LAG), "force", 0.2)
+    closures = {"all of it": late.make_closure(torch.Generator())}
+    twin = TwinEnsemble(PLANT, PLANT.closure, {"all of it": late}, closures)
+    twin.weights = {"all of it": 1.0}
+    found = hypotheses_of(twin)["all of it"]
+    assert found["weights"] == pytest.approx({"force_frequency": 3.0, "force_damping_odds": 1.0, "force_lag": LAG})
+    assert {name: about["unit"] for name, about in found["described"].items()} == {
+        "force_frequency": "rad/s",
+        "force_damping_odds": "-",
+        "force_lag": "s",
+    }
 
 
 def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():

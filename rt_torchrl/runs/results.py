@@ -11,6 +11,7 @@ from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
+from rt_torchrl.plants.extensions.extension import ExtendedClosure
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -166,15 +167,21 @@ def closure_errors(
 
 
 def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
-    """``weight`` and named ``weights`` of what is planned on beside the twin alone, by name; empty if nothing is."""
+    """``weight`` and named ``weights`` of what is planned on beside the twin alone, by name; empty if nothing is.
+
+    They are the parameters of all extensions of a hypothesis, in which nested ones have different names.
+    """
     if not isinstance(twin, TwinEnsemble):
         return {}
     found: dict[str, Any] = {}
     for name, weight in twin.weights.items():
         if name != ALONE:
+            closure = twin.twins[name].closure
             # A delay of whole intervals has no parameters of its own.
-            own = getattr(twin.twins[name].closure, "own", nn.Module())
-            found[name] = {"weight": weight, "weights": named_weights(own) or {}, "described": described_weights(own)}
+            parts = closure.all_own if isinstance(closure, ExtendedClosure) else ()
+            weights = {key: value for part in parts for key, value in (named_weights(part) or {}).items()}
+            described = {key: value for part in parts for key, value in described_weights(part).items()}
+            found[name] = {"weight": weight, "weights": weights, "described": described}
     return found
 
 

@@ -38,6 +38,11 @@ class ExtendedClosure(nn.Module):
         parts = (getattr(part, "named_coefficients", dict) for part in (self.base, self.own))
         return {name: value for part in parts for name, value in part().items()}
 
+    @property
+    def all_own(self) -> list[nn.Module]:
+        """The parameters of each of the nested extensions, those of the innermost first."""
+        return [*(self.base.all_own if isinstance(self.base, ExtendedClosure) else ()), self.own]
+
     def forward(self, features: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         return self.base(features)
 
