@@ -9,6 +9,7 @@ from test_algorithm import twinning
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED
 from rt_torchrl.twinning.planners import PlannerConfig
@@ -17,12 +18,16 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class AlwaysOne(VirtualEpisodes):
-    """Virtual episodes of a twin that says 1 of every policy."""
+    """Virtual episodes of a twin that says 1 of every policy, and counts its flights."""
+
+    flights = 0
 
     def __init__(self):
-        pass
+        plant = LinearQuadratic(horizon=2.0)
+        self.twin = DigitalTwin(plant, LinearClosure(plant.true_closure))
 
     def cost(self, policy, episodes):
+        self.flights += 1
         return torch.ones((), dtype=torch.float64)
 
     def repeated(self, record):
@@ -32,10 +37,10 @@ class AlwaysOne(VirtualEpisodes):
 def flown(*costs, gains=None, exploration=0.0, found=None):
     """A track record after these costs, each flown with a gain of its own, and examined after each."""
     found = found or TrackRecord({"model_based": LinearGain([[0.0, 0.0]])})
-    trajectory = Trajectory(torch.zeros(2, 2).double(), torch.zeros(1, 1).double(), torch.zeros(1, 1).double())
     for cost, gain in zip(costs, gains or range(len(costs)), strict=True):
         weights = {"gain": torch.tensor([[gain, 0.0]], dtype=torch.float64)}
-        found.append(trajectory, "model_based", cost, exploration, weights)
+        trajectory = (torch.zeros(2, 2).double(), torch.zeros(1, 1).double(), torch.zeros(1, 1).double())
+        found.append(Trajectory(*trajectory), "model_based", cost, exploration, weights)
         found.weigh(found.differences(AlwaysOne()))
     return found
 
@@ -76,6 +81,18 @@ def test_what_the_twin_explains_now_is_forgotten():
     explained = found.differences(AlwaysOne())._replace(values=[0.0] * (LATEST + 1))
     found.weigh(explained)
     assert kept(flown(1.0, gains=[0.5], found=found))[0] == []
+
+
+def test_episodes_fly_again_where_the_twin_or_they_are_new():
+    found, virtual = flown(2.0, 3.0), AlwaysOne()
+    found.differences(virtual)
+    assert virtual.flights == 0  # the other twin had the same weights
+    with torch.no_grad():
+        virtual.twin.closure.matrix[0, 0] += 1e-12
+    assert [found.differences(virtual).values for _ in range(2)] == [[math.log(2.0), math.log(3.0)]] * 2
+    assert virtual.flights == 2
+    flown(1.0, found=found).differences(virtual)
+    assert virtual.flights == 5
 
 
 def test_a_saved_record_goes_on_alike():

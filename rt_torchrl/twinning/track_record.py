@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
@@ -62,6 +63,7 @@ class TrackRecord:
     def __init__(self, policies: Mapping[Role, nn.Module]):
         self._policies = policies
         self._flown: list[Flown] = []
+        self._found: tuple[Any, Differences] | None = None
 
     def append(
         self,
@@ -75,7 +77,7 @@ class TrackRecord:
         weights = self._policies[role].state_dict() if weights is None else weights
         weights = {name: weight.detach().clone() for name, weight in weights.items()}
         self._flown.append(Flown(trajectory, role, weights, cost, exploration))
-        self._flown = [*self._refuting(), *self._flown[-LATEST:]]
+        self._flown, self._found = [*self._refuting(), *self._flown[-LATEST:]], None
 
     def _refuting(self) -> list[Flown]:
         """The episodes before the latest ones that stay, of which the last one has just left these."""
@@ -87,8 +89,9 @@ class TrackRecord:
 
     def weigh(self, found: "Differences") -> None:
         """Take how much dearer than the present twin says the episodes of these differences were."""
-        sizes = dict(zip(map(id, found.flown), map(excess, found.values, found.exploration), strict=True))
-        self._flown = [one._replace(excess=sizes.get(id(one), 0.0)) for one in self._flown]
+        flights = [id(one.trajectory) for one in found.flown]
+        sizes = dict(zip(flights, map(excess, found.values, found.exploration), strict=True))
+        self._flown = [one._replace(excess=sizes.get(id(one.trajectory), 0.0)) for one in self._flown]
 
     @property
     def real_costs(self) -> tuple[float, ...]:
@@ -103,7 +106,16 @@ class TrackRecord:
         return tuple(self._predicted(flown, virtual) for flown in self._latest())
 
     def differences(self, virtual: VirtualEpisodes) -> "Differences":
-        """The paired differences of all episodes that are kept, but not of state feedback, whose flights are long."""
+        """The paired differences of all episodes that are kept, but not of state feedback, whose flights are long.
+
+        The episodes are flown again only where the twin has changed.
+        """
+        state = virtual.twin.state_dict()
+        if self._found is None or not equal(state, self._found[0]):
+            self._found = copy.deepcopy(state), self._differences(virtual)
+        return self._found[1]
+
+    def _differences(self, virtual: VirtualEpisodes) -> "Differences":
         earlier, latest = (
             [one for one in part if not isinstance(self._policies[one.role], StateFeedback)]
             for part in (self._flown[:-LATEST], self._flown[-LATEST:])
@@ -151,6 +163,7 @@ class TrackRecord:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._flown = [Flown(**flown | {"trajectory": Trajectory(**flown["trajectory"])}) for flown in state["flown"]]
+        self._found = None
 
 
 class Differences(NamedTuple):
@@ -170,6 +183,14 @@ class Differences(NamedTuple):
         actions = [shares(policy, plant, record) for policy in self.policies]
         stacked = torch.stack(actions) if actions else record.states.new_empty(0, 1)
         return PairedDifferences(stacked, stacked.new_tensor(self.values), stacked.new_tensor(self.exploration))
+
+
+def equal(state: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two states of a twin are the same."""
+    (one, structure), (two, its_structure) = tree_flatten(state), tree_flatten(other)
+    return structure == its_structure and all(
+        torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in zip(one, two, strict=True)
+    )
 
 
 def shares(policy: nn.Module, plant: Plant, record: Trajectory) -> Float[Tensor, " m"]:
