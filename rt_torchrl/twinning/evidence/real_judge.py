@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.cloning import same_architecture
+from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.evidence.paired_differences import NOISE, Belief, PairedDifferences, difference, excess
 from rt_torchrl.twinning.track_record import Differences, shares
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
