@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from linear_quadratic import LinearGain
+from tensordict import TensorDict
 from test_evidence import Content, judge_of
 
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -31,6 +32,16 @@ def gains(first):
 
 def said(policy):
     return policy.gain[0, 0].item()
+
+
+class Hasty(Content):
+    """A learner whose update gives its policy the refuted weights."""
+
+    def update(self):
+        self.policy.load_state_dict(gains(2.0))
+        return TensorDict({})
+
+    store = observations = Content.refuse
 
 
 def exactly(teacher, pupil, **others):
@@ -63,8 +74,7 @@ def test_a_plan_from_other_weights_that_flights_refute_is_refused(approach, evid
 
 @pytest.mark.parametrize(("evidence", "kept"), [(None, 2.0), (REFUTED, 3.0)])
 def test_an_update_that_flights_refute_is_taken_back(evidence, kept):
-    learner = Content(LinearGain([[3.0, 0.0]]))
-    learner.update = lambda: learner.policy.load_state_dict(gains(2.0))
+    learner = Hasty(LinearGain([[3.0, 0.0]]))
     learning = Learning(learner, REFUTED.virtual, taught=False)
     learning.update()
     report = learning.judge(EPISODES, judgement(evidence))
