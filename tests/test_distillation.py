@@ -10,7 +10,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.cloning import same_architecture
+from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.distillation import (
     Distillation,
     DistillationConfig,

@@ -31,12 +31,13 @@ from rt_torchrl.twinning.evidence.paired_differences import (
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration
 from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.judgement import Costs, Judgement
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.planning import Costs, Judgement, Planning
+from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
-from rt_torchrl.twinning.track_record import Differences, Flown
+from rt_torchrl.twinning.track_record import Differences, Flown, TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
@@ -269,7 +270,7 @@ def test_the_report_says_what_a_recall_withholds():
     """The twin says 2 of the present policy, which cost e² times as much, and 4 of an earlier one, which cost it."""
     judge, policy = judge_of([4.0, 2.0], [0.0, 2.0]), LinearGain([[2.0, 0.0]])
     planning = Planning(Content(policy), judge.virtual, PlannerConfig())
-    judgement = Judgement(lambda episodes: judge.virtual.cost(policy, episodes), lambda a, b: a > b, print, judge)
+    judgement = Judgement(lambda a, b: a > b, TrackRecord({}), judge)
     episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
     report = planning.plan(1, episodes, episodes, judgement)
     assert policy.gain.tolist() == [[4.0, 0.0]] and report["recalled"] == 1.0
@@ -293,7 +294,7 @@ def test_what_a_flown_episode_refutes_stays_refuted(said, d, withheld):
     judge.differences = judge.differences._replace(flown=[episode])
     judge.recalled, judge.median = lambda policy, episodes: None, lambda policy, cost: cost
     planning = Planning(Content(policy), judge.virtual, PlannerConfig())
-    judgement = Judgement(lambda episodes: judge.virtual.cost(policy, episodes), lambda a, b: a > b, print, judge)
+    judgement = Judgement(lambda a, b: a > b, TrackRecord({}), judge)
     episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
     report = planning.plan(1, episodes, episodes, judgement)
     assert float(report.get("withheld", 0.0)) == pytest.approx(withheld)

@@ -12,8 +12,10 @@ from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.extreme_starts import ExtremeStarts, astray
+from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.planning import Judgement, Planning
+from rt_torchrl.twinning.planning import Planning
+from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 CPU = torch.device("cpu")
@@ -97,7 +99,7 @@ def test_a_plan_that_fails_from_extreme_starts_is_made_again_with_them(wary, kep
     policy = LinearGain([[1.0, 1.0]])
     virtual = Trapped(LinearQuadratic(horizon=2.0))
     planning = Planning(Greedy(policy, wary), virtual, PlannerConfig())
-    judgement = Judgement(lambda episodes: virtual.cost(policy, episodes), lambda a, b: a > b, print)
+    judgement = Judgement(lambda a, b: a > b, TrackRecord({}))
     episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
     report = planning.plan(1, episodes, episodes, judgement)
     assert policy.gain.tolist() == kept
@@ -111,7 +113,7 @@ def test_a_plan_from_other_weights_that_fails_from_extreme_starts_is_refused(cou
     planning = Planning(Greedy(policy, wary=False), virtual, PlannerConfig())
     planning.others.append({"gain": torch.full((1, 2), 4.0).double()})
     # The plan from the present weights is refused, so that only the one from the others could be kept.
-    judgement = Judgement(lambda episodes: virtual.cost(policy, episodes), lambda a, b: True, print)
+    judgement = Judgement(lambda a, b: True, TrackRecord({}))
     episodes = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
     planning.plan(1, episodes, episodes, judgement)
     assert policy.gain.tolist() == kept and not planning.others

@@ -5,7 +5,7 @@ real system. The other is idle: it learns at the same time and can take over.
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -30,12 +30,13 @@ from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight
 from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
 from rt_torchrl.twinning.informative_memory import InformativeMemory
+from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.operating import Operating
 from rt_torchrl.twinning.own_policies import require_own_policies
 from rt_torchrl.twinning.planners import Planner, make_planner
-from rt_torchrl.twinning.planning import Judgement, Planning
+from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.twinning.saved_state import load_parts, on_device
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
@@ -215,20 +216,19 @@ class ReinforcementTwinning:
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""
         count = self.config.planner.realisations or self.config.realisations
-        planned_on, judged_on = map(self.virtual.draw, (count, self.judged))
-        judgement = Judgement(
-            incumbent=lambda episodes: self.virtual_costs(episodes, ("model_based",))["model_based"],
-            worse=self.referee.worse,
-            require_sound_twin=lambda episodes: self.track_record.require_sound_twin(self.virtual, episodes),
-            evidence=self.examination.correction(self.short_term[-1]) if self.config.corrected_plans else None,
-        )
-        return self.examination.told(self.planning.plan(self.episodes_done + 1, planned_on, judged_on, judgement))
+        plan_on, judged_on = map(self.virtual.draw, (count, self.judged))
+        return self.examination.told(self.planning.plan(self.episodes_done + 1, plan_on, judged_on, self.judgement()))
+
+    def judgement(self) -> Judgement:
+        """How new weights are judged after the latest real episode: by its evidence, if that contradicts the twin."""
+        evidence = self.examination.correction(self.short_term[-1]) if self.config.corrected_plans else None
+        return Judgement(self.referee.worse, self.track_record, evidence)
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
         """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
         judged_on = self.virtual.draw(self.judged)
-        judged = self.learning.judge(judged_on, self.referee.worse) if self.config.judged_updates else findings()
+        judged = self.learning.judge(judged_on, self.judgement()) if self.config.judged_updates else findings()
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
         change = weight_change(self.policies[idle], self._earlier_weights[idle])
@@ -246,13 +246,13 @@ class ReinforcementTwinning:
         report = merged(judged, report).set_non_tensor("event", event)
         return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
 
-    def virtual_costs(self, episodes: Scenario, roles: Iterable[Role] = ROLES) -> dict[Role, Tensor]:
-        """What policies cost over virtual episodes; infinite for one with which a sound twin diverges.
+    def virtual_costs(self, episodes: Scenario) -> dict[Role, Tensor]:
+        """What both policies cost over virtual episodes; infinite for one with which a sound twin diverges.
 
         Raises:
             DivergenceError: if the twin diverges under the weights that have just flown, too.
         """
-        costs = {role: self.virtual.price(self.policies[role], episodes) for role in roles}
+        costs = {role: self.virtual.price(self.policies[role], episodes) for role in ROLES}
         if not all(cost.isfinite() for cost in costs.values()):
             self.track_record.require_sound_twin(self.virtual, episodes)
         return costs
@@ -266,7 +266,7 @@ class ReinforcementTwinning:
             record=self.short_term[-1],
             costs=(costs[live].item(), costs[idle].item()),
             judged_on=judged_on,
-            worse=self.referee.worse,
+            judgement=self.judgement(),
         )
         if "reason" not in report:
             (self.learner if idle == "model_free" else self.planner).restart()

@@ -3,7 +3,7 @@
 import copy
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -13,9 +13,11 @@ from torch import Tensor, nn
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
+from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.distillation import Distillation, DistillationConfig
 from rt_torchrl.twinning.extreme_starts import astray
 from rt_torchrl.twinning.findings import findings, merged
+from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -47,7 +49,7 @@ class Cloning:
         record: Trajectory,
         costs: tuple[float, float],
         judged_on: Scenario,
-        worse: Callable[[float, float], bool],
+        judgement: Judgement,
     ) -> TensorDict:
         """Make ``idle`` a clone of ``live``; it keeps its weights if a distilled clone is worse than it is.
 
@@ -58,7 +60,7 @@ class Cloning:
             record: the real episode that ``live`` has just flown, from which a clone of state feedback learns.
             costs: mean J_a of ``live`` and of ``idle`` over the episodes of ``judged_on``.
             judged_on: virtual episodes on which the clone is judged.
-            worse: function that says whether the first of two mean J_a is worse than the second one.
+            judgement: how the clone and the policy that it replaces are judged.
 
         Returns:
             A report, which is empty after a copy of weights. After a distillation it holds ``distillation_error`` and
@@ -71,12 +73,13 @@ class Cloning:
         if same_architecture(live, idle):
             idle.load_state_dict(live.state_dict())
             return findings()
-        before, (live_cost, replaced) = copy.deepcopy(idle.state_dict()), costs
+        before, live_cost = copy.deepcopy(idle.state_dict()), costs[0]
+        replaced = judgement.of(idle, costs[1]).expected
         source = record if isinstance(live, StateFeedback) else seen()
         error = self.distillation.imitate(live, idle, seen=source, draw=lambda: self.virtual.draw(self.count))
-        cost = self.virtual.price(idle, judged_on).item()
-        found = {"distillation_error": error, "distillation_cost_ratio": cost / live_cost}
-        if not worse(cost, replaced):
+        clone = judgement.costs(idle, self.virtual, judged_on)
+        cost, found = clone.expected, {"distillation_error": error, "distillation_cost_ratio": clone.twin / live_cost}
+        if not judgement.worse(cost, replaced):
             return findings(**found)
         idle.load_state_dict(before)
         reason = f"clone refused: its J_a is {cost:.4g}, that of the policy it replaces {replaced:.4g}"
@@ -147,14 +150,6 @@ class Cloning:
         return own > TWICE * abs(model) and astray(own, model, cost=cost, usual=wanted)
 
 
-def same_architecture(first: nn.Module, second: nn.Module) -> bool:
-    """Whether two modules with the same weights are the same function: same submodules, settings and weight shapes.
-
-    Shapes alone do not tell: perceptrons with different activations have weights of the same shapes.
-    """
-    return _structure(first) == _structure(second)
-
-
 def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module], Result]) -> dict[Role, Result]:
     """What ``flown`` returns for each policy; it is called once if the two are clones of each other.
 
@@ -173,15 +168,3 @@ def clones(first: nn.Module, second: nn.Module) -> bool:
         return False
     pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
     return all(torch.equal(one, other) for one, other in pairs)
-
-
-def _structure(module: nn.Module) -> list[tuple[Any, ...]]:
-    """Class and settings of every submodule, and the shapes of what its state dict holds."""
-    parts = [(name, type(part), part.extra_repr(), _settings(part)) for name, part in module.named_modules()]
-    return [*parts, *((name, value.shape) for name, value in module.state_dict().items())]
-
-
-def _settings(module: nn.Module) -> dict[str, Any]:
-    """Attributes that are neither weights nor submodules, such as an activation or a depth."""
-    values = {name: value for name, value in vars(module).items() if not name.startswith("_") and name != "training"}
-    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}

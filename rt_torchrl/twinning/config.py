@@ -35,12 +35,12 @@ class TwinningConfig:
             the episode is flown again.
         limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
             to be kept before a policy may act.
-        judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse on the twin, in the
-            arm twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
+        judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse, in the arm
+            twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
             ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
-        corrected_plans: whether step 5 judges a plan by what it is expected to cost on the real system, as the paired
-            differences of real episodes say, and goes back to weights that have flown for less, where one of the latest
-            real episodes contradicts the twin; without it the twin alone judges.
+        corrected_plans: whether plans, judged updates and distilled clones are judged by what they are expected to cost
+            on the real system, as the paired differences of real episodes say, and step 5 goes back to weights that
+            have flown for less, where one of these episodes contradicts the twin; without it the twin alone judges.
         corrected_descents: whether step 5 then also descends this expected cost. It leads on where no hypothesis
             explains the real system, by trials that cost real episodes. Needs corrected_plans.
         exploration: parameters of step 1.

@@ -1,4 +1,4 @@
-"""Step 2: the learner's update, which step 6 can take back where it is worse on the twin."""
+"""Step 2: the learner's update, which step 6 can take back where it is worse."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -12,16 +12,17 @@ from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.alarm import MATTERS
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.learners import Learner
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class Learning:
-    """Lets the learner update its policy, and judges the update on the twin.
+    """Lets the learner update its policy, and judges the update.
 
     Note: the paper keeps every update. A critic knows the value of actions near those that were taken. Where a training
     begins with a controller it explores little, and an actor that climbs the critic leaves those actions within one
-    update. Plans and clones are judged on the twin, too.
+    update. Plans and clones are judged alike.
 
     A learner that needs more than one interval in a row says so by ``shortest``; one that takes the first interval it
     is given for the start of an episode has a true ``from_the_start``.
@@ -79,22 +80,23 @@ class Learning:
         return self.learner.update()
 
     @torch.no_grad()
-    def judge(self, judged_on: Scenario, worse: Callable[[float, float], bool]) -> TensorDict:
+    def judge(self, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """Go back to the policy before the update if the update is worse; the critic keeps what it has learned.
 
         Args:
             judged_on: virtual episodes on which both are flown.
-            worse: function that says whether the first of two mean J_a is worse than the second one.
+            judgement: how both are judged.
 
         Returns:
             ``update_accepted``, and the reason if it is 0.
         """
         policy = self.learner.policy
         self.adopt(policy)
-        after, found = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on).item()
+        after = copy.deepcopy(policy.state_dict())
+        found = judgement.costs(policy, self.virtual, judged_on).expected
         policy.load_state_dict(self._before)
-        earlier = self.virtual.price(policy, judged_on).item()
-        if worse(found, earlier):
+        earlier = judgement.costs(policy, self.virtual, judged_on).expected
+        if judgement.worse(found, earlier):
             self.learner.restart()
             reason = f"update refused: J_a of model_free would be {found:.4g}, it was {earlier:.4g}"
             return findings(reason, update_accepted=0.0)

@@ -2,8 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -12,53 +11,11 @@ from rt_torchrl.optimisers.descent import Descended, by_small_steps
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.corrected_plans import CorrectedPlans
-from rt_torchrl.twinning.evidence.paired_differences import difference
-from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.extreme_starts import astray
 from rt_torchrl.twinning.findings import findings, merged
+from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.planners import Planner, PlannerConfig
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
-
-
-class Judgement(NamedTuple):
-    """How a plan is judged.
-
-    Args:
-        incumbent: function that gives the mean J_a of the present policy on virtual episodes.
-        worse: function that says whether the first of two mean J_a is worse than the second one.
-        require_sound_twin: function that refuses a twin that diverges in these episodes with the weights that have just
-            flown, by an error.
-        evidence: judge of what policies cost on the real system; None judges by the twin alone.
-    """
-
-    incumbent: Callable[[Scenario], Tensor]
-    worse: Callable[[float, float], bool]
-    require_sound_twin: Callable[[Scenario], None]
-    evidence: RealJudge | None = None
-
-    def of(self, policy: nn.Module, cost: float) -> "Costs":
-        """What a policy costs that has this mean J_a on the twin: on the real system if there is evidence."""
-        if self.evidence is None:
-            return Costs(cost, cost, cost)
-        return Costs(cost, self.evidence.expected(policy, cost), self.evidence.median(policy, cost))
-
-
-class Costs(NamedTuple):
-    """What a policy costs on the twin, and is expected to cost on the real system: in the mean and in the median."""
-
-    twin: float
-    expected: float
-    median: float
-
-    def withheld(self, stays: "Costs") -> float:
-        """How much better the twin alone finds this policy than the one that stays, as log of the costs' ratio.
-
-        It is zero where the twin does not, and where real episodes do not contradict it: a policy that is refused for
-        the width of the belief alone may be as good as the twin says.
-        """
-        if not math.isfinite(self.twin) or self.median < stays.median:
-            return 0.0
-        return max(0.0, difference(stays.twin, self.twin))
 
 
 class Planning:
@@ -102,10 +59,10 @@ class Planning:
         if withheld is not None:
             found.update(findings(withheld=max(withheld, float(found.get("withheld", 0.0)))))
         while self.others:
-            other = self._from_others(self.others.pop(), planned_on, judged_on)
+            other = self._from_others(self.others.pop(), planned_on, judged_on, judgement)
             found = found if other is None else other
         if self.config.approach and episode == self.config.approach_at:
-            found = self._approached(found, planned_on, judged_on)
+            found = self._approached(found, planned_on, judged_on, judgement)
         for _ in range(self.config.rounds - 1):
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
@@ -131,16 +88,18 @@ class Planning:
         recalled = evidence.recalled(policy, judged_on)
         if recalled is None:
             return None
-        left = judgement.of(policy, self.virtual.price(policy, judged_on).item())
+        left = judgement.costs(policy, self.virtual, judged_on)
         policy.load_state_dict(recalled)
         self.planner.restart()
-        return left.withheld(judgement.of(policy, self.virtual.price(policy, judged_on).item()))
+        return left.withheld(judgement.costs(policy, self.virtual, judged_on))
 
-    def _approached(self, found: TensorDict, planned_on: Scenario, judged_on: Scenario) -> TensorDict:
+    def _approached(
+        self, found: TensorDict, planned_on: Scenario, judged_on: Scenario, judgement: Judgement
+    ) -> TensorDict:
         """The best plan by small steps from the present weights and from the first ones, or the plan found so far."""
         accepted = False
         for weights in (self.planner.policy.state_dict(), *self._first):
-            further = self._from_others(weights, planned_on, judged_on, approach=self.config.approach)
+            further = self._from_others(weights, planned_on, judged_on, judgement, approach=self.config.approach)
             found, accepted = (found, accepted) if further is None else (further, True)
         self._first.clear()
         return merged(found, findings(approached=float(accepted)))
@@ -162,11 +121,17 @@ class Planning:
         self._first = list(state["first"])
 
     def _from_others(
-        self, weights: dict[str, Tensor], planned_on: Scenario, judged_on: Scenario, *, approach: int = 0
+        self,
+        weights: dict[str, Tensor],
+        planned_on: Scenario,
+        judged_on: Scenario,
+        judgement: Judgement,
+        *,
+        approach: int = 0,
     ) -> TensorDict | None:
         """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
         policy = self.planner.policy
-        best, least = copy.deepcopy(policy.state_dict()), self.virtual.price(policy, judged_on)
+        best, stays = copy.deepcopy(policy.state_dict()), judgement.costs(policy, self.virtual, judged_on)
         tail = self.virtual.tail(policy, judged_on)
         policy.load_state_dict(weights)
         self.planner.restart()
@@ -177,9 +142,9 @@ class Planning:
         except FloatingPointError:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
         if found is not None:
-            cost = self.virtual.price(policy, judged_on)
-            if cost < least and not astray(
-                self.virtual.tail(policy, judged_on), tail, cost=cost.item(), usual=least.item()
+            plan = judgement.costs(policy, self.virtual, judged_on)
+            if plan.expected < stays.expected and not astray(
+                self.virtual.tail(policy, judged_on), tail, cost=plan.twin, usual=stays.twin
             ):
                 return planned(found)
         policy.load_state_dict(best)
@@ -197,13 +162,15 @@ class Planning:
         if isinstance(policy, StateFeedback):
             return self._descended(planned_on, planned_on, judgement)
         before, tail = copy.deepcopy(policy.state_dict()), self.virtual.tail(policy, judged_on)
-        incumbent = judgement.of(policy, judgement.incumbent(judged_on).item())
+        incumbent = judgement.costs(policy, self.virtual, judged_on)
+        if not math.isfinite(incumbent.twin):
+            judgement.track_record.require_sound_twin(self.virtual, judged_on)
         failed = 0.0
         for episodes in (planned_on, self.virtual.with_extremes(planned_on)):
             found = self._descended(episodes, planned_on, judgement)
             if not found["plan_accepted"]:
                 return found
-            plan = judgement.of(policy, self.virtual.price(policy, judged_on).item())
+            plan = judgement.costs(policy, self.virtual, judged_on)
             if judgement.worse(plan.expected, incumbent.expected):
                 break
             if not astray(self.virtual.tail(policy, judged_on), tail, cost=plan.twin, usual=incumbent.twin):
@@ -230,7 +197,7 @@ class Planning:
         try:
             return planned(self.planner.plan(episodes))
         except FloatingPointError as error:
-            judgement.require_sound_twin(usual)
+            judgement.track_record.require_sound_twin(self.virtual, usual)
             policy.load_state_dict(before)
             self.planner.restart()
             return findings(f"no plan: {error}", plan_accepted=0.0)

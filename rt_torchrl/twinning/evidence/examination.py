@@ -10,8 +10,8 @@ from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE, EPISODES, MATTERS, QUIET, alarm, contradiction
-from rt_torchrl.twinning.evidence.paired_differences import LARGEST, Belief, difference
-from rt_torchrl.twinning.evidence.real_judge import RealJudge, unexplained
+from rt_torchrl.twinning.evidence.paired_differences import LARGEST, Belief, difference, unexplained
+from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration, repeatable
 from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
@@ -45,10 +45,12 @@ class Examination:
             enough. Nothing if state feedback flew them.
         """
         found = self.track_record.differences(self.virtual)
-        if not found.values:
+        self.track_record.weigh(found)
+        if len(found.values) == found.earlier:
             self.unexplained, self._said = 0.0, False
             return findings()
-        *earlier, latest = zip(found.policies, found.values, found.flown, strict=True)
+        flown = list(zip(found.policies, found.values, found.flown, strict=True))
+        *earlier, latest = flown[found.earlier :]
         now = self._without_luck(*latest)
         self.unexplained = unexplained(found.values[-1], found.exploration[-1]) if now is None else abs(now)
         said = alarm([*self._comparable(earlier), *([] if now is None else [now])])

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
+
 COMMON = 0.1
 """Standard deviation of an error that all policies share, of log J."""
 LOCAL = 0.5
@@ -113,3 +115,13 @@ def difference(real: float, predicted: float) -> float:
     if not real * predicted > 0.0:
         return 0.0
     return max(-LARGEST, min(LARGEST, math.log(real / predicted)))
+
+
+def unexplained(value: float, exploration: float) -> float:
+    """Size of a paired difference beyond what exploration explains."""
+    return abs(value) - 2.0 * EXPLORED * exploration
+
+
+def excess(value: float, exploration: float) -> float:
+    """How far beyond chance an episode cost more than the twin says, by its paired difference; else not above zero."""
+    return unexplained(value, exploration) - BEYOND_CHANCE if value > 0.0 else 0.0

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.cloning import same_architecture
-from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
-from rt_torchrl.twinning.evidence.paired_differences import EXPLORED, NOISE, Belief, PairedDifferences, difference
+from rt_torchrl.twinning.architecture import same_architecture
+from rt_torchrl.twinning.evidence.paired_differences import NOISE, Belief, PairedDifferences, difference, excess
 from rt_torchrl.twinning.track_record import Differences, shares
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -23,11 +22,6 @@ the real system does not; its neighbours need not."""
 NOISES = tuple(NOISE * 2.0**k for k in range(4))
 """Standard deviations of d for one episode among which the likeliest is taken: luck does not cancel where the real
 system has inputs that no sensor reads. Beforehand log₂ of their ratio to the first one is normal, with deviation 1."""
-
-
-def unexplained(value: float, exploration: float) -> float:
-    """Size of a paired difference beyond what exploration explains."""
-    return abs(value) - 2.0 * EXPLORED * exploration
 
 
 class RealJudge:
@@ -106,7 +100,7 @@ class RealJudge:
         """
         found, sizes = self.differences, [0.0]
         for one, d, explored, flown in zip(found.policies, found.values, found.exploration, found.flown, strict=False):
-            if d < 0.0 or unexplained(d, explored) <= BEYOND_CHANCE or not same_architecture(one, policy):
+            if not excess(d, explored) > 0.0 or not same_architecture(one, policy):
                 continue
             episode = self.virtual.repeated(flown.trajectory)
             predicted, stays = (self.virtual.cost(each, episode).item() for each in (one, policy))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from torch import nn
 
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.twinning.cloning import same_architecture
+from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.flight import Flight
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.starts.start import Fly
