@@ -118,6 +118,31 @@ def test_who_acts_follows_from_what_is_at_stake(live, idle, beliefs, event):
     assert decided(live, idle, beliefs) == event
 
 
+@pytest.mark.parametrize(
+    "live, idle, beliefs, preferred",
+    [
+        (1.0, 1.2, (KNOWN, UNKNOWN), "model_based"),  # live on trial, and expected to cost more
+        (10.0, 1.0, (KNOWN, UNKNOWN), "model_free"),
+        (1.0, 1.2, (KNOWN, KNOWN), "model_based"),
+        (math.inf, 1.0, (KNOWN, KNOWN), "model_free"),
+    ],
+)
+def test_a_policy_on_trial_is_not_the_preferred_one(live, idle, beliefs, preferred):
+    referee = make_referee(RefereeConfig(rule="weight_of_evidence"), "model_based")
+    referee.decide(evidence(live, idle, beliefs))
+    resumed = make_referee(RefereeConfig(rule="weight_of_evidence"), "model_free")
+    resumed.load_state_dict(referee.state_dict())
+    assert referee.preferred == resumed.preferred == preferred
+    resumed.decide(evidence(1.0, 5.0, (KNOWN, KNOWN)))  # the trial ends
+    assert resumed.preferred == resumed.live
+
+
+def test_a_state_without_trials_is_read():
+    referee = make_referee(RefereeConfig(rule="weight_of_evidence"), "model_free")
+    referee.load_state_dict({"live": "model_based", "stall_count": 2})
+    assert (referee.preferred, referee.stall_count, referee.on_trial) == ("model_based", 2, 0)
+
+
 def test_stakes_are_those_of_a_simulation():
     from rt_torchrl.twinning.referees.weight_of_evidence import stakes
 

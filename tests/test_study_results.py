@@ -22,6 +22,15 @@ def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
     assert low < entry.mean < high
 
 
+def test_a_policy_on_trial_at_the_end_does_not_count(tmp_path):
+    found = finished(tmp_path, 0, 0.0)
+    metrics = found.metrics()
+    live = arm_entry("twinning", [found]).mean
+    metrics["summary"]["preferred"] = "model_free"
+    (found.folder / "metrics.json").write_text(json.dumps(metrics))
+    assert arm_entry("twinning", [found]).mean == pytest.approx(2.0 * live)
+
+
 def test_intervals_cover_the_mean_as_often_as_they_say():
     rng, hits = np.random.default_rng(0), 0
     for _ in range(40):

@@ -95,6 +95,7 @@ def summarise(
         | results(unseen, judged),
         "cost_of_learning": cost_of_learning(episodes),
         "live": live,
+        "preferred": preferred(algorithm),
         "better": better,
         "better_chosen_on": chosen_on,
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
@@ -111,13 +112,19 @@ def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple
     """The better policy, and the name of the episodes that decided; its cost is reported on other episodes.
 
     It is the policy with the smaller mean J_a on validation episodes. On a real system of unknown closure these would
-    have to be flown; there it is the live policy, which the algorithm has chosen on the twin.
+    have to be flown; there it is the one that the referee prefers.
     """
     validation = unseen.validation()
     if validation is None:
-        return algorithm.referee.live, "twin"
+        return preferred(algorithm), "twin"
     costs = of_each_role(algorithm.policies, lambda policy: validation.control_costs(policy).mean().item())
     return min(ROLES, key=costs.__getitem__), "validation episodes"
+
+
+def preferred(algorithm: ReinforcementTwinning) -> Role:
+    """The policy that the referee expects to cost less; of a referee of one's own that has no trials, the live one."""
+    role: Role = getattr(algorithm.referee, "preferred", algorithm.referee.live)
+    return role
 
 
 def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"] | None) -> dict[str, float]:

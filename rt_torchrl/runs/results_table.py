@@ -7,6 +7,7 @@ from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 from rt_torchrl.twinning.findings import in_words
 
@@ -52,7 +53,9 @@ def results_table(metrics: dict[str, Any]) -> str:
     paid = found["cost_of_learning"]
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
     lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
-    lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
+    live, preferred = (role.replace("_", "-") for role in (found["live"], preferred_role(found)))
+    trial = "" if preferred == live else f", on trial: {preferred} is expected to cost less"
+    lines.append(f"  live at the end: {live}{trial}")
     lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
     lines += alarm_lines(metrics["episodes"])
     room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, ROLES, caption, legend_below, panels
 from rt_torchrl.runs.settings import BESIDE, read_settings
+from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.study.results import Entry
 
 APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
@@ -24,7 +25,8 @@ WIDEST_LINEAR = 5.0
 def entries_of(folders: Sequence[Path]) -> tuple[list[Entry], list[Entry]]:
     """Rows of a comparison: one for each set of options, then one for each classical controller.
 
-    The policy that is live at the end counts. All runs must have been judged on the same unseen episodes of one plant.
+    The policy counts that the referee prefers at the end. All runs must have been judged on the same unseen episodes of
+    one plant.
 
     Args:
         folders: folders of finished runs.
@@ -131,7 +133,7 @@ def _shown(value: Any) -> str:
 
 
 def _entry(kind: str, found: list[dict[str, Any]]) -> Entry:
-    unseen = [(one["summary"]["unseen"], one["summary"]["live"]) for one in found]
+    unseen = [(one["summary"]["unseen"], preferred_role(one["summary"])) for one in found]
     merits = [_means(one["merit"][live]) for one, live in unseen]
     return Entry(
         name=kind,

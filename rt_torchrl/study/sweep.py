@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.study.scheduling import side_by_side
 
 if TYPE_CHECKING:
@@ -61,9 +62,9 @@ class SeededRun:
             recipe.main(from_command_line(recipe.Config, arguments))
 
     def cost(self) -> float:
-        """Mean J_a of the policy that is live at the end, on the unseen episodes; infinite if it diverges there."""
+        """Mean J_a of the policy that the referee prefers, on the unseen episodes; infinite if it diverges there."""
         summary = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))["summary"]
-        found = summary["unseen"][f"J_a_{summary['live']}"]["mean"]
+        found = summary["unseen"][f"J_a_{preferred_role(summary)}"]["mean"]
         return float("inf") if found is None else float(found)
 
 

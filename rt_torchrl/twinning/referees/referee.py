@@ -141,6 +141,11 @@ class TwoPolicies:
     def idle(self) -> Role:
         return "model_based" if self.live == "model_free" else "model_free"
 
+    @property
+    def preferred(self) -> Role:
+        """Role that is expected to cost less: the live one, unless it is on trial."""
+        return self.live
+
     def worse(self, cost: float, than: float) -> bool:
         return not math.isfinite(cost) or cost > than
 
@@ -158,4 +163,4 @@ class TwoPolicies:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.live = state["live"]
         for name in self.counters:
-            setattr(self, name, state[name])
+            setattr(self, name, state.get(name, 0))  # a state of an earlier version lacks a later counter

@@ -21,19 +21,28 @@ class WeightOfEvidence(TwoPolicies):
     episode is evidence. A policy of uncertain worth so gets a trial where little is at stake. Patience is not needed:
     one episode with a hopeless policy is enough where the other is ten times better.
 
+    The attribute ``on_trial`` is 1 while the live policy is expected to cost more than the idle one, L > G.
+
     Args:
         config: parameters of step 6.
         live: role that starts live.
     """
 
-    counters = ("stall_count",)
+    counters = ("stall_count", "on_trial")
 
     def __init__(self, config: RefereeConfig, live: Role = "model_free"):
         super().__init__(config, live)
+        self.on_trial = 0
+
+    @property
+    def preferred(self) -> Role:
+        return self.idle if self.on_trial else self.live
 
     def decide(self, evidence: Evidence) -> Event:
         gain, loss = stakes(evidence, self.live, self.idle)
-        if self.config.trial_horizon * gain > loss:
+        swaps = self.config.trial_horizon * gain > loss
+        self.on_trial = int(swaps and loss > gain)
+        if swaps:
             self.live, self.stall_count = self.idle, 0
             return "swap"
         return self.stalled(evidence.idle_weight_change)
