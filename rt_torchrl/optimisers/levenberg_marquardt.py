@@ -22,9 +22,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.optimisers.placement import place
 
 
 class NormalEquations(NamedTuple):
@@ -84,7 +86,7 @@ class LevenbergMarquardt:
             before = copy.deepcopy(self.module.state_dict())
             scale = torch.maximum(scale, current.matrix.diagonal())
             step, damping = self._limited_step(current, scale)
-            _add(step, weights)
+            place(parameters_to_vector(weights) + step, weights)
             trial = self._attempt(equations)
             if trial is not None and trial.cost <= current.cost:
                 gain = (current.cost - trial.cost) / promised(current, step)
@@ -130,12 +132,6 @@ def _step(current: NormalEquations, damping: float, scale: Tensor) -> Tensor:
 def _relief(gain: float) -> float:
     """Factor of the damping after a step with this share of the decrease that it has promised."""
     return max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
-
-
-def _add(step: Tensor, weights: list[nn.Parameter]) -> None:
-    """Move the weights; in place, because torch's ``vector_to_parameters`` would make them views of one vector."""
-    for weight, part in zip(weights, step.split([w.numel() for w in weights]), strict=True):
-        weight.add_(part.view_as(weight))
 
 
 def promised(equations: NormalEquations, step: Tensor) -> Tensor:

@@ -131,6 +131,8 @@ class Assimilation:
     The expectation is over the records in D_S and, for each record, over realisations of its exogenous process. The
     *stored* actions drive all of them.
 
+    Note: the paper replays from the first reading of the sensors; ``initial="estimated"`` also finds the first state.
+
     Args:
         twin: twin whose closure is updated in place; afterwards the closure holds the best weights seen, w_p*.
         config: parameters of step 4.

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
+from rt_torchrl.optimisers.placement import place
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.evidence.paired_differences import REACH
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
@@ -149,9 +150,3 @@ def go(
             break
         # Actions that saturate move little at first, and then all at once.
         distance *= min(10.0, max(0.1, REACH / moved)) if moved > 0.0 else 10.0
-
-
-def place(values: Tensor, weights: list[nn.Parameter]) -> None:
-    """Give weights these values; in place, because ``vector_to_parameters`` would make them views of one vector."""
-    for weight, part in zip(weights, values.split([w.numel() for w in weights]), strict=True):
-        weight.copy_(part.view_as(weight))

@@ -126,7 +126,7 @@ class TrackRecord:
         return Differences([self._policy(one) for one in flown], pairs, explored, flown, len(earlier))
 
     def _latest(self) -> list[Flown]:
-        return list(self._flown)[-COMPARED:]
+        return self._flown[-COMPARED:]
 
     def _predicted(self, flown: Flown, virtual: VirtualEpisodes) -> float:
         return virtual.cost(self._policy(flown), virtual.repeated(flown.trajectory)).item()
