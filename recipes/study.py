@@ -15,11 +15,9 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import ClassicalController, main_of
-from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
-from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
-from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.envs.unknown_systems import SYSTEMS
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
 from rt_torchrl.study import captions
@@ -49,8 +47,6 @@ CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
     "flapping_wing": {"PD": TrimmedPD},
     "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
 }
-SYSTEMS = {"wind_turbine": turbines.SYSTEMS, "flapping_wing": drones.SYSTEMS, "cryogenic_tank": tanks.SYSTEMS}
-"""What the real system of each plant may have beside its twin, by name."""
 OWN_POLICY: dict[str, tuple[str, ...]] = {
     "wind_turbine": ("--start", "random", "--policy", "paper"),
     "flapping_wing": ("--start", "random", "--policy", "paper"),

@@ -14,10 +14,10 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import check_options, main_of
-from rt_torchrl.envs.cryogenic_tank import unknown as tanks
-from rt_torchrl.envs.flapping_wing import unknown as drones
-from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.envs.unknown_systems import SYSTEMS
+from rt_torchrl.plants.extensions.catalogue import require_systems
 from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.study.results import numeric
 from rt_torchrl.study.room import Room, require_page, room_table, write_into
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
@@ -26,7 +26,6 @@ from rt_torchrl.study.yardsticks import Yardstick, oracle
 if TYPE_CHECKING:
     from rt_torchrl.study.task import Task
 
-CATALOGUES = {"wind_turbine": turbines, "flapping_wing": drones, "cryogenic_tank": tanks}
 POLICY: dict[str, tuple[str, ...]] = {
     "wind_turbine": ("--policy", "scheduled"),
     "flapping_wing": ("--policy", "paper"),
@@ -94,11 +93,11 @@ class Config:
         if self.task == "hop" and self.plant != "flapping_wing":
             raise ValueError(f"task='hop' is a task of the drone; the plant is {self.plant}.")
         for system in self.systems:
-            CATALOGUES[self.plant].require_unknown(names(system))
+            require_systems(names(system), SYSTEMS[self.plant])
 
     def rows(self) -> tuple[str, ...]:
         """The systems of the table, in its order."""
-        return self.systems or ("nothing", *CATALOGUES[self.plant].SYSTEMS)
+        return self.systems or ("nothing", *SYSTEMS[self.plant])
 
     @property
     def title(self) -> str:
@@ -171,10 +170,10 @@ def row(config: Config, system: str) -> Room:
     return Room(
         system=" + ".join(names(system)),
         oracle=config.optimum(system).run()["J_a"]["mean"],
-        planned=[judged["J_a_model_based"]["mean"] for judged in unseen],
-        said=[metrics["episodes"][-1]["J_a_plan"] for metrics in found],
+        planned=[numeric(judged["J_a_model_based"]["mean"]) for judged in unseen],
+        said=[numeric(metrics["episodes"][-1]["J_a_plan"]) for metrics in found],
         classical=baselines,
-        helped=[summary["unseen"]["J_a_model_based"]["mean"] for summary in helped],
+        helped=[numeric(summary["unseen"]["J_a_model_based"]["mean"]) for summary in helped],
         paid=[metrics["summary"]["cost_of_learning"]["sum"] for metrics in found],
         helped_paid=[summary["cost_of_learning"]["sum"] for summary in helped],
     )

@@ -15,9 +15,8 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import check_options, main_of
-from rt_torchrl.envs.cryogenic_tank import unknown as tanks
-from rt_torchrl.envs.flapping_wing import unknown as drones
-from rt_torchrl.envs.wind_turbine import unknown as turbines
+from rt_torchrl.envs.unknown_systems import SYSTEMS
+from rt_torchrl.plants.extensions.catalogue import require_systems
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.arms import SystemResult, classical_arms, trained_arm
 from rt_torchrl.study.results import yardstick_entry
@@ -31,8 +30,8 @@ if TYPE_CHECKING:
     from rt_torchrl.study.task import Task
 
 Options = tuple[str, ...]
-CATALOGUES = {"wind_turbine": turbines, "flapping_wing": drones, "hop": drones, "cryogenic_tank": tanks}
-"""Names of unknown systems of every plant; the hop is a task of the drone."""
+CASES = {name: name for name in ("wind_turbine", "flapping_wing", "hop", "cryogenic_tank")} | {"hop": "flapping_wing"}
+"""Plant of each case; the hop is a task of the drone."""
 POLICY: dict[str, Options] = {
     "wind_turbine": ("--policy", "scheduled"),
     "flapping_wing": ("--policy", "paper"),
@@ -149,26 +148,26 @@ class Config:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if self.unseen is not None and self.unseen < FEW:
             raise ValueError(f"unseen={self.unseen} must be at least {FEW}.")
-        for argument, known in (("plants", (*CATALOGUES, "all")), ("arms", ARMS)):
+        for argument, known in (("plants", (*CASES, "all")), ("arms", ARMS)):
             if other := [name for name in getattr(self, argument) if name not in known]:
                 raise ValueError(f"{argument}: {', '.join(other)} does not exist; choose among {', '.join(known)}.")
         for system in self.systems:
             if not any(system in self.systems_of(case) for case in self.cases()):
-                known = dict.fromkeys(name for case in self.cases() for name in CATALOGUES[case].SYSTEMS)
+                known = dict.fromkeys(name for case in self.cases() for name in SYSTEMS[CASES[case]])
                 raise ValueError(
                     f"systems: {system} is on none of {', '.join(self.cases())}; choose nothing, or names among "
                     f"{', '.join(known)}, which a plus combines."
                 )
         for case, system in self.rows():
-            CATALOGUES[case].require_unknown(names(system))
+            require_systems(names(system), SYSTEMS[CASES[case]])
 
     def cases(self) -> list[str]:
         """The plants, and the drone's hop."""
-        return [case for case in CATALOGUES if "all" in self.plants or case in self.plants]
+        return [case for case in CASES if "all" in self.plants or case in self.plants]
 
     def systems_of(self, case: str) -> list[str]:
         """The systems of a plant, in the order of its tables."""
-        known = CATALOGUES[case].SYSTEMS
+        known = SYSTEMS[CASES[case]]
         if not self.systems:
             return ["nothing", *known]
         return [system for system in self.systems if all(name in known for name in names(system))]

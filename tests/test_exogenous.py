@@ -9,7 +9,7 @@ import torch
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess
+from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, mixed
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
@@ -157,6 +157,42 @@ def test_redrawn_large_scales_keep_means_spectra_and_cross_spectra(n):
     torch.testing.assert_close(cross, (expected[:, 0] * expected[:, 1].conj())[: (n + 1) // 2].expand_as(cross))
     # At any time the mean over draws is that over time, but for the standard error of 200 draws, five of them.
     assert (large.mean(0) - found.mean.mean(0)).abs().max() < 5 * found.mean.std(0).max() / math.sqrt(200)
+
+
+def test_mixed_large_scales_are_draws_of_student_s_distribution_of_the_next_one():
+    """Their mean is that of those met, and their covariance ν/(ν − 2) (1 + 1/m) times that of the sample."""
+    m, n, count = 9, 40, 200_000
+    t = torch.linspace(0.0, 1.0, n, dtype=torch.float64)
+    level, slope = torch.randn(2, m, 1, generator=seeded(3), dtype=torch.float64)
+    met = torch.stack([8.0 + level + slope * t, 3.0 - 0.5 * level + (t > 0.5)], -1)
+    found = mixed(list(met), count, seeded())
+    assert found.shape == (count, n, 2)
+    flat, own = found.flatten(1), met.flatten(1)
+    deviation = own.std(0)
+    assert ((flat.mean(0) - own.mean(0)).abs() / deviation).max() < 0.02
+    expected = 8 / 6 * (1 + 1 / m) * own.T.cov()
+    scale = deviation[:, None] * deviation
+    assert ((flat.T.cov() - expected).abs() / scale).max() < 0.03
+    # Student's t with eight degrees of freedom is beyond 3.355 in one of a hundred draws.
+    standard = (flat[:, 0] - own[:, 0].mean()) / (deviation[0] * (1 + 1 / m) ** 0.5)
+    assert (standard.abs() > 3.355).double().mean().item() == pytest.approx(0.01, abs=1e-3)
+
+
+def test_large_scales_are_mixed_from_the_third_episode_on():
+    plant = WindTurbine(horizon=60.0)
+    levels, seen = (8.0, 11.0, 14.0), {}
+    for count in (2, 3):
+        config = ExogenousConfig(large_scale="mixed")
+        virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), config, 3, generator=seeded())
+        for level in levels[:count]:
+            record = torch.full((plant.n_steps, 1), level, dtype=torch.float64)
+            virtual.processes.append(ExogenousProcess(record, dt=plant.dt, signals=plant.inputs))
+        seen[count] = virtual.draw(200).exogenous[..., 0]
+    assert {round(value, 6) for value in seen[2].mean(1).tolist()} == {8.0, 11.0}
+    new = seen[3].mean(1)
+    assert len(new.unique()) > 150 and new.min() < 8.0 and new.max() > 14.0
+    low, high = plant.inputs[0].low, plant.inputs[0].high
+    assert (seen[3] >= low).all() and (seen[3] <= high).all()
 
 
 def test_virtual_episodes_have_new_large_scales_where_they_are_asked_for():

@@ -1,6 +1,7 @@
 """Several twins side by side: what each finds, how they are weighed, and what is planned on them."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -17,15 +18,16 @@ from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.assimilation import AssimilationConfig
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.hypotheses.assimilation import AGAIN, FIRST, EnsembleAssimilation, evidence, misfit
+from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, evidence
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
+from rt_torchrl.twinning.hypotheses.fit import AGAIN, FIRST, misfit
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
 from rt_torchrl.twinning.hypotheses.reread import Reread, reread
 from rt_torchrl.twinning.planners import PlannerConfig, make_planner
@@ -50,11 +52,11 @@ def recorded(plant, steps=100):
     return Trajectory(read, flown.actions[0], exogenous[0]), flown.states[0]
 
 
-def ensemble(plant, call=0.0, **options):
+def ensemble(plant, call=0.0, *, always=False, **options):
     closure = LinearClosure([[0.0, 0.0], [0.0, 0.0]])
     config = HypothesesConfig(call=call, **options)
     twin = make_twin(plant, closure, config)
-    return twin, make_assimilation(twin, ASSIMILATION, config)
+    return twin, make_assimilation(twin, ASSIMILATION, config, always=always)
 
 
 def fitted(real, plant, **options):
@@ -316,6 +318,31 @@ def test_a_hopeless_hypothesis_is_fitted_in_ever_fewer_episodes(monkeypatch):
     assert fitted_in == {"late": [0, 2, 5, 10, 19], "lags": list(range(20))}
 
 
+@pytest.mark.parametrize("always", [False, True])
+def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
+    """But for state feedback, which plans on it, and where a hypothesis fails and it is planned on again."""
+    twin, assimilation = ensemble(PLANT, always=always)
+    (record, _), fitted_in, own = recorded(PLANT), [], Assimilation.update
+
+    def update(self, *arguments):
+        fitted_in.append(done)
+        return own(self, *arguments)
+
+    monkeypatch.setattr(Assimilation, "update", update)
+    for fit in assimilation.fits.values():
+        monkeypatch.setattr(fit, "update", lambda *_: 1.0)
+    replayed = "rt_torchrl.twinning.hypotheses.assimilation.misfit"
+    monkeypatch.setattr(replayed, lambda one, *_: 100.0 if one is twin.twins[ALONE] else 1.0)
+    for done in range(14):
+        if done == 13:
+            twin.retreat()
+        found = assimilation.update([record], (), 1, torch.Generator())
+        rested = done not in fitted_in
+        assert math.isnan(found.gradient) == rested and math.isfinite(found.best)
+        assert not rested or found.best == pytest.approx(assimilation.cost_of(batch_of([record])))
+    assert fitted_in == (list(range(14)) if always else [0, 2, 5, 10, 13])
+
+
 def test_a_twin_that_diverges_leaves_the_hypotheses_out():
     """The step diverges for as long as a hypothesis counts."""
     twin, _ = ensemble(PLANT)
@@ -365,7 +392,7 @@ def test_the_state_is_kept():
 
 
 def counters(assimilation):
-    return {name: (fit.least, fit.waiting, fit.pause) for name, fit in assimilation.fits.items()}
+    return {name: (fit.least, fit.turns.waiting, fit.turns.pause) for name, fit in assimilation.fits.items()}
 
 
 def test_hypotheses_are_chosen_by_name():

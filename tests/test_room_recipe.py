@@ -72,7 +72,7 @@ def test_a_page_that_cannot_be_written_is_refused_before_any_work(name, tmp_path
 def test_trainings_and_optimum_are_of_the_recipe_with_the_unknown_system(options, system, unknown, tmp_path):
     made = recipe("unknown")
     config = from_command_line(made.Config, [*options, "--seeds", "2", "--folder", str(tmp_path)])
-    assert config.rows()[0] == "nothing" and len(config.rows()) == 1 + len(made.CATALOGUES[config.plant].SYSTEMS)
+    assert config.rows()[0] == "nothing" and len(config.rows()) == 1 + len(made.SYSTEMS[config.plant])
     trainings = config.trainings(system)
     assert [training.seed for training in trainings] == [0, 1]
     found = from_command_line(load_recipe(config.recipe).Config, trainings[1].arguments())

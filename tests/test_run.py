@@ -224,7 +224,7 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     monkeypatch.undo()
     resumed = with_all_parts(tmp_path / "parts", 3, resume=True)
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
-    assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].pause > 1
+    assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].turns.pause > 1
     assert resumed.algorithm.learner.trust not in (0.0, 1.0)  # it was measured
     assert resumed.algorithm.examination.correction(resumed.algorithm.short_term[-1]) is not None
     assert_same(found, resumed.train())

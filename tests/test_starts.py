@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 import torch
@@ -24,6 +25,7 @@ from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.cloning import clones
 from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.referees import ROLES
 from rt_torchrl.twinning.starts.recorded_flights import transitions_of
 
 GAINS = (0.6, 0.5)
@@ -76,6 +78,19 @@ def test_weights_of_a_run_are_taken_as_they_are(earlier, tmp_path):
     assert not len(found.start()) and found.referee.live == live_of(earlier)
     assert all(clones(policy, known.policy(role)) for role, policy in found.policies.items())
     assert torch.equal(found.twin.closure.matrix, known.closure.matrix) and not found.short_term
+
+
+def test_a_policy_that_ended_on_trial_does_not_act_first(earlier, tmp_path):
+    """The one that is expected to cost less does, and is imitated, although it was idle."""
+    copied = shutil.copytree(earlier, tmp_path / "earlier")
+    metrics = json.loads((copied / "metrics.json").read_text())
+    other = next(role for role in ROLES if role != metrics["summary"]["live"])
+    metrics["summary"]["preferred"] = other
+    (copied / "metrics.json").write_text(json.dumps(metrics))
+    run = training(tmp_path / "next", start=str(copied), model_free_policy="mlp", hidden=(6,))
+    run.algorithm.start()
+    assert run.algorithm.referee.live == run.algorithm.first.live == other
+    assert clones(run.algorithm.first.teacher, load_run(copied).policy(other))
 
 
 def test_another_kind_of_policy_imitates_the_one_that_was_live(earlier, tmp_path):

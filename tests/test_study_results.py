@@ -7,7 +7,7 @@ import pytest
 from handwritten_study import EPISODES, finished
 
 from rt_torchrl.atomic_file import finite
-from rt_torchrl.study import captions, report
+from rt_torchrl.study import captions, report, tables
 from rt_torchrl.study.results import Entry, arm_entry, difference, mean_interval, weight_error
 
 
@@ -29,6 +29,23 @@ def test_a_policy_on_trial_at_the_end_does_not_count(tmp_path):
     metrics["summary"]["preferred"] = "model_free"
     (found.folder / "metrics.json").write_text(json.dumps(metrics))
     assert arm_entry("twinning", [found]).mean == pytest.approx(2.0 * live)
+
+
+def test_an_unseen_episode_that_diverges_costs_infinitely(tmp_path):
+    """``metrics.json`` holds null there; the study must not fail, and the mean must not pass it over."""
+    found = [finished(tmp_path, seed, 0.1 * seed) for seed in range(2)]
+    metrics = found[1].metrics()
+    live = metrics["summary"]["live"]
+    metrics["summary"]["unseen"]["costs"][live][3] = None
+    for values in metrics["summary"]["unseen"]["merit"][live].values():
+        values["mean"] = None
+    (found[1].folder / "metrics.json").write_text(json.dumps(metrics))
+    entry = arm_entry("twinning", found)
+    assert np.isposinf(entry.mean) and np.isfinite(entry.costs[0]).all()
+    assert all(np.isnan(value) for value in entry.merit.values())
+    low, high = entry.interval()
+    assert np.isposinf(high) and not np.isnan(low)
+    assert tables.cost_cells(entry)[0] == "inf"
 
 
 def test_intervals_cover_the_mean_as_often_as_they_say():

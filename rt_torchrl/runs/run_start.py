@@ -21,6 +21,7 @@ from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, RunConfig
 from rt_torchrl.runs.settings import read_settings
+from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.referees import ROLES, Role
 from rt_torchrl.twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
@@ -85,13 +86,13 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
                 f"{', '.join(map(str, ours))}. Give the options of that run, such as --observe, or another start."
             )
     _require_same_closure(folder, run.closure, config.make_closure(plant, torch.Generator()))
-    arm, live = run.config.twinning.arm, _live(folder)
+    arm, preferred = run.config.twinning.arm, _preferred(folder)
     policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
 
     def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
         device = _device_of(physics, closure)
         return EarlierPolicies(
-            {role: policy.to(device) for role, policy in policies.items()}, run.closure.to(device), live
+            {role: policy.to(device) for role, policy in policies.items()}, run.closure.to(device), preferred
         )
 
     return start
@@ -111,16 +112,16 @@ def _require_same_closure(folder: Path, its: nn.Module, ours: nn.Module) -> None
         )
 
 
-def _live(folder: Path) -> Role:
-    """The role that was live at the end of a run."""
+def _preferred(folder: Path) -> Role:
+    """The role that was expected to cost less at the end of a run: the live one, unless it was on trial."""
     file = folder / "metrics.json"
     try:
-        live: Role = json.loads(file.read_text(encoding="utf-8"))["summary"]["live"]
+        role = preferred_role(json.loads(file.read_text(encoding="utf-8"))["summary"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file} does not say which policy was live ({error!r}); take a finished run.") from error
-    if live not in ROLES:
-        raise ValueError(f"{file} says that {live!r} was live; it must be {' or '.join(ROLES)}.")
-    return live
+    if role not in ROLES:
+        raise ValueError(f"{file} says that {role!r} was live; it must be {' or '.join(ROLES)}.")
+    return role
 
 
 def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:

@@ -17,5 +17,6 @@ def mean_interval(costs: Float[np.ndarray, "seeds episodes"]) -> tuple[float, fl
     rows = rng.integers(seeds, size=(RESAMPLES, seeds))
     columns = rng.integers(episodes, size=(RESAMPLES, episodes))
     means = [costs[np.ix_(r, c)].mean() for r, c in zip(rows, columns, strict=True)]
-    low, high = np.percentile(means, [2.5, 97.5])
+    # An episode that diverges costs infinitely, and nothing lies between infinity and infinity.
+    low, high = np.percentile(means, [2.5, 97.5], method="linear" if np.isfinite(means).all() else "nearest")
     return float(low), float(high)

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, ROLES, caption, legend_below, panels
 from rt_torchrl.runs.settings import BESIDE, read_settings
 from rt_torchrl.runs.summary import preferred_role
-from rt_torchrl.study.results import Entry
+from rt_torchrl.study.results import Entry, merit_means, numbers
 
 APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
 """Settings in which runs of one row may differ."""
@@ -55,7 +55,7 @@ def entries_of(folders: Sequence[Path]) -> tuple[list[Entry], list[Entry]]:
             controllers.setdefault(name, {"costs": unseen["costs"][name], "merit": result["merit"]})
     runs = [_entry(kind, group) for kind, group in grouped.items()]
     return runs, [
-        Entry(name=name, costs=np.array([one["costs"]], dtype=float), merit=_means(one["merit"]))
+        Entry(name=name, costs=np.array([numbers(one["costs"])]), merit=merit_means(one["merit"]))
         for name, one in controllers.items()
     ]
 
@@ -134,10 +134,10 @@ def _shown(value: Any) -> str:
 
 def _entry(kind: str, found: list[dict[str, Any]]) -> Entry:
     unseen = [(one["summary"]["unseen"], preferred_role(one["summary"])) for one in found]
-    merits = [_means(one["merit"][live]) for one, live in unseen]
+    merits = [merit_means(one["merit"][live]) for one, live in unseen]
     return Entry(
         name=kind,
-        costs=np.array([one["costs"][live] for one, live in unseen], dtype=float),
+        costs=np.array([numbers(one["costs"][live]) for one, live in unseen]),
         merit={name: float(np.mean([merit[name] for merit in merits])) for name in merits[0]},
         curves=[_curve(one["episodes"]) for one in found],
     )
@@ -146,7 +146,3 @@ def _entry(kind: str, found: list[dict[str, Any]]) -> Entry:
 def _curve(episodes: list[dict[str, Any]]) -> list[float]:
     judged = all("J_a_unseen" in episode for episode in episodes)
     return [episode["J_a_unseen" if judged else "real_cost"] for episode in episodes]
-
-
-def _means(merit: dict[str, dict[str, Any]]) -> dict[str, float]:
-    return {name: np.nan if values["mean"] is None else float(values["mean"]) for name, values in merit.items()}

@@ -1,6 +1,7 @@
 """Results of the study: costs of every arm and yardstick on the same unseen episodes, with their intervals."""
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -88,29 +89,39 @@ def arm_entry(name: str, trainings: list[Training]) -> Entry:
     found = [training.metrics() for training in trainings]
     summaries = [metrics["summary"] for metrics in found]
     acting = [preferred_role(summary) for summary in summaries]
-    merits = [summary["unseen"]["merit"][live] for summary, live in zip(summaries, acting, strict=True)]
+    merits = [merit_means(summary["unseen"]["merit"][live]) for summary, live in zip(summaries, acting, strict=True)]
     twinned = trainings[0].arm != "model_free"
     return Entry(
         name=name,
-        costs=np.array([s["unseen"]["costs"][live] for s, live in zip(summaries, acting, strict=True)]),
-        merit={name: float(np.mean([merit[name]["mean"] for merit in merits])) for name in merits[0]},
+        costs=np.array([numbers(s["unseen"]["costs"][live]) for s, live in zip(summaries, acting, strict=True)]),
+        merit={name: float(np.mean([merit[name] for merit in merits])) for name in merits[0]},
         J_p_ratio=[numeric(summary["J_p_ratio"]) for summary in summaries] if twinned else [],
         weight_error=weight_errors(summaries) if twinned else [],
-        curves=[[e["J_a_unseen"] for e in metrics["episodes"] if "J_a_unseen" in e] for metrics in found],
-        twin_errors=[[numeric(e["J_p"]) for e in metrics["episodes"]] for metrics in found] if twinned else [],
+        curves=[numbers(e["J_a_unseen"] for e in metrics["episodes"] if "J_a_unseen" in e) for metrics in found],
+        twin_errors=[numbers(e["J_p"] for e in metrics["episodes"]) for metrics in found] if twinned else [],
     )
 
 
-def numeric(J_p: float | None) -> float:
-    """A J_p of ``metrics.json``, which holds null where the twin diverges: infinite there."""
-    return math.inf if J_p is None else J_p
+def numeric(found: float | None) -> float:
+    """A J_p or a cost of ``metrics.json``, which holds null where the twin or an episode diverges: infinite there."""
+    return math.inf if found is None else found
+
+
+def numbers(found: Iterable[float | None]) -> list[float]:
+    """The same of several."""
+    return [numeric(one) for one in found]
+
+
+def merit_means(merit: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Means of the plant's own quantities; not a number where they are not finite, as in episodes that diverge."""
+    return {name: math.nan if values["mean"] is None else float(values["mean"]) for name, values in merit.items()}
 
 
 def yardstick_entry(name: str, found: dict[str, Any]) -> Entry:
     """Entry of the oracle, of a classical controller, of the limit or of model predictive control."""
-    merit = {quantity: values["mean"] for quantity, values in found["merit"].items()}
     median = (found.get("milliseconds") or {}).get("median")
-    return Entry(name=name, costs=np.array([found["costs"]]), merit=merit, milliseconds=median)
+    costs = np.array([numbers(found["costs"])])
+    return Entry(name=name, costs=costs, merit=merit_means(found["merit"]), milliseconds=median)
 
 
 def weight_errors(summaries: list[dict[str, Any]]) -> list[float]:

@@ -88,7 +88,8 @@ class ReinforcementTwinning:
         self.referee = referee or make_referee(config.referee, acting)
         require_own_policies(self.policies, {"model_free": self.learner, "model_based": self.planner})
         share_critic(self.learner, model_based)
-        self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses)
+        self.fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
+        self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=self.fed_back)
         self.short_term = ShortTermMemory(config.records)
         self.informative = InformativeMemory(self.assimilation, config.informative)
         self.track_record = TrackRecord(self.policies)
@@ -111,8 +112,7 @@ class ReinforcementTwinning:
     @property
     def judged(self) -> int:
         """Number N of virtual episodes on which policies are judged."""
-        planned = isinstance(self.policies["model_based"], StateFeedback)
-        return self.config.planner.receding_horizon.virtual_episodes if planned else self.config.virtual_episodes
+        return self.config.planner.receding_horizon.virtual_episodes if self.fed_back else self.config.virtual_episodes
 
     def episode(self, tell: Callable[[str], None] = lambda step: None) -> EpisodeReport:
         """Fly one real episode and learn from it: the six steps of the paper, in order.

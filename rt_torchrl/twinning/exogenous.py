@@ -13,6 +13,12 @@ from torch import Tensor
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.signal import Signal, bounds
 
+LargeScale = Literal["met", "redrawn", "mixed"]
+ENOUGH = 3
+"""Number of episodes from which on their large scales say how much others may differ."""
+HEAVIEST = 4
+"""Least number of degrees of freedom of mixed large scales: with fewer, draws have hardly any bound."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ExogenousConfig:
@@ -25,15 +31,17 @@ class ExogenousConfig:
         penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
         tube: half-width ε of the regression's tube, in standard deviations of the record.
         large_scale: large scale of the inputs that steps 5 and 6 draw: met for those of the real episodes, as in the
-            paper, or redrawn for new ones with their spectra at random phases. A policy with hundreds of weights fits
-            itself to a few winds that were met. Redrawn inputs have no events at fixed times, such as a step.
+            paper, redrawn for new ones with their spectra at random phases, or mixed for new ones that differ from the
+            mean of those met as these do, see :func:`mixed`. A policy with hundreds of weights fits itself to a few
+            winds that were met, and few winds do not hold the rare ones that cost most. Redrawn inputs have no events
+            at fixed times, such as a step, and the means of those met; mixed ones keep events.
     """
 
     knots: int = 300
     kernel_width: float = 2.0
     penalty: float = 10.0
     tube: float = 0.05
-    large_scale: Literal["met", "redrawn"] = "met"
+    large_scale: LargeScale = "met"
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -115,7 +123,12 @@ class ExogenousProcess:
         return process
 
     def sample(
-        self, count: int, generator: torch.Generator, *, redrawn: bool = False
+        self,
+        count: int,
+        generator: torch.Generator,
+        *,
+        redrawn: bool = False,
+        large: Float[Tensor, "{count} n n_z"] | None = None,
     ) -> Float[Tensor, "{count} n n_z"]:
         """Realisations of the input, within the physical ranges of the signals.
 
@@ -123,6 +136,7 @@ class ExogenousProcess:
             count: number of realisations.
             generator: source of the draws.
             redrawn: whether each has a large scale of its own, with the spectrum of the record's.
+            large: large scale of each; by default that of the record, or a redrawn one.
         """
         n, n_z = self.mean.shape
         shape = (count, 2 * n, n_z)
@@ -131,7 +145,8 @@ class ExogenousProcess:
         )
         coloured = (self._root * noise.unsqueeze(-2)).sum(-1)
         small = torch.fft.fft(coloured, dim=1).real[:, :n]
-        large = self._redrawn(count, generator) if redrawn else self.mean
+        if large is None:
+            large = self._redrawn(count, generator) if redrawn else self.mean
         return (large + small).clamp(self._low, self._high)
 
     def _redrawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
@@ -145,13 +160,61 @@ class ExogenousProcess:
 
 
 def sample_experience(
-    processes: Sequence[ExogenousProcess], count: int, generator: torch.Generator, *, redrawn: bool = False
+    processes: Sequence[ExogenousProcess],
+    count: int,
+    generator: torch.Generator,
+    *,
+    large_scale: LargeScale = "met",
 ) -> Float[Tensor, "{count} n n_z"]:
-    """Realisations from the processes of several episodes, in random order; each is drawn once before any is again."""
+    """Realisations from the processes of several episodes, in random order; each is drawn once before any is again.
+
+    Args:
+        processes: processes of the episodes.
+        count: number of realisations.
+        generator: source of the draws.
+        large_scale: see :class:`ExogenousConfig`. Until three episodes can be mixed, they are taken as met.
+    """
     rounds = -(-count // len(processes))
     order = [torch.randperm(len(processes), generator=generator, device=generator.device) for _ in range(rounds)]
     chosen = torch.cat(order)[:count].tolist()
-    return torch.cat([processes[k].sample(1, generator, redrawn=redrawn) for k in chosen])
+    larges = mixed([one.mean for one in processes], count, generator) if large_scale == "mixed" else None
+    each = [None] * count if larges is None else larges.split(1)
+    of_each, redrawn = zip(chosen, each, strict=True), large_scale == "redrawn"
+    return torch.cat([processes[k].sample(1, generator, redrawn=redrawn, large=large) for k, large in of_each])
+
+
+def mixed(
+    larges: Sequence[Float[Tensor, "n n_z"]], count: int, generator: torch.Generator
+) -> Float[Tensor, "{count} n n_z"] | None:
+    r"""New large scales, which differ from the mean of those met as these do from each other.
+
+    .. math::
+        \tilde d'(t) = \bar d(t) + \sqrt{\frac{m + 1}{m\,(m - 1)}}\;
+            \frac1s\sum_{j=1}^m\xi_j\,\big(\tilde d_j(t) - \bar d(t)\big),
+        \qquad \xi_j \sim \mathcal N(0, 1), \quad \nu s^2 \sim \chi^2_\nu, \quad \nu = \max(m - 1, 4)
+
+    This is what m draws of a Gaussian process of unknown mean and covariance say of the next one. All inputs and all
+    times of an episode have the same ξ and s, so that they move together as in the episodes met.
+
+    Args:
+        larges: the m large scales met.
+        count: number of new ones.
+        generator: source of the draws.
+
+    Returns:
+        The new ones; None if there are fewer than three, of which nobody can tell how much others may differ.
+
+    Source: Gelman et al., Bayesian Data Analysis (2013), section 3.6.
+    """
+    m = len(larges)
+    if m < ENOUGH:
+        return None
+    met = torch.stack(list(larges))
+    centre = met.mean(0)
+    draw = partial(torch.randn, generator=generator, dtype=met.dtype, device=met.device)
+    spread = draw(count, max(m - 1, HEAVIEST)).square().mean(1, keepdim=True).sqrt()
+    weights = draw(count, m) / spread * ((m + 1) / (m * (m - 1))) ** 0.5
+    return centre + torch.einsum("cm,mnz->cnz", weights, met - centre)
 
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:

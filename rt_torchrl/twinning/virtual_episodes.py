@@ -94,9 +94,9 @@ class VirtualEpisodes:
         optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
         one wind of twenty.
         """
-        plant, redrawn = self.twin.plant, self.config.large_scale == "redrawn"
+        plant, large_scale = self.twin.plant, self.config.large_scale
         initial_state = plant.draw_initial_state(count, self.generator)
-        exogenous = sample_experience(self.processes, count, self.generator, redrawn=redrawn)
+        exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
         return Scenario(initial_state, plant.with_previews(exogenous))
 
     @torch.no_grad()

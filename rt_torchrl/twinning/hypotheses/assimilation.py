@@ -1,168 +1,24 @@
 """Step 4 for several hypotheses: each is fitted to the same records, and weighed by how well it replays them."""
 
-import contextlib
-import copy
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 
-from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.plants.extensions.neural_residual import ResidualRates
-from rt_torchrl.trajectories.rollout import DivergenceError
-from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
-from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.exogenous import ExogenousProcess
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
-from rt_torchrl.twinning.hypotheses.reread import Reread, at_rest, reread
+from rt_torchrl.twinning.hypotheses.fit import Fit, misfit
+from rt_torchrl.twinning.hypotheses.turns import Turns
 
 SEGMENTS = 60
 """Number of segments of an episode by default."""
-FIRST = 3 * ("short", "whole")
-"""Stages of the first fit: steps over segments, and over whole records."""
-AGAIN = ("short",)
-"""Stages of every further fit, in which whole records have hardly ever found more."""
-STEPS = 10
-"""Greatest number of Levenberg-Marquardt steps over segments in a stage."""
 HOPELESS = 1e-3
 """Weight, as a share of the greatest one, below which a hypothesis is fitted in fewer episodes."""
-LONGEST_PAUSE = 8
-"""Greatest number of episodes between two fits of a hopeless hypothesis."""
-HELD = 0.1
-"""Twice the cost, as a share of the misfit of a segment, of a weight of a neural residual that has changed by one."""
-FAR = 10.0
-"""Ratio of misfits beyond which a stage has gone astray, or the weights of the last episode have."""
-
-
-class Fit:
-    """The fit of one hypothesis: steps over segments, at first in turns with whole records; the best weights stay.
-
-    Over a whole record of a system that oscillates nearly every weight has local minima. Over segments that begin with
-    what was read (multiple shooting) it has few; the hidden states go on through all segments, with their derivatives.
-    Where some steps over segments have not arrived, the methods take turns, and each frees the other.
-
-    Args:
-        twin: twin of the hypothesis, whose closure is updated in place.
-        config: parameters of step 4, for the whole records.
-        segment: number of control intervals of a segment.
-    """
-
-    def __init__(self, twin: DigitalTwin, config: AssimilationConfig, segment: int):
-        self.twin, self.segment = twin, segment
-        measured = dataclasses.replace(config, inputs="record")
-        short = dataclasses.replace(
-            measured,
-            method="levenberg_marquardt",
-            initial="measured",
-            segment=0,
-            stop_ratio=0.0,
-            iterations=STEPS,
-        )
-        self.stages = {
-            "short": Assimilation(twin.of(Reread(twin.plant)), short),
-            "whole": Assimilation(twin, measured),
-        }
-        self.least, self.waiting, self.pause = math.inf, 0, 1
-        self._first = copy.deepcopy(twin.closure.state_dict())
-        self._held = not config.prior and any(isinstance(m, ResidualRates) for m in twin.closure.modules())
-
-    def update(self, records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        """Fit the records: by both stages in turn the first time, by steps over segments from then on.
-
-        Where these have not arrived, and much more is left over than the last time, the fit also begins anew from the
-        first weights: those of the last episode may explode on these records, and no step leads back from there.
-
-        Returns:
-            The misfit of the best weights, which the closure has then.
-        """
-        first = math.isinf(self.least)
-        least, arrived = self._run(records, FIRST if first else AGAIN, generator)
-        if not (first or arrived or least < FAR * self.least):
-            least = self._anew(records, least, generator)
-        self.least = least
-        return least
-
-    def _anew(self, records: Sequence[Trajectory], least: float, generator: torch.Generator) -> float:
-        """Fit from the first weights; the present ones stay unless their misfit is greater."""
-        closure = self.twin.closure
-        present = copy.deepcopy(closure.state_dict())
-        closure.load_state_dict(self._first)
-        found, _ = self._run(records, FIRST, generator)
-        if not found < least:
-            closure.load_state_dict(present)
-        return min(found, least)
-
-    def _run(
-        self, records: Sequence[Trajectory], stages: Sequence[str], generator: torch.Generator
-    ) -> tuple[float, bool]:
-        """Go through stages until steps over segments have arrived.
-
-        Returns:
-            The misfit of the best weights, which the closure has then, and whether the steps have arrived.
-        """
-        plant, closure = self.twin.plant, self.twin.closure
-        least, best = misfit(self.twin, records, self.segment), copy.deepcopy(closure.state_dict())
-        self._hold(least)
-        taken = {"short": [reread(record, plant, self.segment) for record in records]}
-        taken["whole"] = [at_rest(record, plant) for record in records]
-        arrived = False
-        for name in stages:
-            safe_point()
-            steps = STEPS
-            # A twin that diverges on the way only loses the stage.
-            with contextlib.suppress(FloatingPointError):
-                steps = self.stages[name].update(taken[name], (), 1, generator).iterations
-            found = misfit(self.twin, records, self.segment)
-            if found < least:
-                least, best = found, copy.deepcopy(closure.state_dict())
-            elif not found < FAR * least:
-                closure.load_state_dict(best)
-            arrived = name == "short" and steps < STEPS
-            if arrived:
-                break
-        closure.load_state_dict(best)
-        return least, arrived
-
-    def _hold(self, least: float) -> None:
-        """Hold the weights of a neural residual by a prior whose unit is the present misfit; see ``HELD``.
-
-        Without it the weights that the records hardly show spoil the steps, and many weights follow noise.
-        """
-        for stage in self.stages.values() if self._held and math.isfinite(least) else ():
-            stage.prior.stiffness = HELD * least
-
-    def cost(self, records: Sequence[Trajectory]) -> float:
-        """J_p of whole records under their measured inputs; infinite if the twin diverges on them."""
-        return self.stages["whole"].cost_of(batch_of([at_rest(record, self.twin.plant) for record in records]))
-
-    def due(self) -> bool:
-        """Whether the fit is due, which a hopeless hypothesis is in ever fewer episodes."""
-        self.waiting -= 1
-        return self.waiting < 0
-
-    def rest(self, *, hopeless: bool) -> None:
-        """Wait twice as long as before until the next fit of a hopeless hypothesis, and not at all with another one."""
-        if not hopeless:
-            self.waiting, self.pause = 0, 1
-        elif self.waiting < 0:
-            self.waiting, self.pause = self.pause, min(2 * self.pause, LONGEST_PAUSE)
-
-    def state_dict(self) -> dict[str, Any]:
-        stages = {name: stage.state_dict() for name, stage in self.stages.items()}
-        counters = {"least": self.least, "waiting": self.waiting, "pause": self.pause}
-        return counters | {"closure": self.twin.closure.state_dict(), **stages}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.least, self.waiting, self.pause = state["least"], state["waiting"], state["pause"]
-        self.twin.closure.load_state_dict(state["closure"])
-        for name, stage in self.stages.items():
-            stage.load_state_dict(state[name])
 
 
 class EnsembleAssimilation(Assimilation):
@@ -174,14 +30,24 @@ class EnsembleAssimilation(Assimilation):
         twin: the ensemble, whose closures and weights are updated in place.
         config: parameters of step 4.
         hypotheses: parameters of the hypotheses.
+        always: whether the twin alone is fitted in every episode, because state feedback plans on it; otherwise it
+            rests as any other hypothesis that explains nothing.
     """
 
-    def __init__(self, twin: TwinEnsemble, config: AssimilationConfig, hypotheses: HypothesesConfig):
+    def __init__(
+        self,
+        twin: TwinEnsemble,
+        config: AssimilationConfig,
+        hypotheses: HypothesesConfig,
+        *,
+        always: bool = False,
+    ):
         super().__init__(twin, config)
         self.ensemble, self.hypotheses = twin, hypotheses
         self.segment = hypotheses.segment or max(2, twin.plant.n_steps // SEGMENTS)
         twin.risk = hypotheses.risk
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
+        self.always, self.turns = always, Turns()
         self.misfits: dict[str, float] = {}
         self.called = not hypotheses.call
         self._records: Sequence[Trajectory] = ()
@@ -194,13 +60,30 @@ class EnsembleAssimilation(Assimilation):
         count: int,
         generator: torch.Generator,
     ) -> Descended:
-        """As :meth:`Assimilation.update`, whose result is that of the twin alone, and fit the hypotheses if called."""
+        """As :meth:`Assimilation.update`, and fit the hypotheses if they have been called.
+
+        Returns:
+            The result of the twin alone. Where it rests, that is its present cost, without a gradient.
+        """
         self._before = self._believed_cost(records) if self.ensemble.hypothesis else None
-        found = super().update(records, processes, count, generator)
+        found = self._fit_alone(records, processes, count, generator)
         self._records = records
         if self.called:
             self._weigh(generator)
         return found
+
+    def _fit_alone(
+        self,
+        records: Sequence[Trajectory],
+        processes: Sequence[ExogenousProcess],
+        count: int,
+        generator: torch.Generator,
+    ) -> Descended:
+        """Fit the twin alone if that is due, or it is planned on; its gradient is not known where it rests."""
+        if self.turns.due() or self.always or ALONE in self.ensemble.weights:
+            return super().update(records, processes, count, generator)
+        cost = self.cost_of(batch_of(records))
+        return Descended(cost, cost, math.nan, 0)
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Fit the hypotheses from now on if a real episode cost other than the twin says, and no more if none helps.
@@ -226,12 +109,13 @@ class EnsembleAssimilation(Assimilation):
         misfits = {name: self._misfit(fit, records, generator) for name, fit in self.fits.items()}
         self.misfits = {ALONE: alone} | misfits
         shares = evidence(self.misfits, self.hypotheses)
+        self.turns.rest(hopeless=shares[ALONE] < HOPELESS)
         for name, fit in self.fits.items():
-            fit.rest(hopeless=shares[name] < HOPELESS)
+            fit.turns.rest(hopeless=shares[name] < HOPELESS)
         self.ensemble.weights = {name: share for name, share in shares.items() if share >= self.hypotheses.least}
 
-    def _misfit(self, fit: "Fit", records: Sequence[Trajectory], generator: torch.Generator) -> float:
-        return fit.update(records, generator) if fit.due() else misfit(fit.twin, records, self.segment)
+    def _misfit(self, fit: Fit, records: Sequence[Trajectory], generator: torch.Generator) -> float:
+        return fit.update(records, generator) if fit.turns.due() else misfit(fit.twin, records, self.segment)
 
     def _believed_cost(self, records: Sequence[Trajectory]) -> float:
         """J_p of the likeliest hypothesis, which is not the twin alone, over whole records."""
@@ -259,6 +143,7 @@ class EnsembleAssimilation(Assimilation):
             "misfits": dict(self.misfits),
             "weights": self.ensemble.weights,
             "called": self.called,
+            "alone": self.turns.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -267,18 +152,7 @@ class EnsembleAssimilation(Assimilation):
             fit.load_state_dict(state["fits"][name])
         self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
         self.called = state["called"]
-
-
-@torch.no_grad()
-def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> float:
-    """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
-    try:
-        stacked = batch_of([with_hidden_states(twin, record) for record in records])
-        measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
-        flown = twin.replay(measured[:, 0], exogenous, actions, start=start)
-    except DivergenceError:
-        return float("inf")
-    return identification_cost(twin.plant, flown, measured).mean().item()
+        self.turns.load_state_dict(state.get("alone", Turns().state_dict()))  # earlier versions fitted it always
 
 
 def evidence(misfits: dict[str, float], config: HypothesesConfig) -> dict[str, float]:

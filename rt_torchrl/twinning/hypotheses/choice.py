@@ -67,8 +67,16 @@ def extended(suspect: Plant, closure: nn.Module) -> nn.Module:
     return suspect.extended(closure)
 
 
-def make_assimilation(twin: DigitalTwin, config: AssimilationConfig, hypotheses: HypothesesConfig) -> Assimilation:
+def make_assimilation(
+    twin: DigitalTwin, config: AssimilationConfig, hypotheses: HypothesesConfig, *, always: bool = False
+) -> Assimilation:
     """Step 4 for a twin, or for an ensemble of them.
+
+    Args:
+        twin: the twin.
+        config: parameters of step 4.
+        hypotheses: parameters of the hypotheses.
+        always: whether the twin alone is fitted in every episode; see :class:`EnsembleAssimilation`.
 
     Raises:
         ValueError: if hypotheses are to be fitted to some sensors alone, or the plant has no such sensor.
@@ -81,5 +89,5 @@ def make_assimilation(twin: DigitalTwin, config: AssimilationConfig, hypotheses:
     if config.sensors:
         return SensorAssimilation(twin, config)
     if isinstance(twin, TwinEnsemble):
-        return EnsembleAssimilation(twin, config, hypotheses)
+        return EnsembleAssimilation(twin, config, hypotheses, always=always)
     return Assimilation(twin, config)

@@ -1,5 +1,7 @@
 """Hidden states along a record: what no sensor reads, given what the sensors read."""
 
+from weakref import WeakKeyDictionary
+
 import torch
 from torch import Tensor
 
@@ -20,6 +22,10 @@ class ReadInterval(Interval):
         return self.plant.step(drive.t, known, action, drive.exogenous, self.closure).state
 
 
+_intervals: "WeakKeyDictionary[DigitalTwin, ReadInterval]" = WeakKeyDictionary()
+"""The interval of each twin. The engine compares what is new to it with all that it knows, which takes milliseconds."""
+
+
 @torch.no_grad()
 def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
     """The record with the hidden states of a twin's plant, which follow from the readings of every interval.
@@ -35,7 +41,10 @@ def with_hidden_states(twin: DigitalTwin, record: Trajectory) -> Trajectory:
     if start.shape[-1] == read.shape[-1]:
         return record
     drive = drive_of(plant, record.exogenous[None], torch.cat([record.actions, read[:-1]], -1)[None])
-    ends = Native(compiled=False).end_states(ReadInterval(plant, twin.closure, None), start, drive)[:, 0]
+    interval = _intervals.get(twin)
+    if interval is None or interval.plant is not plant or interval.closure is not twin.closure:
+        interval = _intervals[twin] = ReadInterval(plant, twin.closure, None)
+    ends = Native(compiled=False).end_states(interval, start, drive)[:, 0]
     require_finite(plant, ends.unsqueeze(1), start, [twin.closure])
     states = torch.cat([start, ends])
     return record._replace(states=torch.cat([read, states[:, read.shape[-1] :]], -1))
