@@ -14,8 +14,7 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import check_options, main_of
-from rt_torchrl.envs.unknown_systems import SYSTEMS
-from rt_torchrl.plants.extensions.catalogue import require_systems
+from rt_torchrl.envs.unknown_systems import SYSTEMS, require_unknown
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.results import numeric
 from rt_torchrl.study.room import Room, require_page, room_table, write_into
@@ -93,7 +92,7 @@ class Config:
         if self.task == "hop" and self.plant != "flapping_wing":
             raise ValueError(f"task='hop' is a task of the drone; the plant is {self.plant}.")
         for system in self.systems:
-            require_systems(names(system), SYSTEMS[self.plant])
+            require_unknown(self.plant, names(system))
 
     def rows(self) -> tuple[str, ...]:
         """The systems of the table, in its order."""

@@ -15,8 +15,7 @@ if __name__ == "__main__":
 import tyro
 
 from rt_torchrl import check_options, main_of
-from rt_torchrl.envs.unknown_systems import SYSTEMS
-from rt_torchrl.plants.extensions.catalogue import require_systems
+from rt_torchrl.envs.unknown_systems import SYSTEMS, require_unknown
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.arms import SystemResult, classical_arms, trained_arm
 from rt_torchrl.study.results import yardstick_entry
@@ -159,7 +158,7 @@ class Config:
                     f"{', '.join(known)}, which a plus combines."
                 )
         for case, system in self.rows():
-            require_systems(names(system), SYSTEMS[CASES[case]])
+            require_unknown(CASES[case], names(system))
 
     def cases(self) -> list[str]:
         """The plants, and the drone's hop."""

@@ -101,7 +101,9 @@ def test_the_live_policy_is_judged_on_the_unseen_episodes_when_asked(tmp_path):
     metrics = run.train()
     assert ["J_a_unseen" in record for record in metrics["episodes"]] == [False, True, False, True]
     live = metrics["summary"]["live"]
-    assert metrics["episodes"][3]["J_a_unseen"] == metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
+    # Two libraries sum the costs, in an order that depends on the machine.
+    mean = metrics["summary"]["unseen"][f"J_a_{live}"]["mean"]
+    assert metrics["episodes"][3]["J_a_unseen"] == pytest.approx(mean, rel=1e-14)
 
 
 def test_the_model_free_policy_may_be_of_another_kind(tmp_path):
@@ -112,7 +114,8 @@ def test_the_model_free_policy_may_be_of_another_kind(tmp_path):
     }
     unseen = run.train()["summary"]["unseen"]
     for key, role in (("J_a_before", "model_based"), ("J_a_before_model_free", "model_free")):
-        assert unseen[key]["mean"] == run.unseen.control_costs(run.initial_policies[role]).mean().item()
+        cost = run.unseen.control_costs(run.initial_policies[role]).mean().item()
+        assert unseen[key]["mean"] == pytest.approx(cost, rel=1e-14)
     with pytest.raises(ValueError, match="model_free_policy='cubic' does not exist"):
         small_run(tmp_path / "other", model_free_policy="cubic")
 
