@@ -176,6 +176,7 @@ class CommandCost:
             signals = (signals_of([torch.from_numpy(x.transpose(0, 2, 1))]) for x in self._x)
             self._driven = [(each, 0, lanes - 1, 0) for each in signals]
             self._costate, self._nothing = np.empty((n_s, lanes)), np.zeros((1, n_s, lanes))
+            self._by_weights = np.zeros((0, lanes))
             self._first_block = np.arange(0, n, self.hold)
         self._groups, first = groups, 1 + self._drive.exogenous.shape[-1]
         exogenous, state = self._drive.exogenous.numpy(), self._state.numpy()[None]
@@ -207,8 +208,8 @@ class CommandCost:
         gradient: np.ndarray,
     ) -> None:
         x, states, n, n_a = self._x[k], self._states[k], self.n, unit.shape[-1]
-        lanes = np.repeat(group.gather(unit.transpose(1, 0, 2)), self.hold, 0)[:n]
-        x[:, -n_a:] = lanes
+        lanes = group.gather(unit.transpose(1, 0, 2))
+        x[:, -n_a:] = lanes if self.hold == 1 else np.repeat(lanes, self.hold, 0)[:n]
         driven = self._driven[k]
         programs.march(*driven, states, self._weights, n)
         self._costate[:] = 0.0
@@ -216,10 +217,11 @@ class CommandCost:
         costs[group.first : group.last] = states[-1, -1, : group.live]
         if self.terminal is not None:
             costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
-        by_weights = np.zeros((0, group.lanes))
-        arrays = (self._costate, self._weights, self._by_drive, by_weights)
+        arrays = (self._costate, self._weights, self._by_drive, self._by_weights)
         programs.sweeps[True](*driven, states, self._nothing, 0, *arrays, n)
-        by_blocks = np.add.reduceat(self._by_drive[:, -n_a:], self._first_block, 0)
+        by_blocks = self._by_drive[:, -n_a:]
+        if self.hold > 1:
+            by_blocks = np.add.reduceat(by_blocks, self._first_block, 0)
         gradient[group.first : group.last] = by_blocks[:, :, : group.live].transpose(2, 0, 1)
 
     def _end(self, ends: np.ndarray, live: int) -> np.ndarray:

@@ -32,6 +32,8 @@ class SharedCommands:
 
     def plans(self, point: Float[np.ndarray, "variables n_a"], count: int) -> Float[np.ndarray, "{count} m n_a"]:
         """The plan of each of ``count`` futures; p is less where the window is shorter."""
+        if count == 1:
+            return point[None]
         n_a = point.shape[-1]
         shared = min(len(point), self.shared)
         first = np.broadcast_to(point[:shared], (count, shared, n_a))
@@ -42,6 +44,8 @@ class SharedCommands:
     ) -> tuple[float, Float[np.ndarray, "variables n_a"]]:
         """J and its gradient by the variables of ``count`` futures."""
         costs, slopes = self.cost(self.plans(point, count))
+        if count == 1:
+            return float(costs[0]), slopes[0]
         first = slopes[:, : self.shared].sum(0)
         slope = np.concatenate([first, slopes[:, self.shared :].reshape(-1, slopes.shape[-1])])
         return float(costs.mean()), slope / count

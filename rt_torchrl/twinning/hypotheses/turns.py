@@ -1,5 +1,7 @@
 """In which episodes a hypothesis is fitted."""
 
+from typing import Any
+
 LONGEST_PAUSE = 8
 """Greatest number of episodes between two fits of a hopeless hypothesis."""
 
@@ -30,5 +32,5 @@ class Turns:
     def state_dict(self) -> dict[str, int]:
         return {"waiting": self.waiting, "pause": self.pause}
 
-    def load_state_dict(self, state: dict[str, int]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         self.waiting, self.pause = state["waiting"], state["pause"]
