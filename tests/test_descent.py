@@ -210,6 +210,26 @@ def test_a_cost_that_diverges_at_the_start_raises(optimiser, kind):
         Descent(point, DescentConfig(optimiser=optimiser)).run(Cliff(point, kind), 5)
 
 
+class Exploding(Bowl):
+    """A bowl whose gradient explodes to either side, as that of a flight that depends on its last digits."""
+
+    def __call__(self):
+        cost = super().__call__()
+        steep = (1e118 if len(self.seen) == 1 else -1e128) * self.point.at[1]
+        return cost + (steep - steep.detach())
+
+
+def test_lbfgs_ends_where_an_exploding_gradient_leaves_no_direction():
+    point = Point()
+    cost = Exploding(point)
+    found = Descent(point, DescentConfig(optimiser="lbfgs", rate=1.0)).run(cost, 30)
+    assert all(at.isfinite().all() for _, at in cost.seen)
+    assert found.iterations == len(cost.seen) < 30
+    assert found.best == min(seen for seen, _ in cost.seen) < found.start
+    best = min(cost.seen, key=lambda one: one[0])[1]
+    assert torch.equal(point.at, best)
+
+
 def test_halving_a_step_of_adam_by_hand():
     """Adam's first step has the length of its rate: 0 → −3 is over the cliff at −1, −1.5 still, −0.75 is not."""
     point = Point()

@@ -10,6 +10,9 @@ from torch import nn
 from traced_function import Snippet, compared, gap, signals, traced
 
 from rt_torchrl.programs.program import UntraceableError
+from rt_torchrl.trajectories.engines import programs
+from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.native import Native
 
 CASES = snippets.CASES | operator_snippets.OPERATORS
 REFUSED = {
@@ -93,8 +96,6 @@ def test_wide_perceptrons_need_no_wide_stack():
 
 def test_refusals_hold_no_tensors():
     """The traceback of a refusal would keep everything that was traced."""
-    from rt_torchrl.trajectories.engines import programs
-
     case, (state, drive) = CASES["sort"], signals(2, 2)
     with pytest.warns(UserWarning, match="sort"):
         assert programs.programs_of(case, state, drive) is None
@@ -102,6 +103,26 @@ def test_refusals_hold_no_tensors():
     kept = (found for found, _ in programs._kept.values())
     (refusal,) = (found for found in kept if isinstance(found, UntraceableError) and "sort" in str(found))
     assert refusal.__traceback__ is None
+
+
+@pytest.mark.parametrize("where", ["state", "weight"])
+@pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.filterwarnings("error")
+def test_what_is_no_number_refuses_no_code(where, wanted):
+    """A twin that explodes once does not leave its engine for the rest of a training."""
+    network, (state, drive) = nn.Linear(3, 3).double(), signals(4, 2)
+    interval = Snippet(lambda m, s, d: m.w0 * torch.tanh(m.modules_[0](s) * d.t.unsqueeze(-1) * d.exogenous), network)
+    spoiled = state.detach() if where == "state" else network.bias.data
+    before = spoiled.clone()
+    spoiled.fill_(torch.nan)
+    for number in (torch.nan, 0.0):
+        with torch.set_grad_enabled(wanted):
+            begin = torch.full_like(state, number) if where == "state" else state
+            found = Native(compiled=False).end_states(interval, begin, drive)
+            exact = Autograd(compiled=False).end_states(interval, begin, drive)
+        torch.testing.assert_close(found, exact, equal_nan=True)
+        spoiled.copy_(before)
+    assert programs.programs_of(interval, state, drive) is not None
 
 
 def test_code_may_compute_with_known_numbers_as_it_likes():

@@ -195,7 +195,13 @@ class _Seen:
         return relative
 
     def or_infinite(self) -> Tensor:
-        """The relative cost for a line search, which is infinite where a trial diverges."""
+        """The relative cost for a line search, which is infinite where a trial diverges.
+
+        The square of an exploding gradient overflows, and leaves L-BFGS without a direction: whatever it would try from
+        then on is NaN, so that the run ends.
+        """
+        if self.count and not all(w.isfinite().all() for w in self._weights):
+            raise _Finished
         try:
             return self()
         except _Diverged:

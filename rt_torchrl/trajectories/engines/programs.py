@@ -13,7 +13,7 @@ from rt_torchrl.programs.fingerprint import Fingerprint, fingerprint
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.vector_functions import lanes_of_this_machine
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.traced_interval import Point, Programs
+from rt_torchrl.trajectories.engines.traced_interval import Point, Programs, UncomparedError
 from rt_torchrl.trajectories.engines.weights import Weights
 
 KEPT = 256
@@ -33,8 +33,9 @@ _lock = threading.RLock()
 def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[Programs, Weights] | None:
     """The programs of an interval with its weights; None where there are none.
 
-    There are none for an interval that is not on the CPU or, with one warning, cannot become a program. Where a
-    gradient is wanted, the sweep is prepared too: later the interval may be another one.
+    There are none for an interval that is not on the CPU or, with one warning, cannot become a program. Where the
+    first states or weights are no numbers, there are none for this call. Where a gradient is wanted, the sweep is
+    prepared too: later the interval may be another one.
     """
     if initial_state.device.type != "cpu":
         return None
@@ -49,6 +50,8 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
                 driven = any(x.requires_grad for x in drive)
                 if torch.is_grad_enabled() and (driven or initial_state.requires_grad or weights.learned):
                     found.prepare_sweep(interval, driven)
+            except UncomparedError:
+                return None  # the next call may have numbers
             except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
                 found = _reason(error)
                 warnings.warn(f"engine 'parallel' takes the place of 'native': {found}.", stacklevel=2)

@@ -31,6 +31,10 @@ ROUNDING = 1e-13
 such as 1 − tanh², nothing is left of a gradient but its rounding."""
 
 
+class UncomparedError(Exception):
+    """Where torch finds no numbers, machine code has nothing to be compared with."""
+
+
 class Point(NamedTuple):
     """States and drive of one interval for a few realisations, at which code is traced and compared."""
 
@@ -56,6 +60,7 @@ class Programs:
 
     Raises:
         UntraceableError: if the interval cannot become a program, or the program differs from torch.
+        UncomparedError: if torch finds no numbers at the point, such as with weights that are not finite.
     """
 
     def __init__(self, interval: nn.Module, point: Point, lanes: Lanes):
@@ -85,6 +90,7 @@ class Programs:
 
         Raises:
             UntraceableError: if it cannot become a program, or the program differs from torch.
+            UncomparedError: if torch finds no numbers at the point.
         """
         if driven in self.sweeps:
             return
@@ -115,7 +121,10 @@ class Programs:
             state, t, *rest = _gradients(end, [*leaves, *weights.learned], torch.from_numpy(costate.T))
         exact = [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
         found = [by_state.T, by_drive[0].T if driven else exact[1], *weights.split(by_weights.sum(-1))]
-        floor = ROUNDING / AGREEMENT * max(x[x.isfinite()].abs().amax().item() for x in exact if x.isfinite().any())
+        largest = [x[x.isfinite()].abs().amax().item() for x in exact if x.isfinite().any()]
+        if not largest:
+            raise UncomparedError
+        floor = ROUNDING / AGREEMENT * max(largest)
         names = ["state", "drive", *(name for name, w in interval.named_parameters() if w.requires_grad)]
         for name, part, exactly in zip(names, found, exact, strict=True):
             require_equal(f"the gradient by {name}", np.asarray(part), exactly.numpy(), np.full(exactly.shape, floor))
@@ -133,9 +142,12 @@ def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.nda
 
     Raises:
         UntraceableError: if a number differs by more than :data:`AGREEMENT` of the largest finite number of its column.
+        UncomparedError: if it differs, and torch finds something else than numbers, too.
     """
     sizes = np.abs(np.where(np.isfinite(exact), exact, 0.0)) + np.abs(np.where(np.isfinite(scale), scale, 0.0))
     equal = np.isclose(found, exact, rtol=0.0, atol=AGREEMENT * sizes.max(0, initial=0.0) + 1e-300, equal_nan=True)
+    if not equal.all() and not np.isfinite(exact).all():
+        raise UncomparedError
     if not equal.all():
         raise UntraceableError(
             f"{what} differs from what torch computes, for example {found[~equal][0]} instead of {exact[~equal][0]}. A "
