@@ -178,6 +178,23 @@ def test_mixed_large_scales_are_draws_of_student_s_distribution_of_the_next_one(
     assert (standard.abs() > 3.355).double().mean().item() == pytest.approx(0.01, abs=1e-3)
 
 
+def test_forty_mixed_large_scales_hold_rare_ones_as_often_as_they_come():
+    """What forty draws say of a cost that grows steeply scatters by two thirds of what independent ones say."""
+    m, n, count, repeats = 9, 20, 40, 200
+    level = torch.randn(m, 1, generator=seeded(3), dtype=torch.float64)
+    met = [(one + 0.1 * torch.linspace(0.0, 1.0, n, dtype=torch.float64)).unsqueeze(-1) for one in level]
+    generator = seeded(7)
+
+    def cost(found):
+        return found.mean((1, 2)).clamp_min(0.5).square()
+
+    even = torch.stack([cost(mixed(met, count, generator)).mean() for _ in range(repeats)])
+    # One draw from each net is an independent one.
+    alone = torch.cat([cost(mixed(met, 1, generator)) for _ in range(repeats)])
+    assert even.std() < alone.std() / count**0.5 / 1.5
+    assert even.mean().item() == pytest.approx(alone.mean().item(), abs=4.0 * alone.std().item() / repeats**0.5)
+
+
 def test_large_scales_are_mixed_from_the_third_episode_on():
     plant = WindTurbine(horizon=60.0)
     levels, seen = (8.0, 11.0, 14.0), {}

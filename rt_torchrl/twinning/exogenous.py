@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.twinning.quasi_random import student
 
 LargeScale = Literal["met", "redrawn", "mixed"]
 ENOUGH = 3
@@ -194,7 +195,9 @@ def mixed(
         \qquad \xi_j \sim \mathcal N(0, 1), \quad \nu s^2 \sim \chi^2_\nu, \quad \nu = \max(m - 1, 4)
 
     This is what m draws of a Gaussian process of unknown mean and covariance say of the next one. All inputs and all
-    times of an episode have the same ξ and s, so that they move together as in the episodes met.
+    times of an episode have the same ξ and s, so that they move together as in the episodes met. The draws are
+    :func:`~rt_torchrl.twinning.quasi_random.student`'s, along the principal components of the large scales met, the
+    greatest first: rare gusts are in forty of them, with neither luck nor bad luck.
 
     Args:
         larges: the m large scales met.
@@ -211,9 +214,9 @@ def mixed(
         return None
     met = torch.stack(list(larges))
     centre = met.mean(0)
-    draw = partial(torch.randn, generator=generator, dtype=met.dtype, device=met.device)
-    spread = draw(count, max(m - 1, HEAVIEST)).square().mean(1, keepdim=True).sqrt()
-    weights = draw(count, m) / spread * ((m + 1) / (m * (m - 1))) ** 0.5
+    changes = (met - centre) / (met - centre).square().mean((0, 1)).sqrt().clamp_min(1e-300)  # of one unit
+    components = torch.linalg.eigh(changes.flatten(1) @ changes.flatten(1).T).eigenvectors.flip(1)
+    weights = student(count, m, max(m - 1, HEAVIEST), generator) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
     return centre + torch.einsum("cm,mnz->cnz", weights, met - centre)
 
 
