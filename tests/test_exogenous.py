@@ -159,9 +159,9 @@ def test_redrawn_large_scales_keep_means_spectra_and_cross_spectra(n):
     assert (large.mean(0) - found.mean.mean(0)).abs().max() < 5 * found.mean.std(0).max() / math.sqrt(200)
 
 
-def test_mixed_large_scales_are_draws_of_student_s_distribution_of_the_next_one():
-    """Their mean is that of those met, and their covariance ν/(ν − 2) (1 + 1/m) times that of the sample."""
-    m, n, count = 9, 40, 200_000
+def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():
+    """Their mean is that of those met, and their covariance 1 + 1/m times that of the sample."""
+    m, n, count = 9, 40, 100_000
     t = torch.linspace(0.0, 1.0, n, dtype=torch.float64)
     level, slope = torch.randn(2, m, 1, generator=seeded(3), dtype=torch.float64)
     met = torch.stack([8.0 + level + slope * t, 3.0 - 0.5 * level + (t > 0.5)], -1)
@@ -169,17 +169,16 @@ def test_mixed_large_scales_are_draws_of_student_s_distribution_of_the_next_one(
     assert found.shape == (count, n, 2)
     flat, own = found.flatten(1), met.flatten(1)
     deviation = own.std(0)
-    assert ((flat.mean(0) - own.mean(0)).abs() / deviation).max() < 0.02
-    expected = 8 / 6 * (1 + 1 / m) * own.T.cov()
+    assert ((flat.mean(0) - own.mean(0)).abs() / deviation).max() < 0.01
     scale = deviation[:, None] * deviation
-    assert ((flat.T.cov() - expected).abs() / scale).max() < 0.03
-    # Student's t with eight degrees of freedom is beyond 3.355 in one of a hundred draws.
+    assert ((flat.T.cov() - (1 + 1 / m) * own.T.cov()).abs() / scale).max() < 0.01
+    # A normal number is beyond 2.576 in one of a hundred draws.
     standard = (flat[:, 0] - own[:, 0].mean()) / (deviation[0] * (1 + 1 / m) ** 0.5)
-    assert (standard.abs() > 3.355).double().mean().item() == pytest.approx(0.01, abs=1e-3)
+    assert (standard.abs() > 2.576).double().mean().item() == pytest.approx(0.01, abs=5e-4)
 
 
 def test_forty_mixed_large_scales_hold_rare_ones_as_often_as_they_come():
-    """What forty draws say of a cost that grows steeply scatters by two thirds of what independent ones say."""
+    """What forty draws say of a cost that grows steeply scatters by less than half of what independent ones say."""
     m, n, count, repeats = 9, 20, 40, 200
     level = torch.randn(m, 1, generator=seeded(3), dtype=torch.float64)
     met = [(one + 0.1 * torch.linspace(0.0, 1.0, n, dtype=torch.float64)).unsqueeze(-1) for one in level]
@@ -191,7 +190,7 @@ def test_forty_mixed_large_scales_hold_rare_ones_as_often_as_they_come():
     even = torch.stack([cost(mixed(met, count, generator)).mean() for _ in range(repeats)])
     # One draw from each net is an independent one.
     alone = torch.cat([cost(mixed(met, 1, generator)) for _ in range(repeats)])
-    assert even.std() < alone.std() / count**0.5 / 1.5
+    assert even.std() < alone.std() / count**0.5 / 2.0
     assert even.mean().item() == pytest.approx(alone.mean().item(), abs=4.0 * alone.std().item() / repeats**0.5)
 
 

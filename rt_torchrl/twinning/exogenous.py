@@ -12,13 +12,10 @@ from torch import Tensor
 
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.signal import Signal, bounds
-from rt_torchrl.twinning.quasi_random import student
 
 LargeScale = Literal["met", "redrawn", "mixed"]
 ENOUGH = 3
 """Number of episodes from which on their large scales say how much others may differ."""
-HEAVIEST = 4
-"""Least number of degrees of freedom of mixed large scales: with fewer, draws have hardly any bound."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,23 +188,23 @@ def mixed(
 
     .. math::
         \tilde d'(t) = \bar d(t) + \sqrt{\frac{m + 1}{m\,(m - 1)}}\;
-            \frac1s\sum_{j=1}^m\xi_j\,\big(\tilde d_j(t) - \bar d(t)\big),
-        \qquad \xi_j \sim \mathcal N(0, 1), \quad \nu s^2 \sim \chi^2_\nu, \quad \nu = \max(m - 1, 4)
+            \sum_{j=1}^m\xi_j\,\big(\tilde d_j(t) - \bar d(t)\big), \qquad \xi_j \sim \mathcal N(0, 1)
 
-    This is what m draws of a Gaussian process of unknown mean and covariance say of the next one. All inputs and all
-    times of an episode have the same ξ and s, so that they move together as in the episodes met. The draws are
-    :func:`~rt_torchrl.twinning.quasi_random.student`'s, along the principal components of the large scales met, the
-    greatest first: rare gusts are in forty of them, with neither luck nor bad luck.
+    Their covariance is 1 + 1/m times that of those met, because the mean is uncertain, too. All inputs and all times of
+    an episode have the same ξ, so that they move together as in the episodes met. The ξ are quasi-random, along the
+    principal components of the large scales met: some tens of draws hold rare ones as often as they come. Student's
+    distribution, which also knows that few episodes leave the covariance uncertain, is no help: after three episodes
+    its tails hold gusts that nothing could fly in, and a plan then considers nothing else.
 
     Args:
         larges: the m large scales met.
         count: number of new ones.
-        generator: source of the draws.
+        generator: source of the new ones.
 
     Returns:
         The new ones; None if there are fewer than three, of which nobody can tell how much others may differ.
 
-    Source: Gelman et al., Bayesian Data Analysis (2013), section 3.6.
+    Source: Owen, Scrambled net variance for integrals of smooth functions, Ann. Statist. 25 (1997) 1541.
     """
     m = len(larges)
     if m < ENOUGH:
@@ -216,8 +213,15 @@ def mixed(
     centre = met.mean(0)
     changes = (met - centre) / (met - centre).square().mean((0, 1)).sqrt().clamp_min(1e-300)  # of one unit
     components = torch.linalg.eigh(changes.flatten(1) @ changes.flatten(1).T).eigenvectors.flip(1)
-    weights = student(count, m, max(m - 1, HEAVIEST), generator) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
+    weights = _quasi_normal(count, m, generator).to(met) @ components.T * ((m + 1) / (m * (m - 1))) ** 0.5
     return centre + torch.einsum("cm,mnz->cnz", weights, met - centre)
+
+
+def _quasi_normal(count: int, dimensions: int, generator: torch.Generator) -> Float[Tensor, "{count} {dimensions}"]:
+    """Standard normal numbers that fill the space evenly; each draw is distributed as an independent one."""
+    seed = int(torch.randint(2**31, (), generator=generator, device=generator.device))
+    unit = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed).draw(count, dtype=torch.float64)
+    return torch.special.ndtri(unit.clamp(2.0**-31, 1.0 - 2.0**-31))
 
 
 def _large_scale(values: Float[np.ndarray, " n"], config: ExogenousConfig) -> Float[np.ndarray, " n"]:
