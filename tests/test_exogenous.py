@@ -184,14 +184,14 @@ def test_forty_mixed_large_scales_hold_rare_ones_as_often_as_they_come():
     met = [(one + 0.1 * torch.linspace(0.0, 1.0, n, dtype=torch.float64)).unsqueeze(-1) for one in level]
     generator = seeded(7)
 
-    def cost(found):
-        return found.mean((1, 2)).clamp_min(0.5).square()
+    def cost(mean):
+        return mean.clamp_min(0.5).square()
 
-    even = torch.stack([cost(mixed(met, count, generator)).mean() for _ in range(repeats)])
-    # One draw from each net is an independent one.
-    alone = torch.cat([cost(mixed(met, 1, generator)) for _ in range(repeats)])
-    assert even.std() < alone.std() / count**0.5 / 2.0
-    assert even.mean().item() == pytest.approx(alone.mean().item(), abs=4.0 * alone.std().item() / repeats**0.5)
+    even = torch.stack([cost(mixed(met, count, generator).mean((1, 2))).mean() for _ in range(repeats)])
+    normal = torch.randn(1_000_000, generator=generator, dtype=torch.float64)
+    independent = cost(level.mean() + 0.05 + level.std() * (1 + 1 / m) ** 0.5 * normal)
+    assert even.std() < independent.std() / count**0.5 / 2.0
+    assert even.mean().item() == pytest.approx(independent.mean().item(), abs=4.0 * even.std().item() / repeats**0.5)
 
 
 def test_large_scales_are_mixed_from_the_third_episode_on():
