@@ -65,6 +65,22 @@ class Descended(NamedTuple):
     iterations: int
 
 
+NOTHING = 1e-3
+"""Share of a cost that a descent must gain, where its gradient promises much more."""
+
+
+def stuck(before: float, after: float, promised: float, limit: float) -> bool:
+    r"""Whether a descent gained nothing, although its first gradient promised more than is believable.
+
+    Args:
+        before: cost at the start.
+        after: cost at the end.
+        promised: :math:`\|g\|\,\|w\|`, the change of the cost if the weights change by their norm along the gradient.
+        limit: greatest believable promise, in units of the cost.
+    """
+    return before - after <= NOTHING * abs(before) and promised > limit * abs(before)
+
+
 class Descent:
     """Updates the weights of a module in place and leaves the best weights in it.
 

@@ -16,6 +16,7 @@ from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.planners import Planner, PlannerConfig
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
+from rt_torchrl.twinning.way_back import WayBack
 
 
 class Planning:
@@ -38,6 +39,7 @@ class Planning:
     def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig, *, corrected: bool = False):
         self.planner, self.virtual, self.config = planner, virtual, config
         self.corrected = CorrectedPlans(planner, virtual) if corrected else None
+        self.way_back = WayBack(config.episode_gradient_limit)
         self.others: list[dict[str, Tensor]] = []
         self._first: list[dict[str, Tensor]] = []
 
@@ -54,7 +56,7 @@ class Planning:
             DivergenceError: if the twin diverges with the weights that have just flown.
         """
         withheld = self._recall(judged_on, judgement)
-        found = self._from_the_present(planned_on, judged_on, judgement)
+        found = self._from_the_present_or_earlier(planned_on, judged_on, judgement)
         found = merged(found, findings(recalled=float(withheld is not None)))
         if withheld is not None:
             found.update(findings(withheld=max(withheld, float(found.get("withheld", 0.0)))))
@@ -113,12 +115,13 @@ class Planning:
                 self._first.append(weights)
 
     def state_dict(self) -> dict[str, Any]:
-        """The weights that an approach will begin with; ``others`` is empty after each episode."""
-        return {"first": list(self._first)}
+        """The weights that later plans will begin with; ``others`` is empty after each episode."""
+        return {"first": list(self._first), "way_back": self.way_back.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of a planning with the same planner."""
         self._first = list(state["first"])
+        self.way_back.load_state_dict(state["way_back"])
 
     def _from_others(
         self,
@@ -155,6 +158,20 @@ class Planning:
         """The mean J_a with the price of leaving the bounds, if there are some, for a descent."""
         twin, constraints = self.virtual.twin, self.virtual.constraints
         return constraints.costs(twin, policy, episodes).mean() if constraints else twin.cost(policy, *episodes)
+
+    def _from_the_present_or_earlier(
+        self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement
+    ) -> TensorDict:
+        """A plan from the present weights and, where it is stuck, from earlier ones; the best plan stays."""
+        policy = self.planner.policy
+        if isinstance(policy, StateFeedback):
+            return self._from_the_present(planned_on, judged_on, judgement)
+        began, led_back = copy.deepcopy(policy.state_dict()), 0.0
+        found = self._from_the_present(planned_on, judged_on, judgement)
+        for weights in self.way_back.after(found, began, policy):
+            further = self._from_others(weights, planned_on, judged_on, judgement)
+            found, led_back = (found, led_back) if further is None else (further, 1.0)
+        return merged(found, findings(led_back=led_back))
 
     def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """A plan from the present weights; one that fails from extreme starts is made again on these, too."""

@@ -108,7 +108,8 @@ class PlannerConfig:
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
         episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
-            descent over whole episodes where the first one gains nothing beside a mean gradient that is longer;
+            descent over whole episodes where the first one gains nothing beside a mean gradient that is longer, and
+            of plans from earlier weights (:class:`~rt_torchrl.twinning.way_back.WayBack`) where neither gains anything;
             infinite for none, as in the paper.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         extremes: number of random initial states among which the extremes of each state are found, from which a plan

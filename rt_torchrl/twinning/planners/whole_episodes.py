@@ -7,16 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.optimisers.descent import Descended, Descent
+from rt_torchrl.optimisers.descent import Descended, Descent, stuck
 from rt_torchrl.optimisers.limited_mean import limited_mean
 from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints import Constraints
 from rt_torchrl.twinning.planners.planner import PlannerConfig
-
-NOTHING = 1e-3
-"""Share of a cost that a plan must gain, where its gradient promises much more."""
 
 
 class WholeEpisodes:
@@ -54,8 +51,7 @@ class WholeEpisodes:
     def _stalled(self, found: Descended, limit: float) -> bool:
         """Whether a descent gained nothing although its first gradient is longer than the limit."""
         size = norm_of([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
-        gained = found.start - found.best > NOTHING * abs(found.start)
-        return not gained and found.gradient * size > limit * abs(found.start)
+        return stuck(found.start, found.best, found.gradient * size, limit)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.constraints.costs(self.twin, self.policy, episodes)
