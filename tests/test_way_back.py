@@ -55,12 +55,34 @@ def weights(value):
     return LinearGain([[value, value]]).state_dict()
 
 
-def planning(limit):
+class TwoValleys(DigitalTwin):
+    """Two bowls over the second gain: one at 3, and a poor one at -3."""
+
+    def episode_costs(self, policy, initial_state, exogenous):
+        gain = policy.gain.flatten()
+        valleys = [offset + 0.1 * (gain[1] - at).square() for offset, at in ((1.0, 3.0), (1.5, -3.0))]
+        return torch.minimum(*valleys) * torch.ones(4).double()
+
+
+@pytest.mark.parametrize("anew", [0, 2])
+def test_the_second_plan_leaves_a_poor_minimum_from_the_first_weights(anew):
+    """The first plan ended in the poor one, because another episode had been met."""
+    steps = planning(10.0, anew, TwoValleys)
+    policy = steps.planner.policy
+    policy.load_state_dict(weights(1.0))
+    steps.plan(1, EPISODES, EPISODES, JUDGEMENT)
+    policy.load_state_dict(weights(-2.9))
+    found = steps.plan(2, EPISODES, EPISODES, JUDGEMENT)
+    assert found["led_back"] == float(anew == 2)
+    expected = 1.0 if anew else 1.5
+    assert steps.virtual.price(policy, EPISODES).item() == pytest.approx(expected, abs=1e-6)
+
+
+def planning(limit, anew=0, twin=Chaotic):
     plant, policy = LinearQuadratic(), LinearGain([[-1.0, -1.0]])
-    twin = Chaotic(plant, plant.closure)
-    config = PlannerConfig(
-        iterations=40, episode_gradient_limit=limit, descent=DescentConfig(optimiser="lbfgs", rate=1.0)
-    )
+    twin = twin(plant, plant.closure)
+    descent = DescentConfig(optimiser="lbfgs", rate=1.0)
+    config = PlannerConfig(iterations=40, anew=anew, episode_gradient_limit=limit, descent=descent)
     return Planning(WholeEpisodes(twin, policy, config), Virtual(twin), config)
 
 
@@ -79,7 +101,7 @@ def test_a_plan_that_is_stuck_is_made_from_earlier_weights_too(limit, led_back):
 def test_earlier_weights_that_lead_to_nothing_better_leave_the_policy_as_it_is():
     steps = planning(10.0)
     policy = steps.planner.policy
-    steps.way_back.load_state_dict({"sound": [weights(50.0)], "episodes": 0})
+    steps.way_back.load_state_dict({"sound": [weights(50.0)], "plans": 1, "stuck": 0})
     policy.load_state_dict(weights(8.0))
     found = steps.plan(1, EPISODES, EPISODES, JUDGEMENT)
     assert found["led_back"] == 0.0
@@ -96,6 +118,19 @@ def test_the_first_weights_and_the_last_sound_ones_are_tried_in_the_episodes_1_2
     again = WayBack(10.0)
     again.load_state_dict(way.state_dict())
     assert [each["gain"][0, 0].item() for each in again.after(EXPLODING, weights(6.0), policy)] == [5.0, 1.0]
+
+
+@pytest.mark.parametrize("limit", [10.0, math.inf])
+def test_the_first_plans_are_made_from_the_first_weights_too(limit):
+    way, policy = WayBack(limit, anew=3), LinearGain([[0.0, 0.0]])
+    tried = [[each["gain"][0, 0].item() for each in way.after(SOUND, weights(k), policy)] for k in (1.0, 2.0, 3.0, 4.0)]
+    assert tried == [[], [1.0], [1.0], []]
+
+
+@pytest.mark.parametrize("options", [{"anew": -1}, {"anew": 2, "method": "receding_horizon"}])
+def test_a_number_of_plans_that_makes_no_sense_is_refused(options):
+    with pytest.raises(ValueError, match=f"anew={options['anew']} of the planning must not be negative, and at most 1"):
+        PlannerConfig(**options)
 
 
 def test_a_plan_that_could_not_begin_is_stuck():

@@ -39,7 +39,7 @@ class Planning:
     def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig, *, corrected: bool = False):
         self.planner, self.virtual, self.config = planner, virtual, config
         self.corrected = CorrectedPlans(planner, virtual) if corrected else None
-        self.way_back = WayBack(config.episode_gradient_limit)
+        self.way_back = WayBack(config.episode_gradient_limit, config.anew)
         self.others: list[dict[str, Tensor]] = []
         self._first: list[dict[str, Tensor]] = []
 
@@ -162,7 +162,7 @@ class Planning:
     def _from_the_present_or_earlier(
         self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement
     ) -> TensorDict:
-        """A plan from the present weights and, where it is stuck, from earlier ones; the best plan stays."""
+        """A plan from the present weights and, if it is an early one or stuck, from earlier ones; the best stays."""
         policy = self.planner.policy
         if isinstance(policy, StateFeedback):
             return self._from_the_present(planned_on, judged_on, judgement)

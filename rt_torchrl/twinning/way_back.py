@@ -1,4 +1,4 @@
-"""Weights to plan from again where plans are stuck, because gradients explode."""
+"""Earlier weights to plan from again: the first ones, and sound ones where gradients explode."""
 
 import copy
 import math
@@ -14,24 +14,27 @@ Weights = dict[str, Tensor]
 
 
 class WayBack:
-    r"""The weights from which plans descended where gradients still said something.
+    r"""The weights with which earlier plans began, and from which the next plan is made, too.
 
-    A plan may end where the closed loop is unstable for a while in most episodes. Their gradients are as long as small
-    differences grow, and their directions say nothing, with a limit or without: every later plan ends where it begins.
-    The next plan is then made from earlier weights, too: from those with which the last plan that was not stuck began,
-    and from those of the first one.
+    *From the first ones.* The first plan knows the inputs of one episode or two, and may lie in a minimum that is poor
+    under those of others.
 
-    While plans stay stuck, such plans are made in the first episode, the second, the fourth, the eighth and so on.
+    *From sound ones.* A plan may end where the closed loop is unstable for a while in most episodes. Their gradients
+    are as long as small differences grow, and their directions say nothing, with a limit or without: every later plan
+    ends where it begins. Then the next plan is made from the weights with which the last plan began that was not stuck,
+    and from the first ones: in the first episode whose plan is stuck, and in the second, the fourth, the eighth and so
+    on of those that follow.
 
     Args:
         limit: greatest share by which a gradient may say that the cost changes by itself, over the share by which the
             weights change; infinite for any.
+        anew: number of plans, of which all but the first are also made from the weights of the first.
     """
 
-    def __init__(self, limit: float):
-        self.limit = limit
+    def __init__(self, limit: float, anew: int = 0):
+        self.limit, self.anew = limit, anew
         self._sound: list[Weights] = []
-        self._episodes = 0
+        self._plans = self._stuck = 0
 
     def after(self, found: TensorDict, began: Weights, policy: nn.Module) -> list[Weights]:
         """The weights from which to plan again.
@@ -42,27 +45,30 @@ class WayBack:
             policy: policy that the plan has updated.
 
         Returns:
-            Earlier weights, or none if the plan is not stuck or another one of its kind has been made of late.
+            Earlier weights; none for a plan that is not stuck, unless it is one of the first, and for one that is, if
+            others have been tried of late.
         """
-        if math.isinf(self.limit):
-            return []
-        if not self._stuck(found, [began[name] for name, w in policy.named_parameters() if w.requires_grad]):
-            self._sound, self._episodes = [*self._sound[:1], began], 0
-            return []
-        self._episodes += 1
-        return list(reversed(self._sound)) if self._episodes.bit_count() == 1 else []
+        self._plans += 1
+        first = self._sound[:1]
+        if self._is_stuck(found, [began[name] for name, w in policy.named_parameters() if w.requires_grad]):
+            self._stuck += 1
+            return self._sound[::-1] if self._stuck.bit_count() == 1 else []
+        self._sound, self._stuck = [*first, began], 0
+        return first if self._plans <= self.anew else []
 
-    def _stuck(self, found: TensorDict, began: list[Tensor]) -> bool:
+    def _is_stuck(self, found: TensorDict, began: list[Tensor]) -> bool:
         """Whether a plan gained nothing, although its first gradient is longer than the limit or no number."""
+        if math.isinf(self.limit):
+            return False
         if "policy_gradient" not in found:
             return True
         before, after, gradient = (found[key].item() for key in ("J_a_plan_before", "J_a_plan", "policy_gradient"))
         return stuck(before, after, gradient * norm_of(began).item(), self.limit)
 
     def state_dict(self) -> dict[str, Any]:
-        """The weights, and for how many episodes plans have been stuck."""
-        return {"sound": copy.deepcopy(self._sound), "episodes": self._episodes}
+        """The weights, the number of plans, and for how many of the last ones these have been stuck."""
+        return {"sound": copy.deepcopy(self._sound), "plans": self._plans, "stuck": self._stuck}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of another one."""
-        self._sound, self._episodes = list(state["sound"]), state["episodes"]
+        self._sound, self._plans, self._stuck = list(state["sound"]), state["plans"], state["stuck"]

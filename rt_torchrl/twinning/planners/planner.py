@@ -107,6 +107,9 @@ class PlannerConfig:
             episodes; 0 for none. A descent from the imitation of a controller may end in a minimum beside that
             controller.
         approach_at: number of the episode whose step 5 makes these plans. The twin should be right by then.
+        anew: number of plans, of which all but the first are also made from the weights with which the first began; the
+            better one on other virtual episodes stays. What is planned on the inputs of a single episode may lie in a
+            minimum that is poor in others. 0 and 1 plan from the present weights alone.
         episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
             descent over whole episodes where the first one gains nothing beside a mean gradient that is longer, and
             of plans from earlier weights (:class:`~rt_torchrl.twinning.way_back.WayBack`) where neither gains anything;
@@ -128,6 +131,7 @@ class PlannerConfig:
     rounds: int = 1
     approach: int = 0
     approach_at: int = 3
+    anew: int = 0
     episode_gradient_limit: float = 10.0
     experience: int = 100
     extremes: int = 1000
@@ -174,6 +178,11 @@ class PlannerConfig:
             raise ValueError(
                 f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
                 "no limit."
+            )
+        if self.anew < 0 or (self.anew > 1 and self.method == "receding_horizon"):
+            raise ValueError(
+                f"anew={self.anew} of the planning must not be negative, and at most 1 with method receding_horizon, "
+                "which has no weights."
             )
         if self.extremes < 0:
             raise ValueError(f"extremes={self.extremes} of the planning must not be negative; 0 looks at none.")
