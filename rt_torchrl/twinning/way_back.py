@@ -21,9 +21,9 @@ class WayBack:
 
     *From sound ones.* A plan may end where the closed loop is unstable for a while in most episodes. Their gradients
     are as long as small differences grow, and their directions say nothing, with a limit or without: every later plan
-    ends where it begins. Then the next plan is made from the weights with which the last plan began that was not stuck,
-    and from the first ones: in the first episode whose plan is stuck, and in the second, the fourth, the eighth and so
-    on of those that follow.
+    ends where it begins. A plan that gains nothing or is refused beside such a gradient is stuck. It is made again from
+    the weights with which the last plan began that was not, and from the first ones: in the first episode whose plan is
+    stuck, and in the second, the fourth, the eighth and so on while they stay so.
 
     Args:
         limit: greatest share by which a gradient may say that the cost changes by itself, over the share by which the
@@ -45,8 +45,8 @@ class WayBack:
             policy: policy that the plan has updated.
 
         Returns:
-            Earlier weights; none for a plan that is not stuck, unless it is one of the first, and for one that is, if
-            others have been tried of late.
+            Earlier weights; none for a plan that is not stuck, unless it is one of the first, and none for one that is
+            where they have been tried of late.
         """
         self._plans += 1
         first = self._sound[:1]
@@ -57,7 +57,7 @@ class WayBack:
         return first if self._plans <= self.anew else []
 
     def _is_stuck(self, found: TensorDict, began: list[Tensor]) -> bool:
-        """Whether a plan gained nothing, although its first gradient is longer than the limit or no number."""
+        """Whether a plan gained nothing or was refused, and its gradient is longer than the limit or no number."""
         if math.isinf(self.limit):
             return False
         if "policy_gradient" not in found:
