@@ -91,7 +91,7 @@ HOP = dataclasses.replace(
     # twenty virtual episodes do not say which of two plans is better in it.
     virtual_episodes=120,
     exogenous=dataclasses.replace(CONVERGED.exogenous, large_scale="mixed"),
-    # One record may look like a lag that there is none.
+    # On one record a lag that is not there may replay better than the twin alone.
     records=3,
     # A plan on the gust of the first flight may lie in a minimum that is poor in others.
     planner=dataclasses.replace(CONVERGED.planner, realisations=40, anew=2),
