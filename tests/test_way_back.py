@@ -64,6 +64,14 @@ class TwoValleys(DigitalTwin):
         return torch.minimum(*valleys) * torch.ones(4).double()
 
 
+def planning(limit, anew=0, twin=Chaotic):
+    plant, policy = LinearQuadratic(), LinearGain([[-1.0, -1.0]])
+    twin = twin(plant, plant.closure)
+    descent = DescentConfig(optimiser="lbfgs", rate=1.0)
+    config = PlannerConfig(iterations=40, anew=anew, episode_gradient_limit=limit, descent=descent)
+    return Planning(WholeEpisodes(twin, policy, config), Virtual(twin), config)
+
+
 @pytest.mark.parametrize("anew", [0, 2])
 def test_the_second_plan_leaves_a_poor_minimum_from_the_first_weights(anew):
     """The first plan ended in the poor one, because another episode had been met."""
@@ -76,14 +84,6 @@ def test_the_second_plan_leaves_a_poor_minimum_from_the_first_weights(anew):
     assert found["led_back"] == float(anew == 2)
     expected = 1.0 if anew else 1.5
     assert steps.virtual.price(policy, EPISODES).item() == pytest.approx(expected, abs=1e-6)
-
-
-def planning(limit, anew=0, twin=Chaotic):
-    plant, policy = LinearQuadratic(), LinearGain([[-1.0, -1.0]])
-    twin = twin(plant, plant.closure)
-    descent = DescentConfig(optimiser="lbfgs", rate=1.0)
-    config = PlannerConfig(iterations=40, anew=anew, episode_gradient_limit=limit, descent=descent)
-    return Planning(WholeEpisodes(twin, policy, config), Virtual(twin), config)
 
 
 @pytest.mark.parametrize(("limit", "led_back"), [(10.0, 1.0), (math.inf, 0.0)])
@@ -150,4 +150,4 @@ def test_a_plan_that_could_not_begin_is_stuck():
     ],
 )
 def test_a_descent_is_stuck_where_it_gains_nothing_of_what_its_gradient_promises(before, after, promised, expected):
-    assert stuck(before, after, promised, 10.0) is expected
+    assert stuck(before, after, promised / 5.0, [torch.tensor([3.0, 4.0])], 10.0) is expected

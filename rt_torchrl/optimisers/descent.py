@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.options import check_options
 
 Optimiser = Literal["adam", "lbfgs"]
@@ -69,15 +70,19 @@ NOTHING = 1e-3
 """Share of a cost that a descent must gain, where its gradient promises much more."""
 
 
-def stuck(before: float, after: float, promised: float, limit: float) -> bool:
+def stuck(before: float, after: float, gradient: float, weights: list[Tensor], limit: float) -> bool:
     r"""Whether a descent gained nothing, although its first gradient promised more than is believable.
+
+    A gradient promises :math:`\|g\|\,\|w\|`, the change of the cost if the weights change by their norm along it.
 
     Args:
         before: cost at the start.
         after: cost at the end.
-        promised: :math:`\|g\|\,\|w\|`, the change of the cost if the weights change by their norm along the gradient.
+        gradient: norm of the first gradient g.
+        weights: weights w.
         limit: greatest believable promise, in units of the cost.
     """
+    promised = gradient * norm_of(weights).item()
     return before - after <= NOTHING * abs(before) and promised > limit * abs(before)
 
 

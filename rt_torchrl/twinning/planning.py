@@ -61,8 +61,7 @@ class Planning:
         if withheld is not None:
             found.update(findings(withheld=max(withheld, float(found.get("withheld", 0.0)))))
         while self.others:
-            other = self._from_others(self.others.pop(), planned_on, judged_on, judgement)
-            found = found if other is None else other
+            found, _ = self._also_from([self.others.pop()], found, planned_on, judged_on, judgement)
         if self.config.approach and episode == self.config.approach_at:
             found = self._approached(found, planned_on, judged_on, judgement)
         for _ in range(self.config.rounds - 1):
@@ -99,10 +98,9 @@ class Planning:
         self, found: TensorDict, planned_on: Scenario, judged_on: Scenario, judgement: Judgement
     ) -> TensorDict:
         """The best plan by small steps from the present weights and from the first ones, or the plan found so far."""
-        accepted = False
-        for weights in (self.planner.policy.state_dict(), *self._first):
-            further = self._from_others(weights, planned_on, judged_on, judgement, approach=self.config.approach)
-            found, accepted = (found, accepted) if further is None else (further, True)
+        begins = [self.planner.policy.state_dict(), *self._first]
+        approach = self.config.approach
+        found, accepted = self._also_from(begins, found, planned_on, judged_on, judgement, approach=approach)
         self._first.clear()
         return merged(found, findings(approached=float(accepted)))
 
@@ -122,6 +120,23 @@ class Planning:
         """Go on from the :meth:`state_dict` of a planning with the same planner."""
         self._first = list(state["first"])
         self.way_back.load_state_dict(state["way_back"])
+
+    def _also_from(
+        self,
+        begins: list[dict[str, Tensor]],
+        found: TensorDict,
+        planned_on: Scenario,
+        judged_on: Scenario,
+        judgement: Judgement,
+        *,
+        approach: int = 0,
+    ) -> tuple[TensorDict, bool]:
+        """The best plan from other weights or the plan found so far, and whether it is from others."""
+        better = False
+        for weights in begins:
+            further = self._from_others(weights, planned_on, judged_on, judgement, approach=approach)
+            found, better = (found, better) if further is None else (further, True)
+        return found, better
 
     def _from_others(
         self,
@@ -166,12 +181,11 @@ class Planning:
         policy = self.planner.policy
         if isinstance(policy, StateFeedback):
             return self._from_the_present(planned_on, judged_on, judgement)
-        began, led_back = copy.deepcopy(policy.state_dict()), 0.0
+        began = copy.deepcopy(policy.state_dict())
         found = self._from_the_present(planned_on, judged_on, judgement)
-        for weights in self.way_back.after(found, began, policy):
-            further = self._from_others(weights, planned_on, judged_on, judgement)
-            found, led_back = (found, led_back) if further is None else (further, 1.0)
-        return merged(found, findings(led_back=led_back))
+        earlier = self.way_back.after(found, began, policy)
+        found, led_back = self._also_from(earlier, found, planned_on, judged_on, judgement)
+        return merged(found, findings(led_back=float(led_back)))
 
     def _from_the_present(self, planned_on: Scenario, judged_on: Scenario, judgement: Judgement) -> TensorDict:
         """A plan from the present weights; one that fails from extreme starts is made again on these, too."""

@@ -1,6 +1,5 @@
 """Earlier weights to plan from again: the first ones, and sound ones where gradients explode."""
 
-import copy
 import math
 from typing import Any
 
@@ -8,7 +7,6 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import stuck
-from rt_torchrl.optimisers.norm import norm_of
 
 Weights = dict[str, Tensor]
 
@@ -63,11 +61,11 @@ class WayBack:
         if "policy_gradient" not in found:
             return True
         before, after, gradient = (found[key].item() for key in ("J_a_plan_before", "J_a_plan", "policy_gradient"))
-        return stuck(before, after, gradient * norm_of(began).item(), self.limit)
+        return stuck(before, after, gradient, began, self.limit)
 
     def state_dict(self) -> dict[str, Any]:
         """The weights, the number of plans, and for how many of the last ones these have been stuck."""
-        return {"sound": copy.deepcopy(self._sound), "plans": self._plans, "stuck": self._stuck}
+        return {"sound": list(self._sound), "plans": self._plans, "stuck": self._stuck}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of another one."""

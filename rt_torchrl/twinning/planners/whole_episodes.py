@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent, stuck
 from rt_torchrl.optimisers.limited_mean import limited_mean
-from rt_torchrl.optimisers.norm import norm_of
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints import Constraints
@@ -50,8 +49,8 @@ class WholeEpisodes:
 
     def _stalled(self, found: Descended, limit: float) -> bool:
         """Whether a descent gained nothing although its first gradient is longer than the limit."""
-        size = norm_of([w.detach() for w in self.policy.parameters() if w.requires_grad]).item()
-        return stuck(found.start, found.best, found.gradient * size, limit)
+        weights = [w.detach() for w in self.policy.parameters() if w.requires_grad]
+        return stuck(found.start, found.best, found.gradient, weights, limit)
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.constraints.costs(self.twin, self.policy, episodes)
