@@ -280,9 +280,9 @@ def kept(misfits):
 
 def test_weights_ask_for_evidence():
     shares = evidence({ALONE: 1.0, "lags": 0.95}, HypothesesConfig())
-    assert shares == {ALONE: 1.0, "lags": pytest.approx(0.05 / 0.95**6)}
-    assert kept({ALONE: 1.0, "lags": 0.95}) == {ALONE}
-    assert kept({ALONE: 1.0, "lags": 0.8}) == {ALONE, "lags"}
+    assert shares == {ALONE: 1.0, "lags": pytest.approx(0.01 / 0.95**6)}
+    assert kept({ALONE: 1.0, "lags": 0.7}) == {ALONE}
+    assert kept({ALONE: 1.0, "lags": 0.65}) == {ALONE, "lags"}
     assert kept({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}) == {"lags", "late"}
     assert kept({ALONE: float("inf"), "lags": float("inf")}) == {ALONE}
     assert kept({ALONE: 0.0, "lags": 0.0}) == {ALONE}

@@ -80,12 +80,22 @@ class RealJudge:
 
     def expected(self, policy: nn.Module, cost: float) -> float:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
-        mean, deviation = self.belief(policy)
-        return cost * math.exp(mean + 0.5 * deviation**2) if cost > 0.0 else cost
+        return expected_cost(cost, self.belief(policy))
 
     def median(self, policy: nn.Module, cost: float) -> float:
         """The cost on the real system that is as likely exceeded as not."""
         return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
+
+    @cached_property
+    def _cautious(self) -> PairedDifferences:
+        """The belief that follows from paired differences of at least zero."""
+        known = self.learned
+        return PairedDifferences(known.actions, known.differences, known.exploration, least=0.0)
+
+    @torch.no_grad()
+    def cautious(self, policy: nn.Module, cost: float) -> float:
+        """The cost that is expected on the real system where no flight counts as cheaper than the twin says."""
+        return expected_cost(cost, self._cautious.belief(self.shares(policy)))
 
     @torch.no_grad()
     def refuted(self, policy: nn.Module) -> float:
@@ -110,10 +120,19 @@ class RealJudge:
 
     @torch.no_grad()
     def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
-        """Weights with which the same policy has flown, and is expected to cost less; None if there are none."""
+        """Weights with which the same policy has flown, and is expected to cost less; None if there are none.
+
+        Only flights that cost more than the twin says count. How much less others cost differs from gust to gust more
+        than from policy to policy, and is no reason to leave a policy.
+        """
         flown = [one for one in self.differences.policies if same_architecture(one, policy)]
-        costs = [self.expected(one, self.virtual.price(one, episodes).item()) for one in flown]
-        present = self.expected(policy, self.virtual.price(policy, episodes).item())
+        costs = [self.cautious(one, self.virtual.price(one, episodes).item()) for one in flown]
+        present = self.cautious(policy, self.virtual.price(policy, episodes).item())
         if not costs or not min(costs) < RECALLED_BELOW * present:
             return None
         return copy.deepcopy(flown[costs.index(min(costs))].state_dict())
+
+
+def expected_cost(cost: float, belief: Belief) -> float:
+    """The mean cost on the real system, where it has this cost on the twin."""
+    return cost * math.exp(belief.mean + 0.5 * belief.deviation**2) if cost > 0.0 else cost

@@ -34,7 +34,7 @@ class HypothesesConfig:
     which: Literal["none", "automatic"] = "automatic"
     call: float = 0.05
     names: tuple[str, ...] = ()
-    prior: float = 0.05
+    prior: float = 0.01
     sharpness: float = 6.0
     least: float = 0.1
     segment: int | None = None
