@@ -23,7 +23,7 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, evidence
+from rt_torchrl.twinning.hypotheses.assimilation import EnsembleAssimilation, counting, evidence
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
@@ -273,9 +273,9 @@ def test_virtual_episodes_are_those_of_the_likeliest_as_sensors_read_them():
     torch.testing.assert_close(flown.states, expected.states[..., :2])
 
 
-def kept(misfits):
-    config = HypothesesConfig()
-    return {name for name, share in evidence(misfits, config).items() if share >= config.least}
+def kept(misfits, **options):
+    config = HypothesesConfig(**options)
+    return set(counting(evidence(misfits, config), config.least))
 
 
 def test_weights_ask_for_evidence():
@@ -286,6 +286,7 @@ def test_weights_ask_for_evidence():
     assert kept({ALONE: 1.0, "lags": 0.1, "late": 0.11, "both": 1.0}) == {"lags", "late"}
     assert kept({ALONE: float("inf"), "lags": float("inf")}) == {ALONE}
     assert kept({ALONE: 0.0, "lags": 0.0}) == {ALONE}
+    assert kept({ALONE: 1.0, "lags": float("inf")}, least=0.0) == {ALONE}
 
 
 def test_hypotheses_wait_until_a_real_episode_costs_other_than_the_twin_says(monkeypatch):

@@ -1,5 +1,6 @@
 """Whatever gives a policy new weights is judged alike: plans from other weights, updates, clones."""
 
+import copy
 import math
 
 import pytest
@@ -8,6 +9,7 @@ from linear_quadratic import LinearGain
 from tensordict import TensorDict
 from test_evidence import Content, judge_of
 
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.distillation import DistillationConfig
@@ -79,6 +81,24 @@ def test_an_update_that_flights_refute_is_taken_back(evidence, kept):
     learning.update()
     report = learning.judge(EPISODES, judgement(evidence))
     assert said(learner.policy) == kept and report["update_accepted"] == float(evidence is None)
+
+
+@pytest.mark.parametrize("sound", [False, True])
+def test_an_unsound_twin_leaves_the_update_to_another_closure(sound, monkeypatch):
+    """Nothing flies on the twin. If what has flown does not, either, the step is repeated, with the update."""
+    virtual, learner = copy.copy(REFUTED.virtual), Hasty(LinearGain([[3.0, 0.0]]))
+    monkeypatch.setattr(virtual, "cost", lambda policy, episodes: torch.tensor(math.inf), raising=False)
+    given = Judgement(lambda cost, than: not cost < than, TrackRecord({}))
+    monkeypatch.setattr(given.track_record, "policy_flown", lambda: LinearGain([[1.0, 0.0]]))
+    learning = Learning(learner, virtual, taught=False)
+    learning.update()
+    if sound:
+        monkeypatch.setattr(virtual, "cost", lambda policy, _: torch.tensor(math.inf if said(policy) > 1.0 else 1.0))
+        assert not learning.judge(EPISODES, given)["update_accepted"] and said(learner.policy) == 3.0
+    else:
+        with pytest.raises(DivergenceError):
+            learning.judge(EPISODES, given)
+        assert said(learner.policy) == 2.0
 
 
 @pytest.mark.parametrize(("evidence", "kept"), [(None, 2.0), (REFUTED, 3.0)])

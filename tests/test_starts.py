@@ -9,11 +9,14 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD
+from test_hypotheses import ASSIMILATION as NEWTON
+from test_hypotheses import LAG, Suspecting
 
 from rt_torchrl.identification.sensor_log import LogConfig
 from rt_torchrl.identification.simulated_log import ClassicalLaw, recorded
 from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
@@ -24,6 +27,8 @@ from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_lengt
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.cloning import clones
 from rt_torchrl.twinning.distillation import DistillationConfig
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.referees import ROLES
 from rt_torchrl.twinning.starts.recorded_flights import transitions_of
@@ -109,6 +114,39 @@ def test_a_half_that_was_not_trained_begins_as_the_other(tmp_path):
     found = training(tmp_path / "whole", start=str(tmp_path / "half")).algorithm
     found.start()
     assert clones(found.policies["model_based"], load_run(tmp_path / "half").policy("model_free"))
+
+
+@pytest.fixture(scope="module")
+def believing(tmp_path_factory):
+    """A run that believes a lag of the force, and options of runs that begin with it."""
+    folder, known = tmp_path_factory.mktemp("believing") / "run", Suspecting(horizon=4.0)
+    config = HypothesesConfig(call=0.0, names=("lags",))
+    twinning = dataclasses.replace(SMALL, arm="model_based", assimilation=NEWTON, hypotheses=config)
+    options = {"episodes": 1, "compiled": False, "unseen": 2, "untrained": 0, "figures": False, "twinning": twinning}
+    Run(RunConfig(log_dir=folder, **options), LaggedActuator(known, "force", LAG), believed=known).train()
+    return folder, options | {"start": str(folder)}
+
+
+def test_hypotheses_of_a_run_go_on(believing, tmp_path):
+    folder, options = believing
+    found = Run(RunConfig(log_dir=tmp_path, **options), Suspecting(horizon=4.0)).algorithm
+    its, ours = load_run(folder, RunConfig, plant=Suspecting(horizon=4.0)).twin, found.twin
+    assert its.hypothesis == ours.hypothesis == "lags" and found.assimilation.called
+    (its, ours) = (twin.twins["lags"].closure.state_dict() for twin in (its, ours))
+    assert all(torch.equal(weight, its[name]) for name, weight in ours.items())
+
+
+def test_what_a_run_believes_must_be_among_the_hypotheses_of_the_next_one(believing, tmp_path):
+    options = believing[1] | {"log_dir": tmp_path}
+    late, alone = (
+        RunConfig(**options | {"twinning": dataclasses.replace(SMALL, hypotheses=hypotheses)})
+        for hypotheses in (HypothesesConfig(names=("late",)), HypothesesConfig(which="none"))
+    )
+    with pytest.raises(
+        ValueError, match=r"believes 'lags', but hypotheses 'lags' .*names of that run, or .*which none"
+    ):
+        Run(late, Suspecting(horizon=4.0))
+    assert not isinstance(Run(alone, Suspecting(horizon=4.0)).algorithm.twin, TwinEnsemble)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from rt_torchrl.optimisers.descent import DescentConfig, stuck
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.judgement import Judgement
-from rt_torchrl.twinning.planners import WholeEpisodes
+from rt_torchrl.twinning.planners import ShortHorizon, ShortHorizonConfig, WholeEpisodes
 from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 from rt_torchrl.twinning.way_back import WayBack
@@ -127,7 +127,25 @@ def test_the_first_plans_are_made_from_the_first_weights_too(limit):
     assert tried == [[], [1.0], [1.0], []]
 
 
-@pytest.mark.parametrize("options", [{"anew": -1}, {"anew": 2, "method": "receding_horizon"}])
+def test_the_copy_that_plans_over_a_short_horizon_goes_on():
+    """Its plans may gain nothing for a while."""
+    short = ShortHorizonConfig(window=5)
+    plant, config = LinearQuadratic(), PlannerConfig(iterations=1, episode_gradient_limit=1.0, short_horizon=short)
+    twin = Chaotic(plant, plant.closure)
+    planner = ShortHorizon(twin, LinearGain([[-1.0, -1.0]]), config, generator=torch.Generator())
+    way = Planning(planner, Virtual(twin), config).way_back
+    assert way.after(SOUND, weights(1.0), planner.policy) == []
+    assert way.after(EXPLODING, weights(2.0), planner.policy) == []
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"anew": -1},
+        {"anew": 2, "method": "receding_horizon"},
+        {"anew": 2, "short_horizon": ShortHorizonConfig(window=5)},
+    ],
+)
 def test_a_number_of_plans_that_makes_no_sense_is_refused(options):
     with pytest.raises(ValueError, match=f"anew={options['anew']} of the planning must not be negative, and at most 1"):
         PlannerConfig(**options)

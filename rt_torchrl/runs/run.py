@@ -35,13 +35,12 @@ from rt_torchrl.runs.results_table import next_steps, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
 from rt_torchrl.runs.run_settings import as_written, flat
-from rt_torchrl.runs.run_start import start_of
+from rt_torchrl.runs.run_start import start_of, twin_of
 from rt_torchrl.runs.tensor_file import save_tensors
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.cloning import of_each_role
-from rt_torchrl.twinning.hypotheses.choice import make_twin
 from rt_torchrl.twinning.referees import Role
 
 CHECKED_STEPS = 10
@@ -148,7 +147,7 @@ class Run:
         acting = acting_by_name(policies, first)
         self.algorithm = ReinforcementTwinning(
             operation_of(config, env, make_env, physics, acting, folder=self.folder) if config.asynchronous else env,
-            make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine, compiled=compiled),
+            twin_of(config, physics, closure, first, compiled=compiled),
             model_free=policies["model_free"],
             model_based=policies["model_based"],
             config=config.twinning,

@@ -23,6 +23,9 @@ from rt_torchrl.runs.run_config import STARTS, RunConfig
 from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.hypotheses.choice import make_twin
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.referees import ROLES, Role
 from rt_torchrl.twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
@@ -72,6 +75,16 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     )
 
 
+def twin_of(
+    config: RunConfig, physics: Plant, closure: nn.Module, first: Start | None, *, compiled: bool
+) -> DigitalTwin:
+    """The twin of a run, with the hypotheses of an earlier one that it begins with."""
+    twin = make_twin(physics, closure, config.twinning.hypotheses, engine=config.engine, compiled=compiled)
+    if isinstance(first, EarlierPolicies):
+        first.hand_over(twin)
+    return twin
+
+
 def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
     name = read_settings(folder)["plant"]
     if name != plant.name:
@@ -86,13 +99,17 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
                 f"{', '.join(map(str, ours))}. Give the options of that run, such as --observe, or another start."
             )
     _require_same_closure(folder, run.closure, config.make_closure(plant, torch.Generator()))
+    hypotheses = _hypotheses(folder, run.twin, config, plant)
     arm, preferred = run.config.twinning.arm, _preferred(folder)
     policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
 
     def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
         device = _device_of(physics, closure)
         return EarlierPolicies(
-            {role: policy.to(device) for role, policy in policies.items()}, run.closure.to(device), preferred
+            {role: policy.to(device) for role, policy in policies.items()},
+            run.closure.to(device),
+            preferred,
+            hypotheses,
         )
 
     return start
@@ -110,6 +127,24 @@ def _require_same_closure(folder: Path, its: nn.Module, ours: nn.Module) -> None
             f"start={str(folder)!r} is a run whose twin has a closure {type(its).__name__}, which does not fit the "
             f"{type(ours).__name__} of this run; give that run's --closure and --closure-hidden."
         )
+
+
+def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant) -> dict[str, Any] | None:
+    """The hypotheses of a run, where this run has some, too: the same ones, or else the run believed none."""
+    ours = make_twin(plant, config.make_closure(plant, torch.Generator()), config.twinning.hypotheses)
+    if not isinstance(its, TwinEnsemble) or not isinstance(ours, TwinEnsemble):
+        return None
+    found: dict[str, Any] = its.state_dict()["hypotheses"]
+    try:
+        ours.load_hypotheses(found)
+    except ValueError as error:
+        if its.hypothesis is None:
+            return None
+        raise ValueError(
+            f"start={str(folder)!r} is a run that believes {its.hypothesis!r}, but {error} Give the "
+            "--twinning.hypotheses.names of that run, or --twinning.hypotheses.which none to plan on the twin alone."
+        ) from error
+    return found
 
 
 def _preferred(folder: Path) -> Role:

@@ -40,7 +40,8 @@ class TwinningConfig:
             ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
         corrected_plans: whether plans, judged updates and distilled clones are judged by what they are expected to cost
             on the real system, as the paired differences of real episodes say, and step 5 goes back to weights that
-            have flown for less, where one of these episodes contradicts the twin; without it the twin alone judges.
+            have flown and are expected to cost less, where one of these episodes contradicts the twin; without it the
+            twin alone judges.
         corrected_descents: whether step 5 then also descends this expected cost. It leads on where no hypothesis
             explains the real system, by trials that cost real episodes. Needs corrected_plans.
         exploration: parameters of step 1.

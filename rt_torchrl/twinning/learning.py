@@ -1,6 +1,7 @@
 """Step 2: the learner's update, which step 6 can take back where it is worse."""
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -89,6 +90,9 @@ class Learning:
 
         Returns:
             ``update_accepted``, and the reason if it is 0.
+
+        Raises:
+            DivergenceError: if the twin diverges with both and with the weights that have just flown.
         """
         policy = self.learner.policy
         self.adopt(policy)
@@ -96,6 +100,10 @@ class Learning:
         found = judgement.costs(policy, self.virtual, judged_on).expected
         policy.load_state_dict(self._before)
         earlier = judgement.costs(policy, self.virtual, judged_on).expected
+        if not (math.isfinite(found) or math.isfinite(earlier)):
+            policy.load_state_dict(after)  # an unsound twin judges nothing, and the step is repeated with another one
+            judgement.track_record.require_sound_twin(self.virtual, judged_on)
+            policy.load_state_dict(self._before)
         if judgement.worse(found, earlier):
             self.learner.restart()
             reason = f"update refused: J_a of model_free would be {found:.4g}, it was {earlier:.4g}"

@@ -39,7 +39,9 @@ class Planning:
     def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig, *, corrected: bool = False):
         self.planner, self.virtual, self.config = planner, virtual, config
         self.corrected = CorrectedPlans(planner, virtual) if corrected else None
-        self.way_back = WayBack(config.episode_gradient_limit, config.anew)
+        # A copy of the policy descends over a short horizon, and goes on whether or not a plan gains anything.
+        limit = math.inf if config.short_horizon.window else config.episode_gradient_limit
+        self.way_back = WayBack(limit, config.anew)
         self.others: list[dict[str, Tensor]] = []
         self._first: list[dict[str, Tensor]] = []
 
@@ -82,7 +84,7 @@ class Planning:
         return 0.0 if evidence is None or isinstance(policy, StateFeedback) else evidence.refuted(policy)
 
     def _recall(self, judged_on: Scenario, judgement: Judgement) -> float | None:
-        """Go back to weights that have flown for less on the real system, and say what that withholds."""
+        """Go back to weights that have flown and are expected to cost less, and say what that withholds."""
         policy, evidence = self.planner.policy, judgement.evidence
         if evidence is None or isinstance(policy, StateFeedback):
             return None

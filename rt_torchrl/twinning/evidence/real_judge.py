@@ -120,14 +120,14 @@ class RealJudge:
 
     @torch.no_grad()
     def recalled(self, policy: nn.Module, episodes: Scenario) -> dict[str, Tensor] | None:
-        """Weights with which the same policy has flown, and is expected to cost less; None if there are none.
+        """Weights that have flown, and are expected to cost less than the present ones; None if there are none.
 
-        Only flights that cost more than the twin says count. How much less others cost differs from gust to gust more
-        than from policy to policy, and is no reason to leave a policy.
+        That flights with other weights cost less than the twin says does not count for them: it differs from gust to
+        gust more than from policy to policy, and is no reason to leave a policy.
         """
         flown = [one for one in self.differences.policies if same_architecture(one, policy)]
         costs = [self.cautious(one, self.virtual.price(one, episodes).item()) for one in flown]
-        present = self.cautious(policy, self.virtual.price(policy, episodes).item())
+        present = self.expected(policy, self.virtual.price(policy, episodes).item())
         if not costs or not min(costs) < RECALLED_BELOW * present:
             return None
         return copy.deepcopy(flown[costs.index(min(costs))].state_dict())

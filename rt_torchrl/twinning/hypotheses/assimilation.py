@@ -27,7 +27,8 @@ class EnsembleAssimilation(Assimilation):
     Hypotheses replay the measured inputs, because draws of the inputs hide small dynamics.
 
     Args:
-        twin: the ensemble, whose closures and weights are updated in place.
+        twin: the ensemble, whose closures and weights are updated in place. Where hypotheses have weight already, they
+            are fitted from the first episode on.
         config: parameters of step 4.
         hypotheses: parameters of the hypotheses.
         always: whether the twin alone is fitted in every episode, because state feedback plans on it; otherwise it
@@ -49,7 +50,7 @@ class EnsembleAssimilation(Assimilation):
         self.fits = {name: Fit(one, config, self.segment) for name, one in twin.twins.items() if name != ALONE}
         self.always, self.turns = always, Turns()
         self.misfits: dict[str, float] = {}
-        self.called = not hypotheses.call
+        self.called = not hypotheses.call or set(twin.weights) != {ALONE}
         self._records: Sequence[Trajectory] = ()
         self._before: float | None = None
 
@@ -112,7 +113,7 @@ class EnsembleAssimilation(Assimilation):
         self.turns.rest(hopeless=shares[ALONE] < HOPELESS)
         for name, fit in self.fits.items():
             fit.turns.rest(hopeless=shares[name] < HOPELESS)
-        self.ensemble.weights = {name: share for name, share in shares.items() if share >= self.hypotheses.least}
+        self.ensemble.weights = counting(shares, self.hypotheses.least)
 
     def _misfit(self, fit: Fit, records: Sequence[Trajectory], generator: torch.Generator) -> float:
         return fit.update(records, generator) if fit.turns.due() else misfit(fit.twin, records, self.segment)
@@ -153,6 +154,11 @@ class EnsembleAssimilation(Assimilation):
         self.misfits, self.ensemble.weights = dict(state["misfits"]), state["weights"]
         self.called = state["called"]
         self.turns.load_state_dict(state.get("alone", Turns().state_dict()))  # earlier versions fitted it always
+
+
+def counting(shares: dict[str, float], least: float) -> dict[str, float]:
+    """The weights of the hypotheses that are planned on; one without any weight is not, whatever the least is."""
+    return {name: share for name, share in shares.items() if share > 0.0 and share >= least}
 
 
 def evidence(misfits: dict[str, float], config: HypothesesConfig) -> dict[str, float]:

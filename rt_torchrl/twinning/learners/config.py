@@ -77,7 +77,7 @@ class IncrementalTD3Config:
         trust_region: greatest RMS change of the actions in one update in the states of ``actor_episodes``, as a share
             of half their range.
         settled: ratio of the mean |δ| of a hundred critic iterations to that of the hundred before from which on the
-            critics have settled; the policy waits for this at first and after a clone.
+            critics have settled; the policy waits for this at first and whenever its weights have jumped.
         recovery: ratio of the cost of a real episode to the least median of three in a row so far above which the
             policy goes back to the weights from before the update; infinity never does.
         trust: trust in the twin at first, from 0 to 1; 0 learns nothing from it.

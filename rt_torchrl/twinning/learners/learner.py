@@ -32,7 +32,7 @@ class Learner(Protocol):
         """
 
     def restart(self) -> None:
-        """Forget everything that belongs to the policy's earlier weights, because the policy has become a clone."""
+        """Forget everything that belongs to the policy's earlier weights, because the policy's weights have jumped."""
 
     def observations(self) -> Float[Tensor, "n n_o"]:
         """Observations on the real system, from which a clone of another architecture learns."""

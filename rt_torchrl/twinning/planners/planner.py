@@ -36,7 +36,7 @@ class Planner(Protocol):
         """React to a plan that was worse on other episodes; the policy has its earlier weights again."""
 
     def restart(self) -> None:
-        """Forget everything that belongs to the policy's earlier weights, because the policy has become a clone."""
+        """Forget everything that belongs to the policy's earlier weights, because the policy's weights have jumped."""
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next plan depends on, except the policy's weights: tensors in plain containers."""
@@ -113,7 +113,7 @@ class PlannerConfig:
         episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
             descent over whole episodes where the first one gains nothing beside a mean gradient that is longer, and
             of plans from earlier weights (:class:`~rt_torchrl.twinning.way_back.WayBack`) where neither gains anything;
-            infinite for none, as in the paper.
+            infinite for none, as in the paper. A short horizon has none either.
         experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
         extremes: number of random initial states among which the extremes of each state are found, from which a plan
             and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one
@@ -179,10 +179,10 @@ class PlannerConfig:
                 f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
                 "no limit."
             )
-        if self.anew < 0 or (self.anew > 1 and self.method == "receding_horizon"):
+        if self.anew < 0 or (self.anew > 1 and (self.short_horizon.window or self.method == "receding_horizon")):
             raise ValueError(
-                f"anew={self.anew} of the planning must not be negative, and at most 1 with method receding_horizon, "
-                "which has no weights."
+                f"anew={self.anew} of the planning must not be negative, and at most 1 with short_horizon.window and "
+                "with method=receding_horizon: it belongs to descents over whole episodes."
             )
         if self.extremes < 0:
             raise ValueError(f"extremes={self.extremes} of the planning must not be negative; 0 looks at none.")

@@ -100,11 +100,12 @@ class Referee(Protocol):
         """Role that does not act."""
 
     def worse(self, cost: float, than: float) -> bool:
-        """Whether a policy is worse than another one; plans, clones and swaps are all decided by this question.
+        """Whether a policy is worse than another one: a plan, a judged update or a clone than what it would replace.
 
         Args:
-            cost: mean J_a of the policy over virtual episodes; infinite or NaN if the twin diverges with it.
-            than: mean J_a of the other policy over the same virtual episodes.
+            cost: mean J_a of the policy over virtual episodes, or what it is expected to cost on the real system, with
+                the price of leaving bounds; infinite or NaN if the twin diverges with it.
+            than: the same of the other policy, over the same virtual episodes.
         """
 
     def decide(self, evidence: Evidence) -> Event:

@@ -1,18 +1,21 @@
-"""A start with the policies and the closure of an earlier training."""
+"""A start with the policies and the twin of an earlier training."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from torch import nn
 
 from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.flight import Flight
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.starts.start import Fly
 
 
 class EarlierPolicies:
-    """Policies and closure of an earlier training begin a new one; see :class:`Start` for the members.
+    """Policies and twin of an earlier training begin a new one; see :class:`Start` for the members.
 
     The weights of a policy of the same architecture are taken as they are: those of its own role, or else those of the
     policy that the referee preferred. Where a policy has another architecture, the preferred one flies one episode, and
@@ -23,10 +26,26 @@ class EarlierPolicies:
         closure: trained closure of the twin.
         live: role that was expected to cost less at the end of that training. It begins live, even if it was idle then,
             because the live policy was on trial.
+        hypotheses: closures and weights of the hypotheses, as :meth:`TwinEnsemble.load_hypotheses` takes them.
     """
 
-    def __init__(self, policies: Mapping[Role, nn.Module], closure: nn.Module, live: Role):
-        self.policies, self.closure, self.live = policies, closure, live
+    def __init__(
+        self,
+        policies: Mapping[Role, nn.Module],
+        closure: nn.Module,
+        live: Role,
+        hypotheses: Mapping[str, Any] | None = None,
+    ):
+        self.policies, self.closure, self.live, self.hypotheses = policies, closure, live, hypotheses
+
+    def hand_over(self, twin: DigitalTwin) -> None:
+        """Give the new training's twin the hypotheses, if both have some, before the algorithm takes it.
+
+        Raises:
+            ValueError: if they are not those of the twin.
+        """
+        if self.hypotheses is not None and isinstance(twin, TwinEnsemble):
+            twin.load_hypotheses(self.hypotheses)
 
     @property
     def teacher(self) -> nn.Module:
