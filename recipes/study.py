@@ -27,8 +27,8 @@ from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.task import Task
 from rt_torchrl.study.training import CHANGED, VARIANTS, Training
 from rt_torchrl.study.unknown import by_plant
+from rt_torchrl.study.yardstick import Yardstick
 from rt_torchrl.study.yardsticks import (
-    Yardstick,
     classical,
     cost_along_gain,
     cost_over_episodes,

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,21 +15,16 @@ import tyro
 from rt_torchrl import check_options, main_of
 from rt_torchrl.envs.unknown_systems import SYSTEMS, require_unknown
 from rt_torchrl.runs.results_file import make_folder, write_results
+from rt_torchrl.study.cases import UNSEEN, names, optimum, options_of
 from rt_torchrl.study.results import numeric
 from rt_torchrl.study.room import Room, require_page, room_table, write_into
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
-from rt_torchrl.study.yardsticks import Yardstick, oracle
+from rt_torchrl.study.yardstick import Yardstick
 
 if TYPE_CHECKING:
     from rt_torchrl.study.task import Task
 
-POLICY: dict[str, tuple[str, ...]] = {
-    "wind_turbine": ("--policy", "scheduled"),
-    "flapping_wing": ("--policy", "paper"),
-    "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
-}
-"""Policies of few weights, whose optimum exact gradients find."""
 WITH_HYPOTHESES = (
     *("--twinning.hypotheses.which", "automatic"),
     *("--twinning.referee.rule", "weight_of_evidence", "--twinning.corrected-plans"),
@@ -39,10 +33,6 @@ ALONE = (
     *("--twinning.hypotheses.which", "none"),
     *("--twinning.referee.rule", "decision_tree", "--twinning.no-corrected-plans"),
 )
-UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "cryogenic_tank": 50}
-"""Number of unseen episodes that judge a plant by default."""
-HOPS = 192
-"""Number of unseen episodes of the short hop, a few of which cost ten times as much as the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,16 +98,20 @@ class Config:
         """Folder of the plant and its task."""
         return self.folder / f"{self.plant}_{self.task}"
 
-    def options(self, system: str) -> tuple[str, ...]:
-        """Options of the recipe."""
-        judged = HOPS if self.task == "hop" else UNSEEN[self.plant]
-        found = (*POLICY[self.plant], "--unseen", str(self.unseen or judged))
-        found += ("--task", "hop") if self.task == "hop" else ()
-        return (*found, "--unknown", *names(system)) if names(system) else found
+    @property
+    def case(self) -> str:
+        """The plant, or the drone's hop."""
+        return "hop" if self.task == "hop" else self.plant
+
+    @property
+    def judged(self) -> int:
+        """Number of unseen episodes."""
+        return self.unseen or UNSEEN[self.case]
 
     def trainings(self, system: str, *, helped: bool = False) -> list[Training]:
         """A training of the model-based half for each seed, alone or with hypotheses."""
-        options, kind = (WITH_HYPOTHESES, "-hypotheses") if helped else (ALONE, "")
+        arm, kind = (WITH_HYPOTHESES, "-hypotheses") if helped else (ALONE, "")
+        options = (*options_of(self.case, system), "--unseen", str(self.judged), *arm)
         return [
             Training(
                 recipe=self.recipe,
@@ -126,7 +120,7 @@ class Config:
                 variant="nominal",
                 folder=self.kept / system / f"seed-{seed}{kind}",
                 episodes=self.episodes,
-                options=(*self.options(system), *options),
+                options=options,
             )
             for seed in range(self.seeds)
         ]
@@ -138,22 +132,15 @@ class Config:
 
     def optimum(self, system: str) -> Yardstick:
         """The best policy of the class on the true system."""
-        effort = {"starts": self.starts, "iterations": self.iterations, "polish": self.iterations // 3}
-        options = self.options(system)
-        judged = int(options[options.index("--unseen") + 1])
-        compute = partial(oracle, self.recipe, options, unseen=judged, **effort)
-        kept = "oracle.json" if self.unseen is None else f"oracle-{judged}.json"
-        return Yardstick(self.kept / system / kept, compute)
+        kept = "oracle.json" if self.unseen is None else f"oracle-{self.judged}.json"
+        effort = {"starts": self.starts, "iterations": self.iterations}
+        options = options_of(self.case, system)
+        return optimum(self.kept / system / kept, self.recipe, options, unseen=self.judged, **effort)
 
     @property
     def recipe(self) -> Path:
         """The recipe of the plant."""
         return Path(__file__).with_name(f"{self.plant}.py")
-
-
-def names(system: str) -> tuple[str, ...]:
-    """Names of ``--unknown`` of a system."""
-    return () if system == "nothing" else tuple(system.split("+"))
 
 
 def row(config: Config, system: str) -> Room:

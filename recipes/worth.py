@@ -3,7 +3,6 @@
 import json
 import shlex
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,28 +17,18 @@ from rt_torchrl import check_options, main_of
 from rt_torchrl.envs.unknown_systems import SYSTEMS, require_unknown
 from rt_torchrl.runs.results_file import make_folder, write_results
 from rt_torchrl.study.arms import SystemResult, classical_arms, trained_arm
+from rt_torchrl.study.cases import CASES, UNSEEN, names, optimum, options_of
 from rt_torchrl.study.results import yardstick_entry
 from rt_torchrl.study.room import require_page, write_into
 from rt_torchrl.study.scheduling import on_this_machine
 from rt_torchrl.study.training import Training
 from rt_torchrl.study.worth import WHOLE, findings_page
-from rt_torchrl.study.yardsticks import Yardstick, oracle
+from rt_torchrl.study.yardstick import Yardstick
+from rt_torchrl.study.yardsticks import Options
 
 if TYPE_CHECKING:
     from rt_torchrl.study.task import Task
 
-Options = tuple[str, ...]
-CASES = {name: name for name in ("wind_turbine", "flapping_wing", "hop", "cryogenic_tank")} | {"hop": "flapping_wing"}
-"""Plant of each case; the hop is a task of the drone."""
-POLICY: dict[str, Options] = {
-    "wind_turbine": ("--policy", "scheduled"),
-    "flapping_wing": ("--policy", "paper"),
-    "hop": ("--policy", "paper", "--task", "hop"),
-    "cryogenic_tank": ("--command", "drop", "--end-weight", "0"),
-}
-"""Policies of few weights, whose optimum exact gradients find."""
-UNSEEN = {"wind_turbine": 50, "flapping_wing": 100, "hop": 192, "cryogenic_tank": 50}
-"""Number of unseen episodes that judge everything by default; a few hops cost ten times as much as the others."""
 FEW = 8
 """Number of unseen episodes that model predictive control flies, which takes long."""
 
@@ -150,6 +139,11 @@ class Config:
         for argument, known in (("plants", (*CASES, "all")), ("arms", ARMS)):
             if other := [name for name in getattr(self, argument) if name not in known]:
                 raise ValueError(f"{argument}: {', '.join(other)} does not exist; choose among {', '.join(known)}.")
+        if nowhere := [name for name in self.arms if not any(name in arms_of(case) for case in self.cases())]:
+            raise ValueError(f"arms: {', '.join(nowhere)} is on none of {', '.join(self.cases())}.")
+        self._check_systems()
+
+    def _check_systems(self) -> None:
         for system in self.systems:
             if not any(system in self.systems_of(case) for case in self.cases()):
                 known = dict.fromkeys(name for case in self.cases() for name in SYSTEMS[CASES[case]])
@@ -179,10 +173,6 @@ class Config:
         """Number of unseen episodes."""
         return self.unseen or UNSEEN[case]
 
-    def options(self, case: str, system: str) -> Options:
-        """Options of the recipe that make the system and its policy."""
-        return (*POLICY[case], *(("--unknown", *names(system)) if names(system) else ()))
-
     def trainings(self, case: str, system: str) -> dict[str, list[Training]]:
         """Trainings by arm, one for each seed."""
         every = arms_of(case)
@@ -203,18 +193,16 @@ class Config:
                 variant="nominal",
                 folder=self.folder / case / system / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}",
                 episodes=self.episodes,
-                options=(*rest, *self.options(case, system), *judged),
+                options=(*rest, *options_of(case, system), *judged),
             )
             for seed in range(self.seeds)
         ]
 
     def optimum(self, case: str, system: str) -> Yardstick:
         """The best policy of the class on the true system."""
-        effort = {"starts": self.starts, "iterations": self.iterations, "polish": self.iterations // 3}
-        judged = self.judged(case)
-        options = (*self.options(case, system), "--unseen", str(judged))
-        compute = partial(oracle, recipe_of(case), options, unseen=judged, **effort)
-        return Yardstick(self.folder / case / system / f"oracle-{judged}.json", compute)
+        path = self.folder / case / system / f"oracle-{self.judged(case)}.json"
+        effort = {"starts": self.starts, "iterations": self.iterations}
+        return optimum(path, recipe_of(case), options_of(case, system), unseen=self.judged(case), **effort)
 
     def tasks(self) -> "list[Task]":
         """Everything that is computed, seed by seed, so that an interrupted study has all arms of the first seeds."""
@@ -223,14 +211,9 @@ class Config:
         return found + [group[seed] for seed in range(self.seeds) for group in every]
 
 
-def names(system: str) -> Options:
-    """Names of ``--unknown`` of a system."""
-    return () if system == "nothing" else tuple(system.split("+"))
-
-
 def recipe_of(case: str) -> Path:
     """The recipe of a plant."""
-    return Path(__file__).with_name("flapping_wing.py" if case == "hop" else f"{case}.py")
+    return Path(__file__).with_name(f"{CASES[case]}.py")
 
 
 def result(config: Config, case: str, system: str) -> SystemResult | None:

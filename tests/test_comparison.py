@@ -58,6 +58,18 @@ def test_the_figure_has_a_line_for_each_row(tmp_path):
     }
 
 
+def test_a_policy_that_diverged_on_the_way_is_drawn(tmp_path):
+    """``metrics.json`` holds null for it."""
+    folders = four(tmp_path)
+    for folder in folders:
+        metrics = json.loads((folder / "metrics.json").read_text())
+        metrics["episodes"][0]["J_a_unseen"] = None
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    runs, controllers = entries_of(folders)
+    assert runs[0].curves == [[np.inf, 1.0]] * 2
+    comparison_figure(runs, controllers, "t").canvas.draw()
+
+
 def test_runs_that_cannot_be_compared_are_refused(tmp_path):
     first = leave(tmp_path / "a", arm="twinning", seed=0, costs=[1.0, 2.0])
     with pytest.raises(ValueError, match=r"differ in their plant \(tanks, drone\)"):

@@ -10,7 +10,7 @@ from test_export_recipe import recipe
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.study.room import Room, require_page, room_table, write_into
 from rt_torchrl.study.training import Training
-from rt_torchrl.study.yardsticks import Yardstick
+from rt_torchrl.study.yardstick import Yardstick
 
 ROOMY = Room(system="pitch", oracle=0.05, planned=[0.2, 0.1, 0.3], said=[0.04, 0.05, 0.06], classical={"PD": 0.07})
 

@@ -12,6 +12,7 @@ from rt_torchrl.study import captions, report
 from rt_torchrl.study import figures as charts
 from rt_torchrl.study.report import CaptionedFigure
 from rt_torchrl.study.results import Results
+from rt_torchrl.study.tables import paper_table
 
 
 def test_the_report_says_what_was_found(tmp_path):
@@ -116,6 +117,17 @@ def test_captions_of_a_training_come_from_its_metrics(tmp_path):
     assert "The live policy (model based) costs less than model free on 30 of 30." in found["unseen"]
     assert "The RMS error along the last episode is 0.1, 0.02; that of the initial twin is 1, 0.2." in found["polars"]
     assert "RMS error" not in found["flight"]
+
+
+def test_captions_and_tables_have_words_for_what_diverges(tmp_path):
+    """``metrics.json`` holds null for it."""
+    metrics = finished(tmp_path, 0, 0.0).metrics()
+    unseen = metrics["summary"]["unseen"]
+    metrics["episodes"][0]["J_a_unseen"] = unseen["J_a_model_free"]["mean"] = unseen["costs"]["model_free"][0] = None
+    found = captions.of_run("flapping_wing", metrics)
+    assert found["learning_curves"].endswith("J_a of the live policy went from infinity to 1.")
+    assert "costs less than model free on 30 of 30." in found["unseen"]
+    assert "| inf |" in paper_table({"flapping_wing": [metrics["summary"]]})
 
 
 def test_the_page_holds_its_figures(tmp_path):

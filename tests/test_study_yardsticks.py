@@ -1,5 +1,8 @@
 """Yardsticks of the study: what is kept, and on what they are measured."""
 
+from functools import partial
+from pathlib import Path
+
 import pytest
 import torch
 from handwritten_study import RECIPES
@@ -10,8 +13,8 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.runs.shipped_plants import shipped_plants
 from rt_torchrl.study import yardsticks
 from rt_torchrl.study.results import yardstick_entry
+from rt_torchrl.study.yardstick import Yardstick
 from rt_torchrl.study.yardsticks import (
-    Yardstick,
     changed_closure,
     classical,
     configured,
@@ -26,8 +29,26 @@ def test_what_is_kept_is_not_computed_again(tmp_path):
     yardstick = Yardstick(tmp_path / "deep" / "x.json", lambda: calls.append(1) or {"costs": [1.0]})
     for _ in range(2):
         assert yardstick.done() == bool(calls)
-        assert yardstick.run() == {"costs": [1.0]}
+        assert yardstick.run() == {"costs": [1.0], "arguments": {}}
     assert len(calls) == 1
+
+
+def test_what_is_of_other_arguments_is_computed_again(tmp_path):
+    """The folder of the recipe does not count; what an earlier version has kept has no arguments."""
+
+    def compute(recipe, kind, *, starts):
+        return {"starts": starts}
+
+    few, many, elsewhere = (
+        Yardstick(tmp_path / "x.json", partial(compute, Path(folder) / "plant.py", PIValve, starts=starts))
+        for folder, starts in (("here", 2), ("here", 5), ("there", 2))
+    )
+    assert few.run()["starts"] == 2 and elsewhere.done() and not many.done()
+    with pytest.warns(UserWarning, match=r"x\.json is of other arguments; what it held is computed again"):
+        assert many.run()["starts"] == 5
+    assert many.done() and not few.done()
+    many.path.write_text('{"starts": 5}')
+    assert few.done() and many.done()
 
 
 @pytest.mark.parametrize("left", ["", '{"costs": [1.0', "null"])
@@ -36,7 +57,7 @@ def test_a_damaged_yardstick_is_computed_again(tmp_path, left):
     yardstick.path.write_text(left)
     assert not yardstick.done()
     with pytest.warns(UserWarning, match=r"x\.json is damaged; what it held is computed again"):
-        assert yardstick.run() == {"costs": [1.0]}
+        assert yardstick.run()["costs"] == [1.0]
     assert yardstick.done()
 
 

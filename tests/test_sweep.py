@@ -77,6 +77,29 @@ def test_seeds_are_trained_and_compared(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "small_recipe" / "seeds.png").exists()
 
 
+def test_a_sweep_goes_on_where_it_was_cut_short_and_refuses_runs_of_other_options(tmp_path):
+    (run,) = seeded_runs(SMALL, [3], tmp_path, ["--horizon", "1.0"])
+    run.run()
+    assert run.done() and run.arguments()[6] == "--resume"
+    longer, stopped, other = (
+        SeededRun(recipe=SMALL, seed=3, folder=run.folder, options=("--horizon", horizon, "--episodes", "3", *more))
+        for horizon, more in (("1.0", ()), ("1.0", ("--patience", "1")), ("2.0", ()))
+    )
+    with pytest.raises(
+        ValueError, match=r"seed-3 holds the results of other options: horizon is 2\.0 here and was 1\.0"
+    ):
+        other.done()
+    assert not longer.done() and not stopped.done()
+    longer.run()
+    metrics = json.loads((run.folder / "metrics.json").read_text())
+    assert longer.done() and len(metrics["episodes"]) == 3
+    metrics["episodes"] = [
+        episode | {"J_a_model_free": 1.0, "live": "model_free"} for episode in metrics["episodes"][:2]
+    ]
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+    assert stopped.done() and not longer.done()
+
+
 def test_a_search_finds_the_least_cost_and_goes_on(tmp_path, monkeypatch):
     """The trainings are replaced by a cost of the option, whose least value is known: it lies at 3."""
     pytest.importorskip("optuna", reason="a search needs the extra sweep")

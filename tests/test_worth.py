@@ -88,6 +88,8 @@ def test_what_does_not_exist_is_refused():
         config(plants=("moon",))
     with pytest.raises(ValueError, match="arms: magic does not exist"):
         config(arms=("magic",))
+    with pytest.raises(ValueError, match="arms: predictive control is on none of cryogenic_tank"):
+        config(plants=("cryogenic_tank",), arms=("predictive control",))
     with pytest.raises(ValueError, match=r"systems: bias_5 is on none of wind_turbine; choose nothing, or names among"):
         config(plants=("wind_turbine",), systems=("bias_5",))
     for plants in (("wind_turbine",), ("all",)):

@@ -1,12 +1,13 @@
 """Captions of the report's figures: they say what a figure draws, and give in numbers what a reader sees there."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from rt_torchrl.study.names import shown, title
-from rt_torchrl.study.results import HALVES, NEAR, Entry, Results, named
+from rt_torchrl.study.results import HALVES, NEAR, Entry, Results, named, numbers, numeric
 from rt_torchrl.study.training import CHANGED
 
 ARMS = ("twinning", *HALVES)
@@ -152,16 +153,17 @@ def events(metrics: dict[str, Any]) -> str:
     episodes = metrics["episodes"]
     parts = []
     for event in ("swap", "clone"):
-        numbers = [str(e["episode"] + 1) for e in episodes if e["event"] == event]
-        parts.append(f"{event} after episode {', '.join(numbers)}" if numbers else f"no {event}")
-    costs = [e["J_a_unseen"] for e in episodes]
-    return f"{'; '.join(parts).capitalize()}. J_a of the live policy went from {costs[0]:.3g} to {costs[-1]:.4g}."
+        after = [str(e["episode"] + 1) for e in episodes if e["event"] == event]
+        parts.append(f"{event} after episode {', '.join(after)}" if after else f"no {event}")
+    costs = [numeric(episodes[k]["J_a_unseen"]) for k in (0, -1)]
+    first, last = (f"{cost:.4g}" if math.isfinite(cost) else "infinity" for cost in costs)
+    return f"{'; '.join(parts).capitalize()}. J_a of the live policy went from {first} to {last}."
 
 
 def cheaper(metrics: dict[str, Any]) -> str:
     """Sentence that counts the unseen episodes on which the live policy costs less than the others."""
     live = metrics["summary"]["live"]
-    costs = {name: np.array(values) for name, values in metrics["summary"]["unseen"]["costs"].items()}
+    costs = {name: np.array(numbers(values)) for name, values in metrics["summary"]["unseen"]["costs"].items()}
     against = [f"{shown(name)} on {int((costs[live] < costs[name]).sum())}" for name in costs if name != live]
     return f"The live policy ({shown(live)}) costs less than {', '.join(against)} of {len(costs[live])}."
 

@@ -145,4 +145,4 @@ def _entry(kind: str, found: list[dict[str, Any]]) -> Entry:
 
 def _curve(episodes: list[dict[str, Any]]) -> list[float]:
     judged = all("J_a_unseen" in episode for episode in episodes)
-    return [episode["J_a_unseen" if judged else "real_cost"] for episode in episodes]
+    return numbers(episode["J_a_unseen" if judged else "real_cost"] for episode in episodes)

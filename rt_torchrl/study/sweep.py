@@ -4,13 +4,15 @@ import contextlib
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.summary import preferred_role
+from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.scheduling import side_by_side
+from rt_torchrl.study.training import options_of, require_options
 
 if TYPE_CHECKING:
     import optuna  # only its types: seeds need no search
@@ -47,11 +49,26 @@ class SeededRun:
         return [*own, "--resume" if begun else "--overwrite", *self.options]
 
     def done(self) -> bool:
-        """Whether the run has ended."""
-        return (self.folder / "metrics.json").exists()
+        """Whether the run has ended after all of its episodes, or because its patience has ended.
+
+        Raises:
+            ValueError: if the results are those of other options.
+        """
+        episodes = (read_json(self.folder / "metrics.json") or {}).get("episodes")
+        if not isinstance(episodes, list):
+            return False
+        asked = replace(options_of(self.recipe, self.options), seed=self.seed)
+        require_options(self.folder, asked)
+        stopping = asked.stopping()
+        return len(episodes) >= asked.episodes or (stopping is not None and stopping(episodes) is not None)
 
     def run(self) -> None:
-        """Train, unless it is done. ``training.log`` in the folder takes what the recipe prints."""
+        """Train, unless it is done. ``training.log`` in the folder takes what the recipe prints.
+
+        Raises:
+            ValueError: if the results are there and are those of other options.
+            KeyboardInterrupt: if Ctrl-C or SIGTERM ended the training before its last episode.
+        """
         if self.done():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -60,6 +77,8 @@ class SeededRun:
         with log.open("w") as said, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             recipe = load_recipe(self.recipe)
             recipe.main(from_command_line(recipe.Config, arguments))
+        if not self.done():
+            raise KeyboardInterrupt  # the recipe has taken the signal, and wrote what it had done
 
     def cost(self) -> float:
         """Mean J_a of the policy that the referee prefers, on the unseen episodes; infinite if it diverges there."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from rt_torchrl.figures.style import with_unit
 from rt_torchrl.study.names import shown
-from rt_torchrl.study.results import Entry, named
+from rt_torchrl.study.results import Entry, named, numeric
 
 COST_HEADER = ["J_a", "95 % interval"]
 TWIN_HEADER = ["J_p ratio", "weight error"]
@@ -76,8 +76,8 @@ def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:
         unseen = [summary["unseen"] for summary in found]
         cells = [shown(plant)]
         for printed, (before, after) in zip(PAPER.get(plant, ("–",) * 3), RATIOS, strict=True):
-            start = np.mean([part[before]["mean"] for part in unseen])
-            ratios = np.array([part[after]["mean"] for part in unseen]) / start
+            start = np.mean([numeric(part[before]["mean"]) for part in unseen])
+            ratios = np.array([numeric(part[after]["mean"]) for part in unseen]) / start
             deviation = f" ± {ratios.std(ddof=1):.1g}" if len(ratios) > 1 else ""
             cells += [printed, f"{ratios.mean():.2g}{deviation}"]
         rows.append(cells)

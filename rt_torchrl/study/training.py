@@ -96,12 +96,7 @@ class Training:
         if not (self.folder / FILE).is_file():
             return
         of_every_seed = (*self._usual(), *VARIANTS[self.variant], *self.options)
-        asked = replace(options_of(self.recipe, of_every_seed), seed=self.seed)
-        if found := differences(self.folder, asked):
-            raise ValueError(
-                f"{self.folder} holds the results of other options: {'; '.join(found)}. Give the options of the run, "
-                "or another folder; the training of a folder that you remove is made again."
-            )
+        require_options(self.folder, replace(options_of(self.recipe, of_every_seed), seed=self.seed))
 
     def run(self) -> None:
         """Train, unless the results are there. ``training.log`` in the folder takes what the recipe prints.
@@ -158,6 +153,19 @@ class Training:
         found = read_json(self.folder / "metrics.json") or {}
         sound = isinstance(found.get("summary"), dict) and isinstance(found.get("episodes"), list)
         return found if sound else None
+
+
+def require_options(folder: Path, asked: RunConfig) -> None:
+    """Refuse results of other options than these.
+
+    Raises:
+        ValueError: if the run in the folder has other options, or the folder is no run folder.
+    """
+    if found := differences(folder, asked):
+        raise ValueError(
+            f"{folder} holds the results of other options: {'; '.join(found)}. Give the options of the run, or another "
+            "folder; the training of a folder that you remove is made again."
+        )
 
 
 @cache

@@ -1,10 +1,8 @@
 """Yardsticks of the trainings: the best that a class of policies can do, and tuned classical controllers."""
 
-import json
 import math
-import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,6 @@ from typing import Any
 import torch
 from torch import nn
 
-from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.baselines.tuning import tune
 from rt_torchrl.evaluation.limits import (
@@ -27,7 +24,6 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.configured_plant import physics_of, plant_of
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.training import CHANGED, VARIANTS
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 
@@ -35,38 +31,6 @@ Options = tuple[str, ...]
 """Options of a recipe's command line."""
 TRAINING_SEED = 0
 """Seed of the disturbances that tune the classical controllers; the unseen episodes have another seed."""
-
-
-@dataclass(frozen=True)
-class Yardstick:
-    """A yardstick that is computed once and kept.
-
-    Args:
-        path: JSON file to keep the result in.
-        compute: computes the result.
-    """
-
-    path: Path
-    compute: Callable[[], dict[str, Any]]
-
-    def __str__(self) -> str:
-        return f"the yardstick in {self.path}"
-
-    def done(self) -> bool:
-        """Whether a whole result is kept."""
-        return read_json(self.path) is not None
-
-    def run(self) -> dict[str, Any]:
-        """The kept result, or a new one where none is kept or the file is damaged."""
-        if (kept := read_json(self.path)) is not None:
-            return kept
-        if self.path.exists():
-            warnings.warn(f"{self.path} is damaged; what it held is computed again.", stacklevel=2)
-        found = self.compute()
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        content = json.dumps(found, indent=2) + "\n"
-        write_atomically(self.path, content.encode())
-        return json.loads(content)
 
 
 def oracle(recipe: Path, options: Options, *, unseen: int, starts: int, iterations: int, polish: int) -> dict[str, Any]:
