@@ -430,6 +430,24 @@ def test_an_update_is_a_candidate_until_it_has_flown():
     assert same(found, flown) and not found._waiting
 
 
+def test_a_candidate_that_may_not_fly_does_not_count_as_proved():
+    found = learner(critic_iterations=30)
+    found._waiting = False
+    found.adopt()
+    found.flown(1.0)
+    start = weights_of(found.policy)
+    found.update()
+    found.adopt()
+    proposed = weights_of(found.policy)
+    found.grounded()
+    assert same(found, start) and not same(found, proposed)
+    found.grounded()  # nothing is on board
+    found.adopt()
+    assert same(found, proposed)
+    found.flown(9.0)
+    assert same(found, start)
+
+
 @pytest.mark.parametrize("cost, kept", [(1.4, True), (1.6, False)])
 def test_a_dear_episode_brings_back_the_weights_from_before(cost, kept):
     found = learner(critic_iterations=30)

@@ -30,7 +30,7 @@ class Learning:
 
     A learner that learns from the twin has a method ``take_twin(twin)``; one that asks how far the twin can be trusted
     has a method ``trust_twin(probability)`` and a true ``asks_for_trust``. One that wants to know of the real episodes
-    that its policy flies has methods ``adopt()`` and ``flown(cost)``.
+    that its policy flies has methods ``adopt()``, ``flown(cost)`` and ``grounded()``.
 
     Args:
         learner: learner of step 2.
@@ -123,6 +123,10 @@ class Learning:
             cost: J_a of the episode.
         """
         self._tell("flown", acted, cost)
+
+    def grounded(self, waiting: nn.Module) -> None:
+        """Tell the learner, if it wants to know, that its policy has not flown the episode, or not to its end."""
+        self._tell("grounded", waiting)
 
     def _tell(self, what: str, acting: nn.Module, *values: float) -> None:
         told = getattr(self.learner, what, None)

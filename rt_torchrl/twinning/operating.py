@@ -67,8 +67,10 @@ class Operating:
             role: role that is live.
             episode: number of the learner's episode, from 0.
         """
-        self.trainer.learning.adopt(self.trainer.policies[role])
+        self.trainer.learning.adopt(live := self.trainer.policies[role])
         policy, role, report = self.trainer.clearance.choose(role, self.trainer.judged)
+        if policy is not live:
+            self.trainer.learning.grounded(live)
         strength = self._exploration.strength(episode)
         self.operation.hand_over(role, policy, strength=strength, episode=episode, found=plain(report))
 

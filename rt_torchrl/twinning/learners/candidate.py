@@ -44,6 +44,11 @@ class Candidate:
             self.policy.load_state_dict(self._proposed)
             self._proposed = None
 
+    def ground(self) -> None:
+        """Give the policy its proved weights back where those on board have not flown; they are proposed again."""
+        if self._proposed is None and self._proved is not None:
+            self.nominate(self._proved)
+
     def flown(self, cost: float) -> bool:
         """Keep the weights with which the policy has flown, or give it back the earlier ones.
 

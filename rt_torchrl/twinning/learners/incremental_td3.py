@@ -181,6 +181,10 @@ class IncrementalTD3:
         if not self.candidate.flown(cost):
             self._forget_actor()
 
+    def grounded(self) -> None:
+        """Go back to the proved weights, because the adopted ones have not flown a whole episode."""
+        self.candidate.ground()
+
     def observations(self) -> Float[Tensor, "n n_o"]:
         """See :meth:`Learner.observations`."""
         return self.memory.observations()
