@@ -164,6 +164,24 @@ def train_all(runs: Sequence[SeededRun], jobs: int) -> None:
     side_by_side([[run] for run in runs], backend="loky", jobs=jobs)
 
 
+def study_in(folder: Path, name: str, *, seed: int) -> "optuna.Study":
+    """Optuna's study in a folder, which is made if there is none.
+
+    Raises:
+        ValueError: if Optuna is missing.
+    """
+    try:
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+    except ImportError as error:
+        raise ValueError("trials need Optuna: install the extra, pip install 'rt_torchrl[sweep]'.") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    storage = JournalStorage(JournalFileBackend(str(folder / "study.log")))
+    sampler = optuna.samplers.TPESampler(seed=seed)
+    return optuna.create_study(study_name=name, storage=storage, load_if_exists=True, sampler=sampler)
+
+
 def search(
     recipe: Path,
     over: Sequence[Searched],
@@ -190,20 +208,7 @@ def search(
     Raises:
         ValueError: if Optuna is missing.
     """
-    try:
-        import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-    except ImportError as error:
-        raise ValueError("trials need Optuna: install the extra, pip install 'rt_torchrl[sweep]'.") from error
-    folder.mkdir(parents=True, exist_ok=True)
-    storage = JournalStorage(JournalFileBackend(str(folder / "study.log")))
-    study = optuna.create_study(
-        study_name=recipe.stem,
-        storage=storage,
-        load_if_exists=True,
-        sampler=optuna.samplers.TPESampler(seed=len(over)),
-    )
+    study = study_in(folder, recipe.stem, seed=len(over))
 
     def objective(trial: "optuna.Trial") -> float:
         chosen: list[str] = [word for one in over for word in (f"--{one.option}", one.drawn(trial))]
