@@ -430,7 +430,8 @@ def test_an_update_is_a_candidate_until_it_has_flown():
     assert same(found, flown) and not found._waiting
 
 
-def test_a_candidate_that_may_not_fly_does_not_count_as_proved():
+def candidate_on_board():
+    """A learner whose policy has flown for 1, and then taken the weights of an update; and the weights that flew."""
     found = learner(critic_iterations=30)
     found._waiting = False
     found.adopt()
@@ -438,6 +439,11 @@ def test_a_candidate_that_may_not_fly_does_not_count_as_proved():
     start = weights_of(found.policy)
     found.update()
     found.adopt()
+    return found, start
+
+
+def test_a_candidate_that_may_not_fly_does_not_count_as_proved():
+    found, start = candidate_on_board()
     proposed = weights_of(found.policy)
     found.grounded()
     assert same(found, start) and not same(found, proposed)
@@ -450,13 +456,7 @@ def test_a_candidate_that_may_not_fly_does_not_count_as_proved():
 
 @pytest.mark.parametrize("cost, kept", [(1.4, True), (1.6, False)])
 def test_a_dear_episode_brings_back_the_weights_from_before(cost, kept):
-    found = learner(critic_iterations=30)
-    found._waiting = False
-    found.adopt()
-    found.flown(1.0)
-    start = weights_of(found.policy)
-    found.update()
-    found.adopt()
+    found, start = candidate_on_board()
     found.flown(cost)
     assert same(found, start) is not kept
     assert found._waiting is not kept

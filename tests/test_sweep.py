@@ -81,7 +81,7 @@ def test_a_sweep_goes_on_where_it_was_cut_short_and_refuses_runs_of_other_option
     (run,) = seeded_runs(SMALL, [3], tmp_path, ["--horizon", "1.0"])
     run.run()
     assert run.done() and run.arguments()[6] == "--resume"
-    longer, stopped, other = (
+    longer, patient, other = (
         SeededRun(recipe=SMALL, seed=3, folder=run.folder, options=("--horizon", horizon, "--episodes", "3", *more))
         for horizon, more in (("1.0", ()), ("1.0", ("--patience", "1")), ("2.0", ()))
     )
@@ -89,15 +89,23 @@ def test_a_sweep_goes_on_where_it_was_cut_short_and_refuses_runs_of_other_option
         ValueError, match=r"seed-3 holds the results of other options: horizon is 2\.0 here and was 1\.0"
     ):
         other.done()
-    assert not longer.done() and not stopped.done()
+    assert not longer.done() and not patient.done()
     longer.run()
     metrics = json.loads((run.folder / "metrics.json").read_text())
     assert longer.done() and len(metrics["episodes"]) == 3
-    metrics["episodes"] = [
-        episode | {"J_a_model_free": 1.0, "live": "model_free"} for episode in metrics["episodes"][:2]
-    ]
-    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+
+
+def test_a_run_that_its_patience_or_a_callback_has_ended_is_done(tmp_path):
+    options = ("--horizon", "1.0", "--episodes", "9")
+    stopped = SeededRun(recipe=SMALL, seed=3, folder=tmp_path, options=(*options, "--patience", "1"))
+    longer = SeededRun(recipe=SMALL, seed=3, folder=tmp_path, options=options)
+    stopped.run()
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert len(metrics["episodes"]) < 9 and metrics["summary"]["ended"] == "no gain of 1 % in the last 1 episodes"
     assert stopped.done() and not longer.done()
+    metrics["summary"]["ended"] = None  # as if it had been interrupted
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+    assert not stopped.done()
 
 
 def test_a_search_finds_the_least_cost_and_goes_on(tmp_path, monkeypatch):

@@ -94,6 +94,7 @@ class Run:
         quieten_libraries()  # before the check of the plant, whose forward mode is the first to speak
         self.asked, self.config = config, config.effective()
         self.drawing = Drawing(plant_figures, animate)
+        self.ended: str | None = None
         stopping = self.config.stopping()
         self.callbacks: list[Callback] = [*callbacks, *([stopping] if stopping else [])]
         device = require_device(config.device)
@@ -234,7 +235,8 @@ class Run:
                     bar.episode(self.episodes[-1])
                     reasons = [said for callback in self.callbacks if (said := callback(self.episodes))]
                     if reasons:
-                        bar.write(f"ended after {len(self.episodes)} episodes: {'; '.join(reasons)}")
+                        self.ended = "; ".join(reasons)
+                        bar.write(f"ended after {len(self.episodes)} episodes: {self.ended}")
                         break
             except BaseException as error:
                 if interruption.at_once:
@@ -284,7 +286,7 @@ class Run:
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
         better = self.algorithm.policies[summary["better"]]
         summary |= reference.found(self.config, self.unseen, self.make_policy, better)
-        summary["engine_gap"] = gap
+        summary |= {"engine_gap": gap, "ended": self.ended}
         summary["seconds"]["total"] = time.perf_counter() - self.started
         metrics = finite({"plant": self.algorithm.twin.plant.name, "episodes": self.episodes, "summary": summary})
         weights = {role: policy.state_dict() for role, policy in self.algorithm.policies.items()}

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.runs.settings import read_settings
 from rt_torchrl.runs.summary import preferred_role
-from rt_torchrl.study.json_file import read_json
 from rt_torchrl.study.scheduling import side_by_side
-from rt_torchrl.study.training import options_of, require_options
+from rt_torchrl.study.training import options_of, require_options, written_in
 
 if TYPE_CHECKING:
     import optuna  # only its types: seeds need no search
@@ -49,18 +49,17 @@ class SeededRun:
         return [*own, "--resume" if begun else "--overwrite", *self.options]
 
     def done(self) -> bool:
-        """Whether the run has ended after all of its episodes, or because its patience has ended.
+        """Whether the run has ended after all of its episodes, or because its callbacks or its patience ended it.
 
         Raises:
             ValueError: if the results are those of other options.
         """
-        episodes = (read_json(self.folder / "metrics.json") or {}).get("episodes")
-        if not isinstance(episodes, list):
+        if (found := written_in(self.folder)) is None:
             return False
         asked = replace(options_of(self.recipe, self.options), seed=self.seed)
         require_options(self.folder, asked)
-        stopping = asked.stopping()
-        return len(episodes) >= asked.episodes or (stopping is not None and stopping(episodes) is not None)
+        patient = read_settings(self.folder)["patience"] == asked.patience  # another patience may go on
+        return len(found["episodes"]) >= asked.episodes or (patient and found["summary"].get("ended") is not None)
 
     def run(self) -> None:
         """Train, unless it is done. ``training.log`` in the folder takes what the recipe prints.

@@ -142,17 +142,19 @@ class Training:
 
     def _cut_short(self) -> bool:
         # An interrupted run writes results, too, of the episodes that it has done.
-        written = self._written()
+        written = written_in(self.folder)
         return written is not None and len(written["episodes"]) < self.episodes
 
     def _results(self) -> dict[str, Any] | None:
-        written = self._written()
+        written = written_in(self.folder)
         return written if written is not None and len(written["episodes"]) == self.episodes else None
 
-    def _written(self) -> dict[str, Any] | None:
-        found = read_json(self.folder / "metrics.json") or {}
-        sound = isinstance(found.get("summary"), dict) and isinstance(found.get("episodes"), list)
-        return found if sound else None
+
+def written_in(folder: Path) -> dict[str, Any] | None:
+    """Content of the ``metrics.json`` of a run, whether or not it was cut short; None if it is missing or damaged."""
+    found = read_json(folder / "metrics.json") or {}
+    sound = isinstance(found.get("summary"), dict) and isinstance(found.get("episodes"), list)
+    return found if sound else None
 
 
 def require_options(folder: Path, asked: RunConfig) -> None:

@@ -80,6 +80,10 @@ class PairedDifferences:
         self._root = torch.linalg.cholesky(covariance)
         self._weights = torch.cholesky_solve(self.differences.unsqueeze(-1), self._root)
 
+    def at_least(self, least: float, noise: float = NOISE) -> "PairedDifferences":
+        """What follows from the same episodes, where a smaller d is taken for ``least``, with this noise."""
+        return PairedDifferences(self.actions, self.differences, self.exploration, least, noise)
+
     def _kernel(self, others: Float[Tensor, "k m"]) -> Float[Tensor, "k n"]:
         squared = (others.unsqueeze(1) - self.actions).square().mean(-1)
         return COMMON**2 + LOCAL**2 * torch.exp(-0.5 * squared / REACH**2)

@@ -51,9 +51,7 @@ class RealJudge:
     @cached_property
     def limited(self) -> PairedDifferences:
         """The belief that follows from paired differences of at least ``LEAST``, with the likeliest noise."""
-        known = self.learned
-        flights = (known.actions, known.differences, known.exploration)
-        found = [PairedDifferences(*flights, least=LEAST, noise=noise) for noise in NOISES]
+        found = [self.learned.at_least(LEAST, noise) for noise in NOISES]
         return max(found, key=lambda one: one.log_likelihood() - 0.5 * math.log2(one.noise / NOISE) ** 2)
 
     def factor(self, policy: nn.Module) -> Tensor:
@@ -89,8 +87,7 @@ class RealJudge:
     @cached_property
     def _cautious(self) -> PairedDifferences:
         """The belief that follows from paired differences of at least zero."""
-        known = self.learned
-        return PairedDifferences(known.actions, known.differences, known.exploration, least=0.0)
+        return self.learned.at_least(0.0)
 
     @torch.no_grad()
     def cautious(self, policy: nn.Module, cost: float) -> float:
