@@ -1,11 +1,10 @@
 """The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
 
 import importlib
-import shutil
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from rt_torchrl import begin_loading
 
@@ -14,14 +13,23 @@ if __name__ == "__main__":
 
 import tyro
 
-from rt_torchrl import ClassicalController, main_of
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl import main_of
 from rt_torchrl.envs.unknown_systems import SYSTEMS
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.runs.run_config import QUICK_UNSEEN
-from rt_torchrl.study import captions
-from rt_torchrl.study.names import title
+from rt_torchrl.study.contenders import (
+    ARMS,
+    CONTROLLERS,
+    COUNTS,
+    EPISODES,
+    MULTIPLES,
+    OTHER_CLOSURE,
+    OTHER_PLANT,
+    OWN_POLICY,
+    QUICK_VARIANTS,
+    SHORT,
+    SHORT_EPISODES,
+    policies_of,
+)
 from rt_torchrl.study.results import Entry, Results, arm_entry, yardstick_entry
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.task import Task
@@ -37,51 +45,6 @@ from rt_torchrl.study.yardsticks import (
     plans,
     predictive_control,
 )
-
-if TYPE_CHECKING:
-    from rt_torchrl.study.report import CaptionedFigure
-
-ARMS = ("twinning", "model_free", "model_based")
-CONTROLLERS: dict[str, dict[str, type[ClassicalController]]] = {
-    "wind_turbine": {"Jonkman": JonkmanController},
-    "flapping_wing": {"PD": TrimmedPD},
-    "cryogenic_tank": {"on-off": OnOffValve, "PI": PIValve},
-}
-OWN_POLICY: dict[str, tuple[str, ...]] = {
-    "wind_turbine": ("--start", "random", "--policy", "paper"),
-    "flapping_wing": ("--start", "random", "--policy", "paper"),
-    "cryogenic_tank": ("--start", "random", "--command", "drop", "--end-weight", "0"),
-}
-"""Options for the paper's policy and cost, which every arm has unless it says otherwise."""
-PERCEPTRON = ("--policy", "mlp", "--hidden", "32", "32", "--observe", "paper")
-POLICIES: dict[str, dict[str, tuple[str, ...]]] = {
-    "wind_turbine": {
-        "twinning, gain-scheduled": ("--policy", "scheduled"),
-        "twinning, with bias": ("--policy", "bias"),
-        "twinning, perceptron": PERCEPTRON,
-    },
-    "flapping_wing": {"twinning, perceptron": PERCEPTRON},
-}
-"""Policies that twinning trains beside a plant's own policy, as options of the plant's recipe."""
-LONG_ONLY = ("twinning, with bias",)
-"""Policies that ``quick`` leaves out, because tracing them takes a minute."""
-OTHER_PLANT = ("twinning, gain-scheduled",)
-"""Policies that need a plant with more signals."""
-OTHER_CLOSURE = ("wind_turbine",)
-"""Plants whose true closure has another type than the twin's; no training uses the graphs of their oracle."""
-
-EPISODES = {"wind_turbine": 20, "flapping_wing": 10, "cryogenic_tank": 10}
-"""Number of real episodes of a training, the same for every arm; more episodes do not improve drone and tank."""
-SHORT = {"wind_turbine": 600.0, "flapping_wing": 0.75, "cryogenic_tank": 7.5e4}
-"""Length of an episode with ``quick`` [s]: the whole episode of the turbine, about a sixth of the others."""
-SHORT_EPISODES = 2
-"""Number of real episodes of a training with ``quick``."""
-QUICK_VARIANTS = ("noise 5 %", CHANGED)
-"""Variants that ``quick`` trains."""
-MULTIPLES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e4, 1e5)
-"""Multiples of the default gain at which the figure draws the cost of a controller."""
-COUNTS = (2, 5, 10, 20)
-"""Numbers of training episodes that exact gradients plan on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,11 +124,6 @@ class Config:
         left_out = ("nominal", *((CHANGED,) if self.unknown else ()))
         return [variant for variant in (QUICK_VARIANTS if self.quick else VARIANTS) if variant not in left_out]
 
-    def policies(self, plant: str) -> dict[str, tuple[str, ...]]:
-        """Policies that twinning trains beside the plant's own, as options of its recipe."""
-        every = POLICIES.get(plant, {}).items()
-        return {name: options for name, options in every if not (self.quick and name in LONG_ONLY)}
-
     def episodes_of(self, plant: str) -> int:
         """Number of real episodes in every training of a plant."""
         return SHORT_EPISODES if self.quick else EPISODES[plant]
@@ -190,7 +148,7 @@ class Config:
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
         found["nominal", "twinning"][0] = replace(found["nominal", "twinning"][0], figures=True)
-        for name, policy in self.policies(plant).items():
+        for name, policy in policies_of(plant, quick=self.quick).items():
             found["nominal", name] = every(
                 "twinning", "nominal", seeds, *policy, folder="-".join(policy[:2]).strip("-")
             )
@@ -224,8 +182,9 @@ class Config:
     def line(self, plant: str) -> Yardstick | None:
         """Costs of a plant along one quantity; None for a plant whose tables say enough."""
         counts, iterations = (COUNTS[:2], 5) if self.quick else (COUNTS, 40)
+        proportional = CONTROLLERS["cryogenic_tank"]["PI"]
         lines = {
-            "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=PIValve, multiples=MULTIPLES)),
+            "cryogenic_tank": ("gain-line", partial(cost_along_gain, kind=proportional, multiples=MULTIPLES)),
             "flapping_wing": ("episode-line", partial(cost_over_episodes, counts=counts, iterations=iterations)),
         }
         if plant not in lines:
@@ -282,15 +241,15 @@ def yardstick_tasks(config: Config, plant: str) -> list[Task]:
 def entries_of(config: Config, plant: str) -> list[Entry]:
     """Entries of a plant: arms, then classical controllers, then the oracle."""
     trainings = config.trainings(plant)
-    found = [arm_entry(name, trainings["nominal", name]) for name in (*ARMS, *config.policies(plant))]
+    found = [arm_entry(name, trainings["nominal", name]) for name in (*ARMS, *policies_of(plant, quick=config.quick))]
     yardsticks = [yardstick_entry(name, task.run()) for name, task in config.yardsticks(plant).items()]
     return found + yardsticks[1:] + yardsticks[:1]
 
 
 def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
     """Entries of every arm under every variant; the model error has the classical controllers too."""
-    trainings = config.trainings(plant)
-    found = {variant: [arm_entry(arm, trainings[variant, arm]) for arm in ARMS] for variant in config.variants()}
+    every = config.trainings(plant)
+    found = {variant: [arm_entry(arm, every[variant, arm]) for arm in ARMS] for variant in config.variants()}
     if CHANGED in found:
         tasks = {name: config.yardsticks(plant)[name] for name in CONTROLLERS[plant]}
         found[CHANGED] += [yardstick_entry(name, task.run()["changed"]) for name, task in tasks.items()]
@@ -308,46 +267,15 @@ def gather(config: Config) -> Results:
     return results
 
 
-def draw(config: Config, results: Results) -> list["CaptionedFigure"]:
-    """Draw the figures of the study, copy those of the first twinning run of each plant, and add captions."""
-    from rt_torchrl.study import figures as charts  # here, because --help need not wait for Matplotlib
-    from rt_torchrl.study.report import CaptionedFigure
-
-    place = Path("figures")
-    folder = config.report / place
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = {"learning": charts.learning(results.entries), "robustness": charts.robustness(results.entries)}
-    if config.limit_episodes:
-        drawn["limits"] = charts.limits(results.entries, results.limits)
-    if config.variants():
-        drawn["variants"] = charts.variants(results.entries, results.variants)
-    if CHANGED in config.variants():
-        drawn["following"] = charts.following(results.entries, results.variants)
-    texts = {name: captions.STUDY[name](results) for name in drawn}
-    for plant in config.chosen():
-        if line := config.line(plant):
-            name, costs = f"{plant}_{line.path.stem}", line.run()
-            drawn[name] = charts.cost_line(costs, results.entries[plant])
-            texts[name] = captions.LINES[line.path.stem](costs)
-    found = []
-    for name, figure in drawn.items():
-        figure.savefig(folder / f"{name}.png", dpi=110)
-        found.append(CaptionedFigure(place / f"{name}.png", texts[name]))
-    for plant in config.chosen():
-        first = config.trainings(plant)["nominal", "twinning"][0]
-        for name, text in captions.of_run(plant, first.metrics()).items():
-            copy = folder / f"{plant}_{name}.png"
-            shutil.copy(first.folder / "figures" / f"{name}.png", copy)
-            found.append(CaptionedFigure(place / copy.name, f"{title(plant)}, seed 0. {text}"))
-    return found
-
-
 def write(config: Config) -> Path:
     """Write the report as Markdown, HTML, figures and ``study.json``; return the path of the page."""
-    from rt_torchrl.study import report
+    from rt_torchrl.study import report  # here, because --help need not wait for Matplotlib
+    from rt_torchrl.study.drawing import draw
 
     results = gather(config)
-    figures = draw(config, results)
+    lines = {plant: line for plant in config.chosen() if (line := config.line(plant))}
+    firsts = {plant: config.trainings(plant)["nominal", "twinning"][0] for plant in config.chosen()}
+    figures = draw(config.report, results, lines, firsts)
     made = {"quick": config.quick, "command": command(config), "unknown": config.beside()}
     return report.write(config.report, results, figures=figures, **made)[1]
 
