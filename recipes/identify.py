@@ -28,12 +28,13 @@ from rt_torchrl import (
     main_of,
     read_log,
 )
+from rt_torchrl.identification.column import Column
 from rt_torchrl.identification.estimate_table import metrics_of_sensors, table_of_sensors, weight_lines
 from rt_torchrl.identification.identification import Identified, held_back, measured_states
 from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
 from rt_torchrl.identification.resampling import Resampled, hold_out, resample
 from rt_torchrl.identification.sensor_identification import identify
-from rt_torchrl.identification.sensor_log import Column, SensorLog, checked
+from rt_torchrl.identification.sensor_log import SensorLog, checked
 from rt_torchrl.identification.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.shipped_plants import plant_class

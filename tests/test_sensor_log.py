@@ -11,8 +11,9 @@ from linear_quadratic import LinearQuadratic
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.identification.column import Column
 from rt_torchrl.identification.resampling import resample
-from rt_torchrl.identification.sensor_log import Column, SensorLog, checked, logged_signals, read_log
+from rt_torchrl.identification.sensor_log import SensorLog, checked, logged_signals, read_log
 from rt_torchrl.identification.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import Rollout
 

@@ -16,6 +16,7 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
+from rt_torchrl.envs.wind_turbine.smoothstep import smoothstep
 from rt_torchrl.envs.wind_turbine.suspects import further_suspects, suspects
 from rt_torchrl.plants.cost import RunningCost
 from rt_torchrl.plants.plant import Plant
@@ -296,9 +297,3 @@ class WindTurbine(Plant):
     def make_policy(self, generator: torch.Generator, *, bias: bool = False) -> nn.Module:
         """The paper's policy: one affine law per action through the smooth clip, by default without bias."""
         return SaturatedAffine(len(self.observations), self.actions, bias=bias, weight_scale=0.5, generator=generator)
-
-
-def smoothstep(x: Tensor) -> Tensor:
-    """A step from 0 at x ≤ 0 to 1 at x ≥ 1 with a continuous slope, x²(3 − 2x) in between."""
-    x = x.clamp(0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)

@@ -11,8 +11,9 @@ from torch import nn
 
 from rt_torchrl.baselines.acting import ActingController
 from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.identification.column import Column
 from rt_torchrl.identification.resampling import resample
-from rt_torchrl.identification.sensor_log import READERS, Column, checked, read_log
+from rt_torchrl.identification.sensor_log import READERS, checked, read_log
 from rt_torchrl.optimal_control.predictive_control import PredictiveControl
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
