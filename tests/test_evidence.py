@@ -87,9 +87,10 @@ def test_paired_differences(real, predicted, d):
     assert difference(real, predicted) == pytest.approx(d)
 
 
-def evidence(live, idle, beliefs):
+def evidence(live, idle, beliefs, contradicted=True):
     roles = dict(zip(("model_based", "model_free"), beliefs, strict=True))
-    return Evidence(live_cost=live, idle_cost=idle, idle_weight_change=1.0, beliefs=lambda: roles)
+    judged = {"beliefs": lambda: roles, "contradicted": lambda: contradicted}
+    return Evidence(live_cost=live, idle_cost=idle, idle_weight_change=1.0, **judged)
 
 
 def decided(live, idle, beliefs):
@@ -135,6 +136,22 @@ def test_a_policy_on_trial_is_not_the_preferred_one(live, idle, beliefs, preferr
     assert referee.preferred == resumed.preferred == preferred
     resumed.decide(evidence(1.0, 5.0, (KNOWN, KNOWN)))  # the trial ends
     assert resumed.preferred == resumed.live
+
+
+@pytest.mark.parametrize(
+    "idle, contradicted, preferred",
+    [
+        (0.95, True, "model_based"),
+        (0.95, False, "model_free"),
+        (1.05, False, "model_based"),
+        (1.0, False, "model_free"),
+    ],
+)
+def test_a_twin_that_has_been_right_says_which_policy_is_preferred(idle, contradicted, preferred):
+    """The expectation holds the uncertainty about a policy that has never flown; all of these take over."""
+    referee = make_referee(RefereeConfig(rule="weight_of_evidence"), "model_based")
+    assert referee.decide(evidence(1.0, idle, (KNOWN, UNKNOWN), contradicted)) == "swap"
+    assert referee.preferred == preferred
 
 
 def test_a_state_without_trials_is_read():

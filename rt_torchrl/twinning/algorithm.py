@@ -239,6 +239,7 @@ class ReinforcementTwinning:
             real_costs=self.track_record.real_costs,
             predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
             beliefs=lambda: self.examination.beliefs(self.policies, self.short_term[-1]),
+            contradicted=lambda: self.examination.correction(self.short_term[-1]) is not None,
         )
         event = self.referee.decide(evidence)
         diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]

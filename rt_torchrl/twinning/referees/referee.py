@@ -67,6 +67,7 @@ class Evidence:
         predicted_costs: function that returns the costs of the same episodes on the present twin, flown with the same
             weights from the same states under the same inputs. It flies each episode, so it is called only if needed.
         beliefs: function that returns the belief about log J_real − log J_twin of each policy.
+        contradicted: function that returns whether one of the latest real episodes contradicts the twin beyond chance.
 
     Raises:
         ValueError: if a cost or the weight change is not a number.
@@ -78,6 +79,7 @@ class Evidence:
     real_costs: tuple[float, ...] = ()
     predicted_costs: Callable[[], tuple[float, ...]] = tuple
     beliefs: Callable[[], Mapping[Role, Belief]] = lambda: dict.fromkeys(ROLES, UNKNOWN)
+    contradicted: Callable[[], bool] = lambda: True
 
     def __post_init__(self) -> None:
         for argument in ("live_cost", "idle_cost", "idle_weight_change"):

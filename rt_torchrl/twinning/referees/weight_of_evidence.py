@@ -21,7 +21,10 @@ class WeightOfEvidence(TwoPolicies):
     episode is evidence. A policy of uncertain worth so gets a trial where little is at stake. Patience is not needed:
     one episode with a hopeless policy is enough where the other is ten times better.
 
-    The attribute ``on_trial`` is 1 while the live policy is expected to cost more than the idle one, L > G.
+    The attribute ``on_trial`` is 1 while the policy that took over is not the preferred one: it is expected to cost
+    more than the other, L > G, or where no real episode contradicts the twin, it costs more on the twin. What is
+    expected holds :math:`e^{s^2/2}`, which speaks for whatever has flown more often, and a twin that has been right
+    knows better.
 
     Args:
         config: parameters of step 6.
@@ -41,10 +44,12 @@ class WeightOfEvidence(TwoPolicies):
     def decide(self, evidence: Evidence) -> Event:
         gain, loss = stakes(evidence, self.live, self.idle)
         swaps = self.config.trial_horizon * gain > loss
-        self.on_trial = int(swaps and loss > gain)
         if swaps:
+            dearer = loss > gain if evidence.contradicted() else evidence.idle_cost > evidence.live_cost
+            self.on_trial = int(dearer)
             self.live, self.stall_count = self.idle, 0
             return "swap"
+        self.on_trial = 0
         return self.stalled(evidence.idle_weight_change)
 
 
