@@ -404,6 +404,17 @@ def test_plans_are_corrected_where_a_real_episode_contradicts_the_twin(factor, c
     assert (found.examination.correction(found.short_term[-1]) is not None) == corrects
 
 
+@pytest.mark.parametrize(("factor", "contradicted"), [(1.0, False), (1.3, True)])
+def test_the_referee_learns_whether_a_real_episode_contradicts_the_twin(factor, contradicted):
+    plant = LinearQuadratic(horizon=2.0)
+    found = twinning(plant, closure=copy.deepcopy(plant.closure), exploration=ExplorationConfig(spread=0.0))
+    report_costs(found, factor)
+    asked = []
+    found.referee.decide = lambda evidence: asked.append((evidence.contradicted(), set(evidence.beliefs()))) or "keep"
+    found.episode()
+    assert asked == [(contradicted, set(found.policies))]
+
+
 @pytest.mark.parametrize(("exploration", "corrects"), [(0.0, True), (0.02, True), (0.1, False)])
 def test_what_exploration_explains_corrects_no_plan(exploration, corrects):
     """A real episode cost 30 % more than the twin says; two standard deviations of an exploration by 0.1 are 40 %."""

@@ -6,6 +6,7 @@ real system. The other is idle: it learns at the same time and can take over.
 
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.clearance import Clearance
-from rt_torchrl.twinning.cloning import Cloning
+from rt_torchrl.twinning.cloning import Cloning, of_each_role
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
@@ -232,14 +233,15 @@ class ReinforcementTwinning:
         costs = self.virtual_costs(judged_on)
         live, idle = self.referee.live, self.referee.idle
         change = weight_change(self.policies[idle], self._earlier_weights[idle])
+        judge = cache(lambda: self.examination.judge(self.short_term[-1]))
         evidence = Evidence(
             live_cost=costs[live].item(),
             idle_cost=costs[idle].item(),
             idle_weight_change=change.item(),
             real_costs=self.track_record.real_costs,
             predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
-            beliefs=lambda: self.examination.beliefs(self.policies, self.short_term[-1]),
-            contradicted=lambda: self.examination.correction(self.short_term[-1]) is not None,
+            beliefs=lambda: of_each_role(self.policies, judge().belief),
+            contradicted=lambda: judge().contradicts,
         )
         event = self.referee.decide(evidence)
         diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]

@@ -1,6 +1,6 @@
 """The examination of the twin by the real episodes: paired differences, beliefs about policies, and the alarm."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict
@@ -9,13 +9,12 @@ from torch import nn
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.assimilation import Assimilation
-from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE, EPISODES, MATTERS, QUIET, alarm, contradiction
-from rt_torchrl.twinning.evidence.paired_differences import LARGEST, Belief, difference, unexplained
+from rt_torchrl.twinning.evidence.alarm import EPISODES, MATTERS, QUIET, alarm, contradiction
+from rt_torchrl.twinning.evidence.paired_differences import LARGEST, difference, unexplained
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration, repeatable
 from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
-from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import Flown, TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -137,11 +136,4 @@ class Examination:
         it would refuse plans which are as good as the twin says.
         """
         judge = self.judge(record)
-        sizes = map(unexplained, judge.differences.values, judge.differences.exploration)
-        return judge if max(sizes, default=0.0) > BEYOND_CHANCE else None
-
-    @torch.no_grad()
-    def beliefs(self, policies: Mapping[Role, nn.Module], record: Trajectory) -> dict[Role, Belief]:
-        """The belief about log J_real − log J_twin of each policy, compared in the observations of a record."""
-        judge = self.judge(record)
-        return {role: judge.belief(policy) for role, policy in policies.items()}
+        return judge if judge.contradicts else None

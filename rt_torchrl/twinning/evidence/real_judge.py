@@ -10,7 +10,15 @@ from torch import Tensor, nn
 
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.architecture import same_architecture
-from rt_torchrl.twinning.evidence.paired_differences import NOISE, Belief, PairedDifferences, difference, excess
+from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
+from rt_torchrl.twinning.evidence.paired_differences import (
+    NOISE,
+    Belief,
+    PairedDifferences,
+    difference,
+    excess,
+    unexplained,
+)
 from rt_torchrl.twinning.track_record import Differences, shares
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -42,6 +50,12 @@ class RealJudge:
     def shares(self, policy: nn.Module) -> Float[Tensor, " m"]:
         """Actions in which policies are compared, in shares of half their ranges."""
         return shares(policy, self.virtual.twin.plant, self.record)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether one of the real episodes contradicts the twin beyond chance."""
+        sizes = map(unexplained, self.differences.values, self.differences.exploration)
+        return max(sizes, default=0.0) > BEYOND_CHANCE
 
     @torch.no_grad()
     def belief(self, policy: nn.Module) -> Belief:

@@ -44,13 +44,16 @@ class WeightOfEvidence(TwoPolicies):
     def decide(self, evidence: Evidence) -> Event:
         gain, loss = stakes(evidence, self.live, self.idle)
         swaps = self.config.trial_horizon * gain > loss
+        self.on_trial = int(swaps and dearer(evidence, gain, loss))
         if swaps:
-            dearer = loss > gain if evidence.contradicted() else evidence.idle_cost > evidence.live_cost
-            self.on_trial = int(dearer)
             self.live, self.stall_count = self.idle, 0
             return "swap"
-        self.on_trial = 0
         return self.stalled(evidence.idle_weight_change)
+
+
+def dearer(evidence: Evidence, gain: float, loss: float) -> bool:
+    """Whether the idle policy is the dearer one: by what is expected, or by a twin that no real episode contradicts."""
+    return loss > gain if evidence.contradicted() else evidence.idle_cost > evidence.live_cost
 
 
 def stakes(evidence: Evidence, live: Role, idle: Role) -> tuple[float, float]:
