@@ -19,6 +19,10 @@ from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonCo
 pytestmark = pytest.mark.slow
 HORIZON = 20.0
 SECONDS = 90.0
+EPISODES = 8
+"""A single episode costs up to some 20 % more with either one, by chance: rounding leads plans to other minima."""
+TOLERANCE = 1e-5
+"""Relative decrease at which a solve ends; the default, a tenth as tight, costs 1 % more over sixteen episodes."""
 SCALES = (1.0, 100.0, 10.0, 1.0, 4e4, 10.0)
 
 
@@ -131,30 +135,31 @@ def planned(mpc, state, wind):
 
 
 def main():
-    """Print J_a and CPU time of do-mpc and of the library, and the costs of their plans in the first states."""
+    """Print J_a and CPU time of do-mpc and of the library, and the costs of their plans in the first episode."""
     torch.set_num_threads(1)
     plant = WindTurbine(horizon=SECONDS, closure=SaintDrenan.from_set("Dai2016"))
     generator = torch.Generator().manual_seed(12345)
-    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     mpc, set_wind = controller(plant)
-    mpc.x0 = state[0].numpy()
-    mpc.set_initial_guess()
-
-    plans = []
+    found, plans = [], []
 
     def by_do_mpc(k, s, wind):
         set_wind(wind.item())
         command = torch.from_numpy(mpc.make_step(s[0].numpy().reshape(-1, 1))).reshape(1, 2)
-        if k % 9 == 0:
+        if k % 9 == 0 and not found:
             plans.append(planned(mpc, s, wind))
         return command
 
-    own = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=HORIZON))
-    found = [
-        flown(plant, state, exogenous, by_do_mpc),
-        flown(plant, state, exogenous, lambda k, s, wind: own.act(k * plant.dt, s, wind)),
-    ]
-    print(json.dumps([*found, plans]))
+    own = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=HORIZON, tolerance=TOLERANCE))
+    for _ in range(EPISODES):
+        state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+        mpc.reset_history()
+        mpc.x0 = state[0].numpy()
+        mpc.set_initial_guess()
+        own.begin()
+        theirs = flown(plant, state, exogenous, by_do_mpc)
+        found.append((theirs, flown(plant, state, exogenous, lambda k, s, wind: own.act(k * plant.dt, s, wind))))
+    costs, seconds = np.array(found).mean(0), np.median(found, 0)
+    print(json.dumps([*zip(costs[:, 0], seconds[:, 1], strict=True), plans]))
 
 
 def test_the_receding_horizon_costs_what_do_mpc_costs_in_an_eighth_of_the_time():
