@@ -17,10 +17,10 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.corrected_plans import CorrectedPlans, go
-from rt_torchrl.twinning.evidence.paired_differences import NOISE, REACH, PairedDifferences
-from rt_torchrl.twinning.evidence.real_judge import LEAST, RealJudge
+from rt_torchrl.twinning.evidence.paired_differences import LEAST, NOISE, REACH, PairedDifferences
+from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
-from rt_torchrl.twinning.track_record import Differences
+from rt_torchrl.twinning.track_record import Differences, Flown
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
@@ -95,7 +95,10 @@ def judge_of(gains, differences):
     with torch.no_grad():
         flown = Rollout(plant, plant.closure, Gain(1.0))(state, exogenous)
     record = Trajectory(flown.states[0] * 0.4, flown.actions[0], exogenous[0])
-    found = Differences([Gain(gain) for gain in gains], differences, [0.0] * len(gains))
+    policies = [Gain(gain) for gain in gains]
+    costs = [said(policy).item() * math.exp(d) for policy, d in zip(policies, differences, strict=True)]
+    flights = [Flown(record, "model_based", {}, cost) for cost in costs]
+    found = Differences(policies, differences, [0.0] * len(gains), flights)
     return RealJudge(found, found.learned(plant, record), Twin(plant), record)
 
 

@@ -30,7 +30,7 @@ from rt_torchrl.twinning.evidence.paired_differences import (
 )
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration
-from rt_torchrl.twinning.findings import findings
+from rt_torchrl.twinning.findings import findings, weight_vector
 from rt_torchrl.twinning.judgement import Costs, Judgement
 from rt_torchrl.twinning.learners import LearnerConfig
 from rt_torchrl.twinning.learners.config import IncrementalTD3Config
@@ -223,7 +223,9 @@ def judge_of(gains, differences):
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     flown = Rollout(plant, plant.closure, LinearGain([[1.0, 1.0]]))(state, exogenous)
     record = Trajectory(flown.states[0], flown.actions[0], exogenous[0])
-    found = Differences([LinearGain([[gain, 0.0]]) for gain in gains], differences, [0.0] * len(gains))
+    costs = [gain * math.exp(d) for gain, d in zip(gains, differences, strict=True)]
+    flights = [Flown(record, "model_based", {}, cost) for cost in costs]
+    found = Differences([LinearGain([[gain, 0.0]]) for gain in gains], differences, [0.0] * len(gains), flights)
     return RealJudge(found, found.learned(plant, record), ByGain(plant), record)
 
 
@@ -231,6 +233,23 @@ def test_a_policy_that_cost_more_than_the_twin_said_is_expected_to_cost_it_again
     judge = judge_of([4.0, 4.0], [1.0, 1.0])
     assert judge.expected(LinearGain([[4.0, 0.0]]), 4.0) == pytest.approx(4.0 * math.e, rel=0.03)
     assert judge.expected(LinearGain([[4.0, 0.0]]), -4.0) == -4.0
+
+
+def test_a_twin_that_blew_up_tells_of_policies_with_which_it_does_too():
+    """The twin says 40 of a flight that cost 0.54; midway are 4.6."""
+    judge, policy = judge_of([40.0, 40.0], [-4.3, -4.3]), LinearGain([[40.0, 0.0]])
+    assert judge.expected(policy, 40.0) == pytest.approx(40.0 * math.exp(-4.3), rel=0.03)
+    assert judge.belief(policy, 5.0).mean == pytest.approx(-4.3, rel=0.03)
+    assert judge.belief(policy, 4.0) == (0.0, pytest.approx(math.hypot(COMMON, LOCAL)))
+    assert judge.median(policy, 4.0) == 4.0
+    assert judge.trust(policy, 0.1) < 0.01
+
+
+def test_a_twin_that_is_merely_wrong_tells_of_all_neighbours():
+    judge, policy = judge_of([40.0, 40.0], [-0.9, -0.9]), LinearGain([[40.0, 0.0]])
+    assert judge.belief(policy, 0.4).mean == pytest.approx(-0.9, rel=0.03)
+    judge = judge_of([0.4, 0.4], [3.0, 3.0])
+    assert judge.belief(LinearGain([[0.4, 0.0]]), 0.01).mean == pytest.approx(3.0, rel=0.03)
 
 
 def test_weights_are_recalled_that_are_expected_to_cost_less():
@@ -413,6 +432,24 @@ def test_the_referee_learns_whether_a_real_episode_contradicts_the_twin(factor, 
     found.referee.decide = lambda evidence: asked.append((evidence.contradicted(), set(evidence.beliefs()))) or "keep"
     found.episode()
     assert asked == [(contradicted, set(found.policies))]
+
+
+def test_beliefs_of_the_referee_follow_from_what_the_twin_says_of_each_policy():
+    """The twin says twenty times what an episode cost, as it does of the live policy, but not of its clone's costs."""
+    plant = LinearQuadratic(horizon=2.0)
+    found = twinning(plant, closure=copy.deepcopy(plant.closure), exploration=ExplorationConfig(spread=0.0))
+    report_costs(found, 0.05)
+    asked, live, idle = [], found.referee.live, found.referee.idle
+    found.policies[idle].load_state_dict(found.policies[live].state_dict())
+    found.interact()
+    said = found.track_record.real_costs[-1] / 0.05
+    found.virtual_costs = lambda episodes: {live: torch.tensor(said), idle: torch.tensor(0.1 * said)}
+    found._earlier_weights = {role: weight_vector(policy) for role, policy in found.policies.items()}
+    found.referee.decide = lambda evidence: asked.append(evidence.beliefs()) or "keep"
+    found.fit_exogenous()
+    found.switch_policies()
+    assert asked[0][live].mean == pytest.approx(math.log(0.05), rel=0.03)
+    assert asked[0][idle] == (0.0, pytest.approx(math.hypot(COMMON, LOCAL)))
 
 
 @pytest.mark.parametrize(("exploration", "corrects"), [(0.0, True), (0.02, True), (0.1, False)])

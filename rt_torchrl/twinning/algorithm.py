@@ -22,7 +22,7 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.clearance import Clearance
-from rt_torchrl.twinning.cloning import Cloning, of_each_role
+from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
@@ -240,7 +240,7 @@ class ReinforcementTwinning:
             idle_weight_change=change.item(),
             real_costs=self.track_record.real_costs,
             predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
-            beliefs=lambda: of_each_role(self.policies, judge().belief),
+            beliefs=lambda: {role: judge().belief(self.policies[role], cost.item()) for role, cost in costs.items()},
             contradicted=lambda: judge().contradicts,
         )
         event = self.referee.decide(evidence)

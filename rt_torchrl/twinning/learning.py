@@ -59,7 +59,7 @@ class Learning:
         if not self._asks:
             return findings()
         told: Any = self.learner
-        probability = judge().belief(self.learner.policy).within(MATTERS)
+        probability = judge().trust(self.learner.policy, MATTERS)
         told.trust_twin(probability)
         return findings(trust=probability)
 

@@ -1,6 +1,7 @@
 """Costs of real episodes, as measured and as the twin predicts them: the latest, and earlier ones that refute it."""
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.evidence.paired_differences import PairedDifferences, difference, excess
+from rt_torchrl.twinning.evidence.paired_differences import LEAST, PairedDifferences, difference, excess
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -175,8 +176,18 @@ class Differences(NamedTuple):
     policies: list[nn.Module]
     values: list[float]
     exploration: list[float]
-    flown: Sequence[Flown] = ()
+    flown: Sequence[Flown]
     earlier: int = 0
+
+    def telling(self, cost: float) -> list[bool]:
+        """Which episodes tell something of a policy that has this mean J_a on the twin.
+
+        A twin that says more than e times the real cost blows up or stalls where the real system does not. It tells of
+        policies with which it does so, too: whose cost is nearer to what it says of the episode than to what that cost,
+        on a logarithmic scale.
+        """
+        pairs = zip(self.values, self.flown, strict=True)
+        return [d >= LEAST or cost > one.cost * math.exp(-0.5 * d) for d, one in pairs]
 
     def learned(self, plant: Plant, record: Trajectory) -> PairedDifferences:
         """The belief about all policies, which are compared in the observations of a record."""

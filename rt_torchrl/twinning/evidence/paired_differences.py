@@ -5,6 +5,7 @@ cancels. What is left is the paired difference :math:`d_i = \log J_i - \log\hat 
 """
 
 import math
+from collections.abc import Sequence
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -26,6 +27,10 @@ EXPLORED = 2.0
 """Standard deviation of d for each unit of exploration."""
 LARGEST = 5.0
 """Greatest |d| that counts: beyond e⁵ = 150 times it does not matter how wrong a prediction is."""
+
+LEAST = -1.0
+"""Least d of a twin that is merely wrong. One that says more than e times the real cost blows up or stalls where the
+real system does not, and need not do so with the neighbours of a policy."""
 
 
 class Belief(NamedTuple):
@@ -83,6 +88,12 @@ class PairedDifferences:
     def at_least(self, least: float, noise: float = NOISE) -> "PairedDifferences":
         """What follows from the same episodes, where a smaller d is taken for ``least``, with this noise."""
         return PairedDifferences(self.actions, self.differences, self.exploration, least, noise)
+
+    def of(self, counts: Sequence[bool]) -> "PairedDifferences":
+        """What follows from those episodes alone that count."""
+        chosen = torch.tensor(counts, dtype=torch.bool, device=self.differences.device)
+        actions, d, explored = (each[chosen] for each in (self.actions, self.differences, self.exploration))
+        return PairedDifferences(actions, d, explored, noise=self.noise)
 
     def _kernel(self, others: Float[Tensor, "k m"]) -> Float[Tensor, "k n"]:
         squared = (others.unsqueeze(1) - self.actions).square().mean(-1)

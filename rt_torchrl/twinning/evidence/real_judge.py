@@ -12,6 +12,7 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
 from rt_torchrl.twinning.evidence.paired_differences import (
+    LEAST,
     NOISE,
     Belief,
     PairedDifferences,
@@ -24,9 +25,6 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 RECALLED_BELOW = 0.98
 """Share of the present policy's expected cost below which earlier weights take its place."""
-LEAST = -1.0
-"""Least d that makes other policies cheaper. A twin that says more than e times the real cost blows up or stalls where
-the real system does not; its neighbours need not."""
 NOISES = tuple(NOISE * 2.0**k for k in range(4))
 """Standard deviations of d for one episode among which the likeliest is taken: luck does not cancel where the real
 system has inputs that no sensor reads. Beforehand log₂ of their ratio to the first one is normal, with deviation 1."""
@@ -58,9 +56,14 @@ class RealJudge:
         return max(sizes, default=0.0) > BEYOND_CHANCE
 
     @torch.no_grad()
-    def belief(self, policy: nn.Module) -> Belief:
-        """The belief about log J_real − log J_twin of a policy."""
-        return self.learned.belief(self.shares(policy))
+    def belief(self, policy: nn.Module, cost: float) -> Belief:
+        """The belief about log J_real − log J_twin of a policy, where it has this cost on the twin."""
+        return self.learned.of(self.differences.telling(cost)).belief(self.shares(policy))
+
+    @torch.no_grad()
+    def trust(self, policy: nn.Module, size: float) -> float:
+        """Probability that the twin says what a policy costs to within this size of log J, by all episodes."""
+        return self.learned.belief(self.shares(policy)).within(size)
 
     @cached_property
     def limited(self) -> PairedDifferences:
@@ -92,11 +95,11 @@ class RealJudge:
 
     def expected(self, policy: nn.Module, cost: float) -> float:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""
-        return expected_cost(cost, self.belief(policy))
+        return expected_cost(cost, self.belief(policy, cost))
 
     def median(self, policy: nn.Module, cost: float) -> float:
         """The cost on the real system that is as likely exceeded as not."""
-        return cost * math.exp(self.belief(policy).mean) if cost > 0.0 else cost
+        return cost * math.exp(self.belief(policy, cost).mean) if cost > 0.0 else cost
 
     @cached_property
     def _cautious(self) -> PairedDifferences:
