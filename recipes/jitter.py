@@ -114,6 +114,19 @@ def statistics(late: list[np.ndarray], period: float) -> dict[str, float]:
     }
 
 
+def measure(operation, learner: Learner, config: Config) -> tuple[dict[str, dict[str, float]], list[float]]:
+    """Lateness without and with learning beside it, in turn, and the times of the learner's rounds [s]."""
+    late, rounds = {"idle": [], "learning": []}, []
+    operation.hand_over(NAME, learner.policies[NAME], strength=0.0, episode=0)
+    for k in range(config.turns):
+        for kind, beside in (("idle", None), ("learning", learner)):
+            found, times = turn(operation, beside, config.seconds)
+            late[kind].append(found)
+            rounds += times
+        print(f"turns {k + 1} of {config.turns} done", file=sys.stderr)
+    return {kind: statistics(found, config.period) for kind, found in late.items()}, rounds
+
+
 def main(config: Config) -> None:
     # Here, because --help need not wait for TorchRL.
     from functools import partial
@@ -132,30 +145,19 @@ def main(config: Config) -> None:
     make_env = partial(PlantEnv, plant, seed=config.seed + 1)
     crew = Crew(make_env, plant, {NAME: learner.policies[NAME]}, ExplorationConfig(episodes=0), options, seed=0)
     operation = ProcessOperation(crew, make_env())
-    idle, learning, rounds = [], [], []
     try:
-        operation.hand_over(NAME, learner.policies[NAME], strength=0.0, episode=0)
-        for k in range(config.turns):
-            late, _ = turn(operation, None, config.seconds)
-            idle.append(late)
-            late, times = turn(operation, learner, config.seconds)
-            learning.append(late)
-            rounds += times
-            print(f"turns {k + 1} of {config.turns} done", file=sys.stderr)
+        found, rounds = measure(operation, learner, config)
     finally:
         operation.close()
     alone += [learner.learn() for _ in range(3)]
-    found = {
-        "idle": statistics(idle, config.period),
-        "learning": statistics(learning, config.period),
-        "learner_seconds": {"alone": float(np.median(alone)), "beside": float(np.median(rounds))},
-        "learner_ratio": float(np.median(rounds) / np.median(alone)),
-    }
-    path = write_results(config.log_dir / "jitter.json", {"config": config, **found})
-    for kind in ("idle", "learning"):
-        told = ", ".join(f"{name.replace('_', ' ')} {value:.6g}" for name, value in found[kind].items())
+    seconds = {"alone": float(np.median(alone)), "beside": float(np.median(rounds))}
+    ratio = seconds["beside"] / seconds["alone"]
+    times = {"learner_seconds": seconds, "learner_ratio": ratio}
+    path = write_results(config.log_dir / "jitter.json", {"config": config, **found, **times})
+    for kind, numbers in found.items():
+        told = ", ".join(f"{name.replace('_', ' ')} {value:.6g}" for name, value in numbers.items())
         print(f"{kind}: {told}")
-    print(f"learner: {found['learner_ratio']:.3g} times as long beside the control as alone")
+    print(f"learner: {ratio:.3g} times as long beside the control as alone")
     print(f"results in {path}")
 
 

@@ -130,13 +130,9 @@ class CryogenicTank(Plant):
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)
         self.register_buffer("error_sizes", torch.tensor(error_sizes, dtype=torch.float64))
         if wall == "explicit":
-            require_stable_step(
-                self.name,
-                dt,
-                self.wall_rate(self.closure),
-                mode=f"the wall of heat capacity {wall_heat_capacity:.6g} J/K",
-                remedy="wall='exponential'",
-            )
+            mode = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K"
+            rate = self.wall_rate(self.closure)
+            require_stable_step(self.name, dt, rate, mode=mode, remedy="wall='exponential'")
 
     @torch.no_grad()
     def wall_rate(self, closure: nn.Module) -> float:

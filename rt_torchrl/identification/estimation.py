@@ -271,7 +271,7 @@ class Estimation:
         equations = likelihood.normal_equations(blocks)
         inverse = inverse_information(equations.matrix).matrix
         rest, n, prior = True, likelihood.weight_count, likelihood.prior
-        determined = likelihood.count - _held_back(likelihood, inverse)
+        determined = likelihood.count - likelihood.held_back(inverse)
         if self.config.prior is None and prior is not None and prior.held.any():
             gamma = (prior.held * (1.0 - prior.stiffness * inverse.diagonal()[:n])).sum()
             moved = (prior.held * (prior.weights() - prior.start).square()).sum()
@@ -288,14 +288,3 @@ class Estimation:
         rest &= bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
         likelihood.noise = levels
         return rest
-
-
-def _held_back(likelihood: Likelihood, inverse: Float[Tensor, "n n"]) -> float:
-    """Number of unknowns that priors determine instead of the data."""
-    n, prior = likelihood.weight_count, likelihood.prior
-    stiffness = likelihood.first_stiffness.flatten()
-    found = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
-    for push in likelihood.pushes():
-        A, places = push.jacobian[0], push.places
-        found = found + (A.T @ A * inverse[places[:, None], places]).sum()
-    return float(found if prior is None else found + prior.determined(inverse))

@@ -235,6 +235,16 @@ class Likelihood:
             found.append(Residuals(values[None], jacobian[None], joined))
         return found
 
+    def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
+        """Number of unknowns that priors determine instead of the data, by the inverse of the information."""
+        n = self.weight_count
+        stiffness = self.first_stiffness.flatten()
+        found = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
+        for push in self.pushes():
+            A, places = push.jacobian[0], push.places
+            found = found + (A.T @ A * inverse[places[:, None], places]).sum()
+        return float(found if self.prior is None else found + self.prior.determined(inverse))
+
     def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)
         first = self._shown + number * free

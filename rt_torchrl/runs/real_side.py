@@ -1,4 +1,4 @@
-"""The real side of a run: the system in simulation, the episodes that judge on it, and what does not go with it."""
+"""The real side of a run: the system in simulation, and the episodes that judge on it."""
 
 import torch
 from tensordict import TensorDictBase
@@ -6,13 +6,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from rt_torchrl.baselines.acting import ActingController
-from rt_torchrl.baselines.check import require_controller
 from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs.configured_plant import require_plant
+from rt_torchrl.plants.state_bounds import StateBounds
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
@@ -69,76 +67,15 @@ def simulated(
 
 
 def judged_on(
-    plant: Plant, env: RealSystem | None, count: int, *, device: torch.device, compiled: bool
+    plant: Plant, physics: Plant, env: RealSystem | None, config: RunConfig, *, device: torch.device, compiled: bool
 ) -> UnseenEpisodes:
-    """The unseen episodes: on the plant, or on the real system itself if its closure is not known."""
+    """The unseen episodes: on the plant, or on the real system itself if its closure is not known.
+
+    Policies for them are made for the physics that the twin knows, and leaving the bounds of states counts.
+    """
     if env is None or env.closure is not None:
-        return UnseenEpisodes(plant, count, compiled=compiled, device=device)
-    return RealEpisodes(env, count, device=device)
-
-
-def require_simulation(
-    config: RunConfig, plant: Plant, env: RealSystem | None, baselines: dict[str, type[Baseline]] | None
-) -> None:
-    """Refuse options that only a plant in simulation can carry out, and controllers that need the other kind of system.
-
-    Raises:
-        ValueError: if there is such an option or controller; it names it.
-    """
-    if env is not None and (config.noise or config.wear(plant) is not None):
-        raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
-    real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
-    on_the_plant = [name for name in baselines or {} if name not in real]
-    if real and (env is None or env.closure is not None):
-        raise ValueError(
-            f"baselines {real} can only be flown on a real system, and this run judges on the plant in simulation. "
-            "Give ClassicalController classes, or a RealSystem without its closure."
-        )
-    if env is not None and env.closure is None and (config.reference or on_the_plant):
-        raise ValueError(
-            f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "
-            "and the real system's is not known; leave them out, or give the RealSystem its closure."
-        )
-
-
-def _acts_on_the_real_system(law: object) -> bool:
-    return isinstance(law, type) and issubclass(law, RealController)
-
-
-def require_controllers(
-    physics: Plant, first: type[ClassicalController] | None, baselines: dict[str, type[Baseline]] | None
-) -> None:
-    """Refuse controllers that are no classes, or whose laws do not fit the plant.
-
-    Raises:
-        ValueError: if there is one; the message names it, and says what is expected.
-    """
-    given: dict[str, object] = {} if first is None else {"first": first}
-    given |= {f"baselines[{name!r}]": law for name, law in (baselines or {}).items()}
-    for name, law in given.items():
-        if not _acts_on_the_real_system(law):
-            require_controller(name, law, physics)
-
-
-def physics_known(plant: Plant, believed: Plant | None) -> Plant:
-    """The physics of the twin of a real system.
-
-    Args:
-        plant: the real system.
-        believed: physics that the twin is given; None for those of the real system.
-
-    Raises:
-        ValueError: if one is no plant, or the twin has states that no sensor of the real system reads, or lacks some
-            that one reads.
-    """
-    require_plant("plant", plant)
-    if believed is not None:
-        require_plant("believed", believed)
-    physics = believed or plant
-    known, read = ([state.name for state in states] for states in (physics.states, plant.readings))
-    if known != read:
-        raise ValueError(
-            f"a twin of plant {plant.name!r} with the states {', '.join(known)} cannot be fitted to records of "
-            f"{', '.join(read)}, which is all that sensors read; give believed, the plant without its extensions."
-        )
-    return physics
+        unseen = UnseenEpisodes(plant, config.unseen, compiled=compiled, device=device)
+    else:
+        unseen = RealEpisodes(env, config.unseen, device=device)
+    unseen.physics, unseen.bounds = physics, StateBounds(plant, config.twinning.bounded_states)
+    return unseen

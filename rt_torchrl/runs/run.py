@@ -14,23 +14,22 @@ from torchrl.envs import EnvBase
 from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.contract.check import check_plant
 from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.gradient_check import engine_gap
 from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.state_bounds import StateBounds
 from rt_torchrl.runs import checkpoint, reference, results
 from rt_torchrl.runs.callbacks import Callback
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.drawing import Drawing, PlantFigures, first_flights
+from rt_torchrl.runs.known_physics import known_physics
 from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, learner_threads, operation_of
 from rt_torchrl.runs.progress import Progress
-from rt_torchrl.runs.real_side import judged_on, physics_known, require_controllers, require_simulation, simulated
+from rt_torchrl.runs.real_side import judged_on, simulated
 from rt_torchrl.runs.results_table import next_steps, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_folder import RunFolder
@@ -42,9 +41,6 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.cloning import of_each_role
 from rt_torchrl.twinning.referees import Role
-
-CHECKED_STEPS = 10
-"""Number of control intervals on which a plant is checked before a run; ``check_plant`` by itself checks more."""
 
 
 class Run:
@@ -102,11 +98,7 @@ class Run:
         compiled = config.compiled if config.compiled is not None else not native and can_compile(device)
         make_env: Callable[[], EnvBase] | None = None if isinstance(env, RealSystem) else env
         real = env if isinstance(env, RealSystem) or env is None else env()
-        require_simulation(config, plant, real, baselines)
-        physics = physics_known(plant, believed)
-        for one in filter(None, (plant, believed)):
-            check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
-        require_controllers(physics, first, baselines)
+        physics = known_physics(config, plant, believed, real, first, baselines)
         self._start = start_of(config, physics, first)
         if threads := learner_threads(config):
             torch.set_num_threads(threads)
@@ -117,9 +109,7 @@ class Run:
                 make_env = functools.partial(simulated, plant, config, first, device=device, compiled=compiled)
             system = real or simulated(plant, config, first, device=device, compiled=compiled)
             self._make_algorithm(system, make_env, physics, device=device, compiled=compiled)
-            self.unseen = judged_on(plant, real, self.config.unseen, device=device, compiled=compiled)
-            self.unseen.physics = physics
-            self.unseen.bounds = StateBounds(plant, config.twinning.bounded_states)
+            self.unseen = judged_on(plant, physics, real, self.config, device=device, compiled=compiled)
             made = {name: law(physics, compiled=compiled) for name, law in (baselines or {}).items()}
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []

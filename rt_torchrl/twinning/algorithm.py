@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.operation.operation import Operation
+from rt_torchrl.systems.operation.operation import Operation, system_of
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -41,7 +41,7 @@ from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.twinning.saved_state import load_parts, on_device
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
-from rt_torchrl.twinning.starts import Start
+from rt_torchrl.twinning.starts import Start, first_live
 from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
@@ -82,11 +82,9 @@ class ReinforcementTwinning:
     ):
         self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
-        begun: Role = "model_free" if first is None else first.live
-        acting = begun if config.arm == "twinning" else config.arm
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
-        self.referee = referee or make_referee(config.referee, acting)
+        self.referee = referee or make_referee(config.referee, first_live(config.arm, first))
         require_own_policies(self.policies, {"model_free": self.learner, "model_based": self.planner})
         share_critic(self.learner, model_based)
         self.fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
@@ -97,8 +95,7 @@ class ReinforcementTwinning:
         experience = max(config.records, config.planner.experience)
         self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
         self.virtual.judge_by(getattr(self.planner, "constraints", None), config.planner.extremes)
-        system = env.system if isinstance(env, Operation) else env
-        self.clearance = Clearance(system, self.policies, self.virtual, config.limits)
+        self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual, config.planner, corrected=config.corrected_descents)

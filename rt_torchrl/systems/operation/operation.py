@@ -75,3 +75,8 @@ class Operation(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of an operation that was built with the same arguments."""
+
+
+def system_of(env: EnvBase | Operation) -> EnvBase:
+    """The real system itself, in operation or not."""
+    return env.system if isinstance(env, Operation) else env

@@ -5,6 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import nn
 
+from rt_torchrl.twinning.config import Arm
 from rt_torchrl.twinning.flight import Flight
 from rt_torchrl.twinning.referees import Role
 
@@ -37,3 +38,10 @@ class Start(Protocol):
         Args:
             fly: function that flies one on the real system; nothing is flown if enough is known without it.
         """
+
+
+def first_live(arm: Arm, first: Start | None) -> Role:
+    """The role that acts in the first episode: the only one that an arm trains or, of both, the one that begins."""
+    if arm != "twinning":
+        return arm
+    return "model_free" if first is None else first.live
