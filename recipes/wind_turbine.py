@@ -67,6 +67,7 @@ CONVERGED = dataclasses.replace(
     planner=PlannerConfig(
         iterations=25,
         realisations=50,
+        scouts=32,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),

@@ -43,6 +43,7 @@ TAGS = {
     "withheld": "twin/log of the cost that stays over that of the plan which real episodes contradict (twin)",
     "corrected": "twin/plans that real episodes have corrected",
     "led_back": "switch/plan from earlier weights accepted",
+    "scouted": "switch/plan from a random policy accepted",
     "astray": "twin/plans that failed from extreme starts",
     "alarm": "twin/alarm: the twin is wrong where it matters",
     "whiteness": "twin/apart from the alarm: probability that white noise leaves as much over (Ljung-Box)",

@@ -144,6 +144,7 @@ class Run:
             config=config.twinning,
             generator=generator,
             first=first,
+            make_policy=self.make_policy,
         )
         # Copies made after the algorithm know its learner's critic, where model predictive control needs one.
         self.initial_policies, self.initial_closure = copy.deepcopy(policies), copy.deepcopy(closure)

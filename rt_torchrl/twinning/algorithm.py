@@ -40,6 +40,7 @@ from rt_torchrl.twinning.planners import Planner, make_planner
 from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.twinning.saved_state import load_parts, on_device
+from rt_torchrl.twinning.scouts import Scouts
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 from rt_torchrl.twinning.starts import Start, first_live
 from rt_torchrl.twinning.track_record import TrackRecord
@@ -56,9 +57,9 @@ class ReinforcementTwinning:
         model_based: policy π_mb, trained in place, or :class:`PredictiveControl` on the twin's closure.
         config: hyper-parameters of the six steps.
         generator: source of all random numbers that the real system does not draw itself.
-        learner: learner of step 2, which trains ``model_free``; by default ``config.learner`` makes it.
-        planner: planner of step 5, which trains ``model_based``; by default ``config.planner`` makes it.
-        referee: referee of step 6; by default ``config.referee`` makes it.
+        learner: learner of step 2, which trains ``model_free``; by default that of ``config.learner``.
+        planner: planner of step 5, which trains ``model_based``; by default that of ``config.planner``.
+        referee: referee of step 6; by default that of ``config.referee``.
         first: what is known before the first episode, such as :class:`FirstController`, with which twin and policies
             begin; None begins with the policies as they are.
 
@@ -79,6 +80,7 @@ class ReinforcementTwinning:
         planner: Planner | None = None,
         referee: Referee | None = None,
         first: Start | None = None,
+        make_policy: Callable[[torch.Generator], nn.Module] | None = None,
     ):
         self.env, self.twin, self.config, self.generator, self.first = env, twin, config, generator, first
         self.policies: dict[Role, nn.Module] = {"model_free": model_free, "model_based": model_based}
@@ -89,16 +91,15 @@ class ReinforcementTwinning:
         share_critic(self.learner, model_based)
         self.fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=self.fed_back)
-        self.short_term = ShortTermMemory(config.records)
+        self.short_term, self.track_record = ShortTermMemory(config.records), TrackRecord(self.policies)
         self.informative = InformativeMemory(self.assimilation, config.informative)
-        self.track_record = TrackRecord(self.policies)
-        experience = max(config.records, config.planner.experience)
-        self.virtual = VirtualEpisodes(twin, config.exogenous, experience, generator=generator)
+        self.virtual = VirtualEpisodes(twin, config.exogenous, config.experience, generator=generator)
         self.virtual.judge_by(getattr(self.planner, "constraints", None), config.planner.extremes)
         self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual, config.planner, corrected=config.corrected_descents)
+        self.planning.scouts = Scouts(self.virtual, model_based, config.planner.scouting, make_policy)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)

@@ -74,6 +74,11 @@ class TwinningConfig:
     distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
     @property
+    def experience(self) -> int:
+        """Number of latest real episodes whose exogenous inputs are kept: enough for step 4, and for steps 5 and 6."""
+        return max(self.records, self.planner.experience)
+
+    @property
     def bounded_states(self) -> dict[str, tuple[float, float]]:
         """Bounds on states by name, of the limits and of the constraints of plans, which come first."""
         return {**self.limits.states, **self.planner.constraints.states}

@@ -15,6 +15,7 @@ from rt_torchrl.twinning.extreme_starts import astray
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.planners import Planner, PlannerConfig
+from rt_torchrl.twinning.scouts import GAINED, Scouts
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 from rt_torchrl.twinning.way_back import WayBack
 
@@ -27,7 +28,8 @@ class Planning:
     while it acts, so that there is nothing to compare.
 
     The attribute ``others`` holds further weights, from which the next plan is made, too; the best plan stays. A
-    descent from the imitation of a controller may end in a minimum beside that controller.
+    descent from the imitation of a controller may end in a minimum beside that controller. The attribute ``scouts``
+    holds :class:`Scouts` of the policy, or None.
 
     Args:
         planner: planner of step 5.
@@ -38,6 +40,7 @@ class Planning:
 
     def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig, *, corrected: bool = False):
         self.planner, self.virtual, self.config = planner, virtual, config
+        self.scouts: Scouts | None = None
         self.corrected = CorrectedPlans(planner, virtual) if corrected else None
         # A copy of the policy descends over a short horizon, and goes on whether or not a plan gains anything.
         limit = math.inf if config.short_horizon.window else config.episode_gradient_limit
@@ -66,6 +69,8 @@ class Planning:
             found, _ = self._also_from([self.others.pop()], found, planned_on, judged_on, judgement)
         if self.config.approach and episode == self.config.approach_at:
             found = self._approached(found, planned_on, judged_on, judgement)
+        if self.scouts is not None and self.scouts.due(episode):
+            found = self._scouted(self.scouts.best(episode, planned_on), found, planned_on, judged_on, judgement)
         for _ in range(self.config.rounds - 1):
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
@@ -106,6 +111,18 @@ class Planning:
         self._first.clear()
         return merged(found, findings(approached=float(accepted)))
 
+    def _scouted(
+        self,
+        scout: dict[str, Tensor],
+        found: TensorDict,
+        planned_on: Scenario,
+        judged_on: Scenario,
+        judgement: Judgement,
+    ) -> TensorDict:
+        """The plan from the best scout, if it saves enough, or the plan found so far."""
+        further, better = self._also_from([scout], found, planned_on, judged_on, judgement, gained=GAINED)
+        return merged(merged(found, further) if better else found, findings(scouted=float(better)))
+
     def remember(self) -> None:
         """Plan from the present weights, too, the next time; state feedback has none."""
         if not isinstance(self.planner.policy, StateFeedback):
@@ -132,11 +149,12 @@ class Planning:
         judgement: Judgement,
         *,
         approach: int = 0,
+        gained: float = 0.0,
     ) -> tuple[TensorDict, bool]:
         """The best plan from other weights or the plan found so far, and whether it is from others."""
         better = False
         for weights in begins:
-            further = self._from_others(weights, planned_on, judged_on, judgement, approach=approach)
+            further = self._from_others(weights, planned_on, judged_on, judgement, approach=approach, gained=gained)
             found, better = (found, better) if further is None else (further, True)
         return found, better
 
@@ -148,8 +166,12 @@ class Planning:
         judgement: Judgement,
         *,
         approach: int = 0,
+        gained: float = 0.0,
     ) -> TensorDict | None:
-        """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better."""
+        """A plan that begins with other weights; None, and the present policy as it is, unless the plan is better.
+
+        It is if it saves more than a share ``gained`` of the cost.
+        """
         policy = self.planner.policy
         best, stays = copy.deepcopy(policy.state_dict()), judgement.costs(policy, self.virtual, judged_on)
         tail = self.virtual.tail(policy, judged_on)
@@ -163,7 +185,7 @@ class Planning:
             found = None  # the twin is sound with the present policy, so that these weights are to blame
         if found is not None:
             plan = judgement.costs(policy, self.virtual, judged_on)
-            if plan.expected < stays.expected and not astray(
+            if saves(plan.expected, stays.expected, gained) and not astray(
                 self.virtual.tail(policy, judged_on), tail, cost=plan.twin, usual=stays.twin
             ):
                 return planned(found)
@@ -239,3 +261,8 @@ class Planning:
 def planned(found: Descended) -> TensorDict:
     """The report of a plan that is kept."""
     return findings(J_a_plan_before=found.start, J_a_plan=found.best, policy_gradient=found.gradient, plan_accepted=1.0)
+
+
+def saves(cost: float, of: float, share: float) -> bool:
+    """Whether a cost is lower than another one by more than a share of that."""
+    return cost < of if math.isinf(of) else of - cost > share * abs(of)

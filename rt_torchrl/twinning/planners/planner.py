@@ -110,6 +110,9 @@ class PlannerConfig:
         anew: number of plans, of which all but the first are also made from the weights with which the first began; the
             better one on other virtual episodes stays. What is planned on the inputs of a single episode may lie in a
             minimum that is poor in others. 0 and 1 plan from the present weights alone.
+        scouts: number of random policies, from the best of which on the twin the fourth plan, the eighth and so on are
+            also made (:class:`~rt_torchrl.twinning.scouts.Scouts`); such a plan stays if it costs 5 % less on other
+            virtual episodes; 0 for none. Neither short horizons nor receding horizons have any.
         episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
             descent over whole episodes where the first one gains nothing beside a mean gradient that is longer, and
             of plans from earlier weights (:class:`~rt_torchrl.twinning.way_back.WayBack`) where neither gains anything;
@@ -132,6 +135,7 @@ class PlannerConfig:
     approach: int = 0
     approach_at: int = 3
     anew: int = 0
+    scouts: int = 0
     episode_gradient_limit: float = 10.0
     experience: int = 100
     extremes: int = 1000
@@ -139,6 +143,11 @@ class PlannerConfig:
     descent: DescentConfig = field(default_factory=DescentConfig)
     short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
+
+    @property
+    def scouting(self) -> int:
+        """Number of scouts; 0 where plans do not descend over whole episodes."""
+        return 0 if self.short_horizon.window or self.method == "receding_horizon" else self.scouts
 
     def __post_init__(self) -> None:
         check_options(self, infinite=("episode_gradient_limit",))
@@ -184,6 +193,8 @@ class PlannerConfig:
                 f"anew={self.anew} of the planning must not be negative, and at most 1 with short_horizon.window and "
                 "with method=receding_horizon: it belongs to descents over whole episodes."
             )
+        if self.scouts < 0:
+            raise ValueError(f"scouts={self.scouts} of the planning must not be negative; 0 sends none.")
         if self.extremes < 0:
             raise ValueError(f"extremes={self.extremes} of the planning must not be negative; 0 looks at none.")
         if self.experience < 1:

@@ -1,0 +1,103 @@
+"""Scouts: random policies on the twin, with the best of which one more plan begins."""
+
+import pytest
+import torch
+from linear_quadratic import LinearGain
+from test_algorithm import twinning, weights
+from test_evidence import Content, judge_of
+from test_judgement import EPISODES, judgement, said
+
+from rt_torchrl.twinning.planners import PlannerConfig
+from rt_torchrl.twinning.planners.planner import ShortHorizonConfig
+from rt_torchrl.twinning.planning import Planning
+from rt_torchrl.twinning.scouts import Scouts
+
+REFUTED = judge_of([2.0, 3.0], [2.0, 0.0])
+
+
+class Seeded(type(REFUTED.virtual)):
+    """Virtual episodes on which a policy costs its gain, with a source of random numbers."""
+
+    generator = torch.Generator().manual_seed(5)
+
+
+VIRTUAL = Seeded(REFUTED.virtual.twin.plant)
+
+
+class Other(LinearGain):
+    """The same law in another architecture."""
+
+
+def drawn(generator):
+    return LinearGain([[1.0 + torch.rand((), generator=generator).item(), 0.0]])
+
+
+def scouts(policy, count=8, make_policy=drawn):
+    return Scouts(VIRTUAL, policy, count, make_policy)
+
+
+def test_scouts_precede_the_fourth_plan_and_then_ever_fewer():
+    sent = scouts(LinearGain([[3.0, 0.0]]))
+    assert [episode for episode in range(1, 40) if sent.due(episode)] == [4, 8, 16, 32]
+    assert not scouts(LinearGain([[3.0, 0.0]]), count=0).due(4)
+
+
+def test_the_cheapest_of_all_is_found_and_the_policy_keeps_its_weights():
+    policy = LinearGain([[3.0, 0.0]])
+    sent, seen = scouts(policy), []
+    price = VIRTUAL.price
+    try:
+        VIRTUAL.price = lambda policy, episodes: seen.append(said(policy)) or price(policy, episodes)
+        found = sent.best(4, EPISODES)["gain"][0, 0].item()
+    finally:
+        del VIRTUAL.price
+    assert len(set(seen)) == 8 and found == min(seen) and said(policy) == 3.0
+    assert sent.best(4, EPISODES)["gain"][0, 0] == found != sent.best(8, EPISODES)["gain"][0, 0]
+
+
+def test_policies_of_another_architecture_are_refused():
+    with pytest.raises(ValueError, match=r"scouts=8 draws random policies of the class LinearGain.*make_policy"):
+        scouts(Other([[3.0, 0.0]]))
+    assert not scouts(Other([[3.0, 0.0]]), count=0).count
+
+
+@pytest.mark.parametrize(
+    ("evidence", "scout", "kept"), [(None, 2.0, 2.0), (None, 2.9, 3.0), (REFUTED, 2.0, 3.0), (None, 4.0, 3.0)]
+)
+def test_a_plan_from_a_scout_stays_if_it_saves_a_twentieth(evidence, scout, kept):
+    """The twin says 3 of the present policy; that of 2 is what flights have refuted."""
+    policy = LinearGain([[3.0, 0.0]])
+    planning = Planning(Content(policy), VIRTUAL, PlannerConfig())
+    planning.scouts = scouts(policy, make_policy=lambda generator: LinearGain([[scout, 0.0]]))
+    assert "scouted" not in planning.plan(3, EPISODES, EPISODES, judgement(evidence))
+    report = planning.plan(4, EPISODES, EPISODES, judgement(evidence))
+    assert said(policy) == kept and report["scouted"] == float(kept != 3.0)
+
+
+def test_any_finite_cost_is_better_than_a_policy_that_diverges(monkeypatch):
+    policy = LinearGain([[3.0, 0.0]])
+    planning = Planning(Content(policy), VIRTUAL, PlannerConfig())
+    planning.scouts = scouts(policy, make_policy=lambda generator: LinearGain([[2.0, 0.0]]))
+    costs = {2.0: torch.tensor(2.0), 3.0: torch.tensor(torch.inf)}
+    monkeypatch.setattr(VIRTUAL, "price", lambda policy, episodes: costs[said(policy)], raising=False)
+    monkeypatch.setattr("rt_torchrl.twinning.track_record.TrackRecord.require_sound_twin", lambda *arguments: None)
+    assert planning.plan(4, EPISODES, EPISODES, judgement(None))["scouted"] == 1.0 and said(policy) == 2.0
+
+
+def test_scouts_that_find_nothing_change_no_training():
+    found = [twinning(arm="model_based", planner=PlannerConfig(iterations=5, scouts=count)) for count in (0, 4)]
+    for training in found:
+        reports = [training.episode() for _ in range(4)]
+    assert reports[3]["scouted"] == 0.0
+    one, two = (weights(training.policies["model_based"]) for training in found)
+    assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("options", [{"short_horizon": ShortHorizonConfig(window=5)}, {"method": "receding_horizon"}])
+def test_only_plans_over_whole_episodes_have_scouts(options):
+    assert PlannerConfig(scouts=8).scouting == 8 and PlannerConfig(scouts=8, **options).scouting == 0
+
+
+def test_a_wrong_number_is_refused():
+    with pytest.raises(ValueError, match="scouts=-1 of the planning must not be negative"):
+        PlannerConfig(scouts=-1)
