@@ -235,14 +235,21 @@ def test_a_policy_that_cost_more_than_the_twin_said_is_expected_to_cost_it_again
     assert judge.expected(LinearGain([[4.0, 0.0]]), -4.0) == -4.0
 
 
-def test_a_twin_that_blew_up_tells_of_policies_with_which_it_does_too():
-    """The twin says 40 of a flight that cost 0.54; midway are 4.6."""
+def test_a_twin_that_blew_up_makes_no_neighbour_cheaper_than_its_flight():
+    """The twin says 40 of a flight that cost 0.54, and of a neighbour more than that, or less."""
     judge, policy = judge_of([40.0, 40.0], [-4.3, -4.3]), LinearGain([[40.0, 0.0]])
-    assert judge.expected(policy, 40.0) == pytest.approx(40.0 * math.exp(-4.3), rel=0.03)
-    assert judge.belief(policy, 5.0).mean == pytest.approx(-4.3, rel=0.03)
-    assert judge.belief(policy, 4.0) == (0.0, pytest.approx(math.hypot(COMMON, LOCAL)))
-    assert judge.median(policy, 4.0) == 4.0
+    flight = 40.0 * math.exp(-4.3)
+    for cost, expected in ((80.0, 2.0 * flight), (40.0, flight), (5.0, flight), (0.6, flight), (0.3, 0.3)):
+        assert judge.expected(policy, cost) == pytest.approx(expected, rel=0.04)
+    assert judge.belief(policy, 0.3).mean == 0.0 and judge.median(policy, 0.3) == 0.3
+    assert judge.expected(policy, math.inf) == math.inf
     assert judge.trust(policy, 0.1) < 0.01
+
+
+def test_who_costs_more_on_the_twin_is_expected_to_cost_more():
+    judge, policy = judge_of([40.0, 3.0, 1.0], [-4.3, -1.2, 0.3]), LinearGain([[40.0, 0.0]])
+    costs = [judge.expected(policy, 0.05 * 1.1**k) for k in range(90)]
+    assert all(more >= 0.999 * less for less, more in zip(costs, costs[1:], strict=False))
 
 
 def test_a_twin_that_is_merely_wrong_tells_of_all_neighbours():
@@ -329,7 +336,7 @@ class Content:
     def plan(self, episodes):
         return Descended(1.0, 1.0, 0.0, 0)
 
-    def refuse(self):
+    def refuse(self, *state):
         pass
 
     restart = load_state_dict = state_dict = refuse
@@ -449,7 +456,7 @@ def test_beliefs_of_the_referee_follow_from_what_the_twin_says_of_each_policy():
     found.fit_exogenous()
     found.switch_policies()
     assert asked[0][live].mean == pytest.approx(math.log(0.05), rel=0.03)
-    assert asked[0][idle] == (0.0, pytest.approx(math.hypot(COMMON, LOCAL)))
+    assert asked[0][idle].mean == pytest.approx(math.log(0.5), rel=0.03)
 
 
 @pytest.mark.parametrize(("exploration", "corrects"), [(0.0, True), (0.02, True), (0.1, False)])

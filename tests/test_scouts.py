@@ -1,5 +1,7 @@
 """Scouts: random policies on the twin, with the best of which one more plan begins."""
 
+import copy
+
 import pytest
 import torch
 from linear_quadratic import LinearGain
@@ -7,6 +9,8 @@ from test_algorithm import twinning, weights
 from test_evidence import Content, judge_of
 from test_judgement import EPISODES, judgement, said
 
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.planners.planner import ShortHorizonConfig
 from rt_torchrl.twinning.planning import Planning
@@ -84,18 +88,52 @@ def test_any_finite_cost_is_better_than_a_policy_that_diverges(monkeypatch):
     assert planning.plan(4, EPISODES, EPISODES, judgement(None))["scouted"] == 1.0 and said(policy) == 2.0
 
 
-def test_scouts_that_find_nothing_change_no_training():
-    found = [twinning(arm="model_based", planner=PlannerConfig(iterations=5, scouts=count)) for count in (0, 4)]
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_scouts_that_find_nothing_change_no_training(optimiser):
+    """Nor do they change what the next plan depends on: random numbers, and moments of Adam."""
+    descent = DescentConfig(optimiser=optimiser, rate=0.01 if optimiser == "adam" else 1.0)
+    planners = (PlannerConfig(iterations=5, descent=descent, scouts=count) for count in (0, 4))
+    found = [twinning(arm="model_based", planner=planner) for planner in planners]
     for training in found:
-        reports = [training.episode() for _ in range(4)]
-    assert reports[3]["scouted"] == 0.0
+        reports = [training.episode() for _ in range(6)]
+    assert reports[3]["scouted"] == 0.0 and "scouted" not in reports[4]
     one, two = (weights(training.policies["model_based"]) for training in found)
-    assert torch.equal(one, two)
+    assert torch.equal(one, two) and torch.equal(*(training.generator.get_state() for training in found))
 
 
-@pytest.mark.parametrize("options", [{"short_horizon": ShortHorizonConfig(window=5)}, {"method": "receding_horizon"}])
-def test_only_plans_over_whole_episodes_have_scouts(options):
-    assert PlannerConfig(scouts=8).scouting == 8 and PlannerConfig(scouts=8, **options).scouting == 0
+def test_what_is_not_trained_is_not_drawn():
+    policy = LinearGain([[3.0, 0.0]])
+    policy.gain.requires_grad_(False)
+    assert scouts(policy).best(4, EPISODES)["gain"].tolist() == [[3.0, 0.0]]
+
+
+def test_a_seed_may_be_any():
+    virtual = copy.copy(VIRTUAL)
+    virtual.generator = torch.Generator().manual_seed(-1)
+    assert Scouts(virtual, LinearGain([[3.0, 0.0]]), 2, drawn).best(4, EPISODES)
+
+
+def test_a_plan_from_a_scout_has_the_last_word_in_the_report():
+    """What step 5 withheld before is not what is planned now."""
+    policy = LinearGain([[3.0, 0.0]])
+    planning = Planning(Content(policy), VIRTUAL, PlannerConfig())
+    planning.scouts = scouts(policy, make_policy=lambda generator: LinearGain([[2.0, 0.0]]))
+    refused = findings("no plan", plan_accepted=0.0, withheld=1.0)
+    planning._from_the_present_or_earlier = lambda *arguments: refused
+    report = planning.plan(4, EPISODES, EPISODES, judgement(None))
+    assert report["plan_accepted"] == report["scouted"] == 1.0
+    assert "withheld" not in report and "reason" not in report
+
+
+def test_only_plans_over_whole_episodes_have_scouts():
+    window = ShortHorizonConfig(window=5)
+    assert twinning(planner=PlannerConfig(scouts=8)).planning.scouts.count == 8
+    assert twinning(planner=PlannerConfig(scouts=8, short_horizon=window)).planning.scouts.count == 0
+    assert PlannerConfig(scouts=8, method="receding_horizon").scouting == 0
+
+
+def test_an_arm_without_plans_has_no_scouts():
+    assert twinning(planner=PlannerConfig(scouts=8), arm="model_free").planning.scouts.count == 0
 
 
 def test_a_wrong_number_is_refused():

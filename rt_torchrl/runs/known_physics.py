@@ -28,7 +28,7 @@ def known_physics(
         ValueError: if options, controllers, the twin's physics and the real system do not go together.
     """
     require_simulation(config, plant, real, baselines)
-    physics = physics_known(plant, believed)
+    physics = require_physics(plant, believed)
     for one in filter(None, (plant, believed)):
         check_plant(one, steps=CHECKED_STEPS, traced=False, trained=one is physics)
     require_controllers(physics, first, baselines)
@@ -78,7 +78,7 @@ def require_controllers(
             require_controller(name, law, physics)
 
 
-def physics_known(plant: Plant, believed: Plant | None) -> Plant:
+def require_physics(plant: Plant, believed: Plant | None) -> Plant:
     """The physics of the twin of a real system.
 
     Args:

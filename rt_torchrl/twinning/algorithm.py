@@ -60,8 +60,7 @@ class ReinforcementTwinning:
         learner: learner of step 2, which trains ``model_free``; by default that of ``config.learner``.
         planner: planner of step 5, which trains ``model_based``; by default that of ``config.planner``.
         referee: referee of step 6; by default that of ``config.referee``.
-        first: what is known before the first episode, such as :class:`FirstController`, with which twin and policies
-            begin; None begins with the policies as they are.
+        first: what is known beforehand, such as :class:`FirstController`; None begins with the policies as they are.
 
     Raises:
         ValueError: if the real system's batch size is not 1, or the learner or planner trains another policy.
@@ -99,7 +98,7 @@ class ReinforcementTwinning:
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
         self.planning = Planning(self.planner, self.virtual, config.planner, corrected=config.corrected_descents)
-        self.planning.scouts = Scouts(self.virtual, model_based, config.planner.scouting, make_policy)
+        self.planning.scouts = Scouts(self.virtual, model_based, config.scouts, make_policy)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)

@@ -79,6 +79,11 @@ class TwinningConfig:
         return max(self.records, self.planner.experience)
 
     @property
+    def scouts(self) -> int:
+        """Number of scouts; 0 where nothing is planned, or not over whole episodes."""
+        return 0 if self.arm == "model_free" else self.planner.scouting
+
+    @property
     def bounded_states(self) -> dict[str, tuple[float, float]]:
         """Bounds on states by name, of the limits and of the constraints of plans, which come first."""
         return {**self.limits.states, **self.planner.constraints.states}

@@ -62,15 +62,15 @@ class Planning:
         """
         withheld = self._recall(judged_on, judgement)
         found = self._from_the_present_or_earlier(planned_on, judged_on, judgement)
-        found = merged(found, findings(recalled=float(withheld is not None)))
-        if withheld is not None:
-            found.update(findings(withheld=max(withheld, float(found.get("withheld", 0.0)))))
         while self.others:
             found, _ = self._also_from([self.others.pop()], found, planned_on, judged_on, judgement)
         if self.config.approach and episode == self.config.approach_at:
             found = self._approached(found, planned_on, judged_on, judgement)
         if self.scouts is not None and self.scouts.due(episode):
             found = self._scouted(self.scouts.best(episode, planned_on), found, planned_on, judged_on, judgement)
+        found = merged(found, findings(recalled=float(withheld is not None)))
+        if withheld is not None:
+            found.update(findings(withheld=max(withheld, float(found.get("withheld", 0.0)))))
         for _ in range(self.config.rounds - 1):
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
@@ -119,9 +119,12 @@ class Planning:
         judged_on: Scenario,
         judgement: Judgement,
     ) -> TensorDict:
-        """The plan from the best scout, if it saves enough, or the plan found so far."""
-        further, better = self._also_from([scout], found, planned_on, judged_on, judgement, gained=GAINED)
-        return merged(merged(found, further) if better else found, findings(scouted=float(better)))
+        """The plan from the best scout, if it saves enough, or the plan found so far and the planner as it was."""
+        before = copy.deepcopy(self.planner.state_dict())
+        found, better = self._also_from([scout], found, planned_on, judged_on, judgement, gained=GAINED)
+        if not better:
+            self.planner.load_state_dict(before)
+        return merged(found, findings(scouted=float(better)))
 
     def remember(self) -> None:
         """Plan from the present weights, too, the next time; state feedback has none."""

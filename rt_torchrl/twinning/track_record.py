@@ -179,15 +179,19 @@ class Differences(NamedTuple):
     flown: Sequence[Flown]
     earlier: int = 0
 
-    def telling(self, cost: float) -> list[bool]:
-        """Which episodes tell something of a policy that has this mean J_a on the twin.
+    def about(self, cost: float) -> list[float]:
+        """The paired differences, as far as they tell of a policy that has this mean J_a on the twin.
 
-        A twin that says more than e times the real cost blows up or stalls where the real system does not. It tells of
-        policies with which it does so, too: whose cost is nearer to what it says of the episode than to what that cost,
-        on a logarithmic scale.
+        A twin that says more than e times the real cost blows up or stalls where the real system does not, and need not
+        do so with the neighbours of a policy. Such an episode says that a neighbour costs no more than it did, and
+        nothing of one that costs less even on the twin.
         """
+        if not 0.0 < cost < math.inf:
+            return self.values
         pairs = zip(self.values, self.flown, strict=True)
-        return [d >= LEAST or cost > one.cost * math.exp(-0.5 * d) for d, one in pairs]
+        return [
+            d if d >= LEAST or not one.cost > 0.0 else max(d, min(0.0, math.log(one.cost / cost))) for d, one in pairs
+        ]
 
     def learned(self, plant: Plant, record: Trajectory) -> PairedDifferences:
         """The belief about all policies, which are compared in the observations of a record."""

@@ -89,11 +89,10 @@ class PairedDifferences:
         """What follows from the same episodes, where a smaller d is taken for ``least``, with this noise."""
         return PairedDifferences(self.actions, self.differences, self.exploration, least, noise)
 
-    def of(self, counts: Sequence[bool]) -> "PairedDifferences":
-        """What follows from those episodes alone that count."""
-        chosen = torch.tensor(counts, dtype=torch.bool, device=self.differences.device)
-        actions, d, explored = (each[chosen] for each in (self.actions, self.differences, self.exploration))
-        return PairedDifferences(actions, d, explored, noise=self.noise)
+    def of(self, differences: Sequence[float]) -> "PairedDifferences":
+        """What follows if these are the differences of the same episodes."""
+        values = self.differences.new_tensor(differences)
+        return PairedDifferences(self.actions, values, self.exploration, noise=self.noise)
 
     def _kernel(self, others: Float[Tensor, "k m"]) -> Float[Tensor, "k n"]:
         squared = (others.unsqueeze(1) - self.actions).square().mean(-1)

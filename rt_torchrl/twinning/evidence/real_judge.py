@@ -58,7 +58,7 @@ class RealJudge:
     @torch.no_grad()
     def belief(self, policy: nn.Module, cost: float) -> Belief:
         """The belief about log J_real − log J_twin of a policy, where it has this cost on the twin."""
-        return self.learned.of(self.differences.telling(cost)).belief(self.shares(policy))
+        return self.learned.of(self.differences.about(cost)).belief(self.shares(policy))
 
     @torch.no_grad()
     def trust(self, policy: nn.Module, size: float) -> float:
@@ -123,7 +123,7 @@ class RealJudge:
             The greatest log of the ratio of both costs on the twin; zero if the twin prefers nothing that is refuted.
         """
         found, sizes = self.differences, [0.0]
-        for one, d, explored, flown in zip(found.policies, found.values, found.exploration, found.flown, strict=False):
+        for one, d, explored, flown in zip(found.policies, found.values, found.exploration, found.flown, strict=True):
             if not excess(d, explored) > 0.0 or not same_architecture(one, policy):
                 continue
             episode = self.virtual.repeated(flown.trajectory)
