@@ -61,9 +61,10 @@ class ReinforcementTwinning:
         planner: planner of step 5, which trains ``model_based``; by default that of ``config.planner``.
         referee: referee of step 6; by default that of ``config.referee``.
         first: what is known beforehand, such as :class:`FirstController`; None begins with the policies as they are.
+        make_policy: function that draws a random policy like ``model_based``, a scout; by default that of the plant.
 
     Raises:
-        ValueError: if the real system's batch size is not 1, or the learner or planner trains another policy.
+        ValueError: if the real system's batch size is not 1, or learner, planner or scouts have another policy.
     """
 
     def __init__(
@@ -124,8 +125,7 @@ class ReinforcementTwinning:
         arm, report, seconds = self.config.arm, findings(), {}
         self.flights.begin()
         steps = [self.start] if self.first is not None and not self.episodes_done else []
-        steps += [self.interact]
-        steps += [self.update_model_free] if arm != "model_based" else []
+        steps += [self.interact, self.update_model_free] if arm != "model_based" else [self.interact]
         steps += [] if arm == "model_free" else [self.fit_exogenous, self.assimilate, self.examine, self.plan]
         steps += [self.switch_policies] if arm == "twinning" else []
         for step in steps:

@@ -110,9 +110,10 @@ class PlannerConfig:
         anew: number of plans, of which all but the first are also made from the weights with which the first began; the
             better one on other virtual episodes stays. What is planned on the inputs of a single episode may lie in a
             minimum that is poor in others. 0 and 1 plan from the present weights alone.
-        scouts: number of random policies, from the best of which on the twin the fourth plan, the eighth and so on are
-            also made (:class:`~rt_torchrl.twinning.scouts.Scouts`); such a plan stays if it costs 5 % less on other
-            virtual episodes; 0 for none. Neither short horizons nor receding horizons have any.
+        scouts: number of random policies that fly the virtual episodes in the fourth episode, the eighth, the sixteenth
+            and so on (:class:`~rt_torchrl.twinning.scouts.Scouts`). One more plan begins with the best of them, and
+            stays if it costs 5 % less on other virtual episodes; 0 for none. Neither short windows nor model predictive
+            control have any.
         episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
             descent over whole episodes where the first one gains nothing beside a mean gradient that is longer, and
             of plans from earlier weights (:class:`~rt_torchrl.twinning.way_back.WayBack`) where neither gains anything;
