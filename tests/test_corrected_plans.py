@@ -7,7 +7,7 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from test_algorithm import twinning
-from test_evidence import Content
+from test_evidence import Content, differences_of
 from torch import nn
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
@@ -20,7 +20,6 @@ from rt_torchrl.twinning.corrected_plans import CorrectedPlans, go
 from rt_torchrl.twinning.evidence.paired_differences import LEAST, NOISE, REACH, PairedDifferences
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
-from rt_torchrl.twinning.track_record import Differences, Flown
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
@@ -96,9 +95,7 @@ def judge_of(gains, differences):
         flown = Rollout(plant, plant.closure, Gain(1.0))(state, exogenous)
     record = Trajectory(flown.states[0] * 0.4, flown.actions[0], exogenous[0])
     policies = [Gain(gain) for gain in gains]
-    costs = [said(policy).item() * math.exp(d) for policy, d in zip(policies, differences, strict=True)]
-    flights = [Flown(record, "model_based", {}, cost) for cost in costs]
-    found = Differences(policies, differences, [0.0] * len(gains), flights)
+    found = differences_of(policies, [said(policy).item() for policy in policies], differences, record)
     return RealJudge(found, found.learned(plant, record), Twin(plant), record)
 
 

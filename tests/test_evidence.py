@@ -217,15 +217,20 @@ class ByGain(VirtualEpisodes):
         return policy.gain.detach().sum()
 
 
+def differences_of(policies, said, differences, record):
+    """Paired differences of flights, where the twin says these costs of their policies."""
+    costs = [cost * math.exp(d) for cost, d in zip(said, differences, strict=True)]
+    flights = [Flown(record, "model_based", {}, cost) for cost in costs]
+    return Differences(policies, differences, [0.0] * len(policies), flights)
+
+
 def judge_of(gains, differences):
     plant = LinearQuadratic(horizon=2.0)
     generator = torch.Generator().manual_seed(0)
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     flown = Rollout(plant, plant.closure, LinearGain([[1.0, 1.0]]))(state, exogenous)
     record = Trajectory(flown.states[0], flown.actions[0], exogenous[0])
-    costs = [gain * math.exp(d) for gain, d in zip(gains, differences, strict=True)]
-    flights = [Flown(record, "model_based", {}, cost) for cost in costs]
-    found = Differences([LinearGain([[gain, 0.0]]) for gain in gains], differences, [0.0] * len(gains), flights)
+    found = differences_of([LinearGain([[gain, 0.0]]) for gain in gains], gains, differences, record)
     return RealJudge(found, found.learned(plant, record), ByGain(plant), record)
 
 

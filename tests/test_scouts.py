@@ -6,17 +6,16 @@ import pytest
 import torch
 from linear_quadratic import LinearGain
 from test_algorithm import twinning, weights
-from test_evidence import Content, judge_of
-from test_judgement import EPISODES, judgement, said
+from test_evidence import Content
+from test_judgement import EPISODES, REFUTED, Other, judgement, said
 
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.planners.planner import ShortHorizonConfig
 from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.scouts import Scouts
-
-REFUTED = judge_of([2.0, 3.0], [2.0, 0.0])
 
 
 class Seeded(type(REFUTED.virtual)):
@@ -28,10 +27,6 @@ class Seeded(type(REFUTED.virtual)):
 VIRTUAL = Seeded(REFUTED.virtual.twin.plant)
 
 
-class Other(LinearGain):
-    """The same law in another architecture."""
-
-
 def drawn(generator):
     return LinearGain([[1.0 + torch.rand((), generator=generator).item(), 0.0]])
 
@@ -40,21 +35,18 @@ def scouts(policy, count=8, make_policy=drawn):
     return Scouts(VIRTUAL, policy, count, make_policy)
 
 
-def test_scouts_precede_the_fourth_plan_and_then_ever_fewer():
+def test_scouts_are_sent_in_the_fourth_episode_and_then_ever_less_often():
     sent = scouts(LinearGain([[3.0, 0.0]]))
     assert [episode for episode in range(1, 40) if sent.due(episode)] == [4, 8, 16, 32]
     assert not scouts(LinearGain([[3.0, 0.0]]), count=0).due(4)
 
 
-def test_the_cheapest_of_all_is_found_and_the_policy_keeps_its_weights():
+def test_the_cheapest_of_all_is_found_and_the_policy_keeps_its_weights(monkeypatch):
     policy = LinearGain([[3.0, 0.0]])
-    sent, seen = scouts(policy), []
-    price = VIRTUAL.price
-    try:
-        VIRTUAL.price = lambda policy, episodes: seen.append(said(policy)) or price(policy, episodes)
+    sent, seen, price = scouts(policy), [], VIRTUAL.price
+    with monkeypatch.context() as patched:
+        patched.setattr(VIRTUAL, "price", lambda one, episodes: seen.append(said(one)) or price(one, episodes))
         found = sent.best(4, EPISODES)["gain"][0, 0].item()
-    finally:
-        del VIRTUAL.price
     assert len(set(seen)) == 8 and found == min(seen) and said(policy) == 3.0
     assert sent.best(4, EPISODES)["gain"][0, 0] == found != sent.best(8, EPISODES)["gain"][0, 0]
 
@@ -129,7 +121,7 @@ def test_only_plans_over_whole_episodes_have_scouts():
     window = ShortHorizonConfig(window=5)
     assert twinning(planner=PlannerConfig(scouts=8)).planning.scouts.count == 8
     assert twinning(planner=PlannerConfig(scouts=8, short_horizon=window)).planning.scouts.count == 0
-    assert PlannerConfig(scouts=8, method="receding_horizon").scouting == 0
+    assert TwinningConfig(planner=PlannerConfig(scouts=8, method="receding_horizon")).scouts == 0
 
 
 def test_an_arm_without_plans_has_no_scouts():

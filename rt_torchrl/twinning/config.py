@@ -81,7 +81,7 @@ class TwinningConfig:
     @property
     def scouts(self) -> int:
         """Number of scouts; 0 where nothing is planned, or not over whole episodes."""
-        return 0 if self.arm == "model_free" else self.planner.scouting
+        return self.planner.scouts if self.planner.whole and self.arm != "model_free" else 0
 
     @property
     def bounded_states(self) -> dict[str, tuple[float, float]]:
@@ -103,8 +103,7 @@ class TwinningConfig:
         self._check_combinations()
 
     def _check_combinations(self) -> None:
-        whole = self.planner.method in (None, "whole_episodes") and not self.planner.short_horizon.window
-        if self.corrected_descents and not (self.corrected_plans and whole):
+        if self.corrected_descents and not (self.corrected_plans and self.planner.whole):
             raise ValueError(
                 "corrected_descents=True needs corrected_plans=True, and plans over whole episodes: leave "
                 "planner.method and short_horizon.window as they are, or leave it out."

@@ -146,9 +146,9 @@ class PlannerConfig:
     receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
 
     @property
-    def scouting(self) -> int:
-        """Number of scouts; 0 where plans do not descend over whole episodes."""
-        return 0 if self.short_horizon.window or self.method == "receding_horizon" else self.scouts
+    def whole(self) -> bool:
+        """Whether plans descend over whole episodes."""
+        return not self.short_horizon.window and self.method != "receding_horizon"
 
     def __post_init__(self) -> None:
         check_options(self, infinite=("episode_gradient_limit",))
@@ -157,7 +157,7 @@ class PlannerConfig:
                 f"method={self.method!r} of the planning does not go with short_horizon.window="
                 f"{self.short_horizon.window}; a positive window belongs to short_horizon alone."
             )
-        if self.constraints.states and (self.short_horizon.window or self.method == "receding_horizon"):
+        if self.constraints.states and not self.whole:
             raise ValueError(
                 f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
                 "planner.method and short_horizon.window as they are, or leave the constraints out."
@@ -172,7 +172,7 @@ class PlannerConfig:
                 f"approach={self.approach} of the planning must not be negative, and approach_at={self.approach_at} "
                 "must be at least 1."
             )
-        if self.approach and (self.short_horizon.window or self.method == "receding_horizon"):
+        if self.approach and not self.whole:
             raise ValueError(
                 f"approach={self.approach} of the planning belongs to descents over whole episodes; leave it out, or "
                 "short_horizon.window and method=receding_horizon."
@@ -189,7 +189,7 @@ class PlannerConfig:
                 f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
                 "no limit."
             )
-        if self.anew < 0 or (self.anew > 1 and (self.short_horizon.window or self.method == "receding_horizon")):
+        if self.anew < 0 or (self.anew > 1 and not self.whole):
             raise ValueError(
                 f"anew={self.anew} of the planning must not be negative, and at most 1 with short_horizon.window and "
                 "with method=receding_horizon: it belongs to descents over whole episodes."
