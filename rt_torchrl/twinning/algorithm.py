@@ -237,7 +237,7 @@ class ReinforcementTwinning:
             idle_weight_change=change.item(),
             real_costs=self.track_record.real_costs,
             predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
-            beliefs=lambda: {role: judge().belief(self.policies[role], cost.item()) for role, cost in costs.items()},
+            difference=lambda: judge().difference(*((self.policies[r], costs[r].item()) for r in (idle, live))),
             contradicted=lambda: judge().contradicts,
         )
         event = self.referee.decide(evidence)

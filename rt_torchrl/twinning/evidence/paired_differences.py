@@ -108,6 +108,18 @@ class PairedDifferences:
         variance = (prior - half.square().sum()).clamp_min(self.noise**2 / len(self.differences))
         return (k @ self._weights).squeeze(), variance.sqrt()
 
+    def deviation_between(self, one: Float[Tensor, " m"], other: Float[Tensor, " m"]) -> float:
+        r"""Standard deviation of d(π) − d(π'), whose errors are those of neighbours: zero for policies that act alike.
+
+        .. math:: \sigma^2 = k_{\pi\pi} + k_{\pi'\pi'} - 2 k_{\pi\pi'} - (k_\pi - k_{\pi'})^T K^{-1} (k_\pi - k_{\pi'})
+        """
+        apart = -torch.expm1(-0.5 * (one - other).square().mean() / REACH**2)
+        variance = 2.0 * LOCAL**2 * apart
+        if len(self.differences):
+            seen = self._kernel(one.unsqueeze(0)) - self._kernel(other.unsqueeze(0))
+            variance = variance - torch.linalg.solve_triangular(self._root, seen.mT, upper=False).square().sum()
+        return variance.clamp_min(0.0).sqrt().item()  # rounding alone makes it negative
+
     def log_likelihood(self) -> float:
         """Log of the marginal likelihood of the differences, without its constant."""
         misfit = (self.differences * self._weights.squeeze(-1)).sum()

@@ -61,6 +61,12 @@ class RealJudge:
         return self.learned.of(self.differences.about(cost)).belief(self.shares(policy))
 
     @torch.no_grad()
+    def difference(self, one: tuple[nn.Module, float], other: tuple[nn.Module, float]) -> Belief:
+        """The joint belief about d of one policy less d of another; each comes with its cost on the twin."""
+        mean = self.belief(*one).mean - self.belief(*other).mean
+        return Belief(mean, self.learned.deviation_between(self.shares(one[0]), self.shares(other[0])))
+
+    @torch.no_grad()
     def trust(self, policy: nn.Module, size: float) -> float:
         """Probability that the twin says what a policy costs to within this size of log J, by all episodes."""
         return self.learned.belief(self.shares(policy)).within(size)

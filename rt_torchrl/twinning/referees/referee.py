@@ -1,18 +1,18 @@
 """The protocol of a referee, which says in step 6 whether a policy is worse and who acts next, and its parameters."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from rt_torchrl.options import check_options
-from rt_torchrl.twinning.evidence.paired_differences import COMMON, LOCAL, Belief
+from rt_torchrl.twinning.evidence.paired_differences import LOCAL, Belief
 
 Role = Literal["model_free", "model_based"]
 Event = Literal["keep", "swap", "clone"]
 RefereeName = Literal["decision_tree", "trust_ratio", "weight_of_evidence"]
-UNKNOWN = Belief(0.0, math.hypot(COMMON, LOCAL))
-"""Belief about a policy of which nothing is known."""
+UNKNOWN = Belief(0.0, math.sqrt(2.0) * LOCAL)
+"""Belief about the difference of two policies of which nothing is known; the error that all policies share cancels."""
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
 
 
@@ -66,7 +66,9 @@ class Evidence:
         real_costs: J_a of the latest real episodes, oldest first.
         predicted_costs: function that returns the costs of the same episodes on the present twin, flown with the same
             weights from the same states under the same inputs. It flies each episode, so it is called only if needed.
-        beliefs: function that returns the belief about log J_real − log J_twin of each policy.
+        difference: function that returns the belief about d_idle − d_live, where d is log J_real − log J_twin of a
+            policy. It is the joint belief about both: two policies that act alike differ by nothing, however little is
+            known of either.
         contradicted: function that returns whether one of the latest real episodes contradicts the twin beyond chance.
 
     Raises:
@@ -78,7 +80,7 @@ class Evidence:
     idle_weight_change: float
     real_costs: tuple[float, ...] = ()
     predicted_costs: Callable[[], tuple[float, ...]] = tuple
-    beliefs: Callable[[], Mapping[Role, Belief]] = lambda: dict.fromkeys(ROLES, UNKNOWN)
+    difference: Callable[[], Belief] = lambda: UNKNOWN
     contradicted: Callable[[], bool] = lambda: True
 
     def __post_init__(self) -> None:

@@ -9,22 +9,23 @@ NORMAL = NormalDist()
 
 
 class WeightOfEvidence(TwoPolicies):
-    r"""A referee that compares beliefs about the real costs of both policies.
+    r"""A referee that believes the twin as long as real episodes do, and else weighs gains against losses.
 
-    The belief about a policy is :math:`\log J \sim \mathcal N(\log\hat J + m, s^2)`, with the cost Ĵ on the twin over
-    common draws, and m and s from the paired differences of real episodes. Of the difference
-    :math:`g = \log J_{idle} - \log J_{live}` follow what an episode gains and what it loses, in units of J_live,
+    Where no real episode contradicts the twin, the policy that costs less on the twin acts: there is nothing to try.
+
+    Where one does, the belief about the real costs is :math:`g = \log J_{idle} - \log J_{live} \sim \mathcal N(\log
+    \hat J_{idle} - \log\hat J_{live} + m, s^2)`, with the costs Ĵ on the twin over common draws, and with m and s from
+    the joint belief about both policies by the paired differences of real episodes. Of g follow what an episode with
+    the idle policy gains and what it loses, in units of J_live,
 
     .. math:: G = \mathrm E(1 - e^g)_+, \qquad L = \mathrm E(e^g - 1)_+
 
-    The idle policy takes over if G over the next ``trial_horizon`` episodes exceeds L in one, after which its own
-    episode is evidence. A policy of uncertain worth so gets a trial where little is at stake. Patience is not needed:
-    one episode with a hopeless policy is enough where the other is ten times better.
+    The idle policy takes over if G over the next ``trial_horizon`` episodes exceeds L in one. A policy of uncertain
+    worth so gets a trial where little is at stake. After a trial the other policy comes back only if it is expected to
+    cost less, G > L: otherwise the episodes whose gain was counted would never come. Two policies that act alike never
+    change roles.
 
-    The attribute ``on_trial`` is 1 while the policy that took over is not the preferred one: it is expected to cost
-    more than the other, L > G, or where no real episode contradicts the twin, it costs more on the twin. What is
-    expected holds :math:`e^{s^2/2}`, which speaks for whatever has flown more often, and a twin that has been right
-    knows better.
+    The attribute ``on_trial`` is 1 while the live policy took over although it was expected to cost more, L > G.
 
     Args:
         config: parameters of step 6.
@@ -42,21 +43,19 @@ class WeightOfEvidence(TwoPolicies):
         return self.idle if self.on_trial else self.live
 
     def decide(self, evidence: Evidence) -> Event:
-        gain, loss = stakes(evidence, self.live, self.idle)
-        swaps = self.config.trial_horizon * gain > loss
-        self.on_trial = int(swaps and dearer(evidence, gain, loss))
+        if evidence.contradicted():
+            gain, loss = stakes(evidence)
+            swaps = (1.0 if self.on_trial else self.config.trial_horizon) * gain > loss
+            self.on_trial = int(swaps and loss > gain)
+        else:
+            swaps, self.on_trial = self.worse(evidence.live_cost, evidence.idle_cost), 0
         if swaps:
             self.live, self.stall_count = self.idle, 0
             return "swap"
         return self.stalled(evidence.idle_weight_change)
 
 
-def dearer(evidence: Evidence, gain: float, loss: float) -> bool:
-    """Whether the idle policy is the dearer one: by what is expected, or by a twin that no real episode contradicts."""
-    return loss > gain if evidence.contradicted() else evidence.idle_cost > evidence.live_cost
-
-
-def stakes(evidence: Evidence, live: Role, idle: Role) -> tuple[float, float]:
+def stakes(evidence: Evidence) -> tuple[float, float]:
     """Expected gain and loss of an episode with the idle policy in the place of the live one, in units of J_live."""
     if not math.isfinite(evidence.idle_cost):
         return 0.0, math.inf
@@ -65,9 +64,10 @@ def stakes(evidence: Evidence, live: Role, idle: Role) -> tuple[float, float]:
     if not evidence.live_cost * evidence.idle_cost > 0.0:  # costs of two signs have no ratio
         better = evidence.idle_cost < evidence.live_cost
         return float(better), float(not better)
-    beliefs = evidence.beliefs()
-    mean = math.log(evidence.idle_cost / evidence.live_cost) + beliefs[idle].mean - beliefs[live].mean
-    deviation = math.hypot(beliefs[idle].deviation, beliefs[live].deviation)
+    error = evidence.difference()
+    mean, deviation = math.log(evidence.idle_cost / evidence.live_cost) + error.mean, error.deviation
+    if not deviation > 0.0:
+        return max(-math.expm1(mean), 0.0), max(math.expm1(mean), 0.0)
     mean_ratio = math.exp(mean + 0.5 * deviation**2)
     low, high = NORMAL.cdf(-mean / deviation), NORMAL.cdf(-(mean + deviation**2) / deviation)
     gain = low - mean_ratio * high
