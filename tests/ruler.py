@@ -1,0 +1,127 @@
+"""The table of results to hold: default trainings, unknown systems, and an identification, over several seeds.
+
+``uv run --group test python tests/ruler.py --seeds 5 --folder runs/ruler`` trains what is missing in the folder, two
+trainings side by side on one thread each, and prints the table as Markdown. The same command goes on where it was
+interrupted; another folder is another measurement. It takes about 50 minutes on two cores.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+
+
+class Row(NamedTuple):
+    """A row of the table: a recipe with its options."""
+
+    recipe: str
+    options: tuple[str, ...] = ()
+
+
+def planned(*options: str, episodes: int, unseen: int) -> tuple[str, ...]:
+    """Options of the model-based half alone."""
+    return ("--twinning.arm", "model_based", "--episodes", str(episodes), "--unseen", str(unseen), *options)
+
+
+SCHEDULED = ("--policy", "scheduled")
+VALVE = ("--command", "drop", "--end-weight", "0")
+HOP = ("--policy", "paper", "--task", "hop")
+ROWS = {
+    "turbine": Row("wind_turbine"),
+    "drone": Row("flapping_wing"),
+    "tank": Row("cryogenic_tank"),
+    "turbine, engineering": Row("wind_turbine", ("--task", "engineering")),
+    "turbine, pitch": Row("wind_turbine", planned(*SCHEDULED, "--unknown", "pitch", episodes=3, unseen=50)),
+    "turbine, inflow": Row("wind_turbine", planned(*SCHEDULED, "--unknown", "inflow", episodes=3, unseen=50)),
+    "tank, bias_15": Row("cryogenic_tank", planned(*VALVE, "--unknown", "bias_15", episodes=3, unseen=50)),
+    "hop, plane_6.3": Row("flapping_wing", planned(*HOP, "--unknown", "plane_6.3", episodes=10, unseen=192)),
+}
+
+
+def train(row: Row, seed: int, folder: Path) -> None:
+    """Run the recipe, unless its results are there; ``seconds.json`` takes the seconds of the whole process."""
+    if (folder / "seconds.json").exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, str(RECIPES / f"{row.recipe}.py"), "--seed", str(seed), "--threads", "1"]
+    command += ["--no-figures", "--figures-every", "0", "--untrained", "0", "--log-dir", str(folder), *row.options]
+    start = time.perf_counter()
+    with (folder / "training.log").open("w") as log:
+        subprocess.run([*command, "--overwrite"], check=True, stdout=log, stderr=log)
+    (folder / "seconds.json").write_text(json.dumps(time.perf_counter() - start))
+
+
+def identified(data: Path, folder: Path) -> float:
+    """RMS error of physics and perceptron on the Cascaded Tanks' test record [V]."""
+    results = folder / "results.json"
+    if not results.exists():
+        command = [sys.executable, str(RECIPES / "cascaded_tanks.py"), "--test", "--data", str(data)]
+        subprocess.run([*command, "--log-dir", str(folder)], check=True)
+    return json.loads(results.read_text())["physics and perceptron"]["test"]["rms"]
+
+
+class Result(NamedTuple):
+    """What a training ended with: cost of the live policy and of the cheaper one on unseen episodes, Σ, seconds."""
+
+    live: float
+    cheaper: float
+    paid: float
+    seconds: float
+
+    @classmethod
+    def of(cls, folder: Path) -> "Result":
+        summary = json.loads((folder / "metrics.json").read_text())["summary"]
+        costs = {role: summary["unseen"][f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
+        seconds = json.loads((folder / "seconds.json").read_text())
+        return cls(costs[summary["live"]], min(costs.values()), summary["cost_of_learning"]["sum"], seconds)
+
+
+def line(name: str, results: list[Result]) -> str:
+    """A row of the table: least and greatest over seeds, and the median of the seconds."""
+
+    def span(values: list[float], digits: int = 5) -> str:
+        least, greatest = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
+        return least if least == greatest else f"{least} … {greatest}"
+
+    live, cheaper, paid, seconds = (list(values) for values in zip(*results, strict=True))
+    dearer = sum(one.live > 1.001 * one.cheaper for one in results)
+    time = f"{statistics.median(seconds):.0f}"
+    return f"| {name} | {len(results)} | {span(live)} | {span(cheaper)} | {dearer} | {span(paid, 4)} | {time} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--folder", type=Path, default=Path("runs/ruler"))
+    parser.add_argument("--rows", nargs="*", default=list(ROWS), choices=list(ROWS))
+    parser.add_argument("--tanks", type=Path, help="CSV file of the Cascaded Tanks; without it that row is left out")
+    options = parser.parse_args()
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    tasks = {
+        (name, seed): options.folder / name.replace(", ", "-") / f"{seed}" for name in options.rows for seed in seeds
+    }
+    with ThreadPoolExecutor(options.jobs) as pool:
+        running = {task: pool.submit(train, ROWS[task[0]], task[1], folder) for task, folder in tasks.items()}
+        for (name, seed), training in running.items():
+            training.result()
+            print(f"{name}, seed {seed}: {Result.of(tasks[name, seed])}", file=sys.stderr, flush=True)
+    print("| system | seeds | J_a of the live policy | J_a of the cheaper policy | live is dearer | Σ | seconds |")
+    print("|---|---|---|---|---|---|---|")
+    for name in options.rows:
+        print(line(name, [Result.of(tasks[name, seed]) for seed in seeds]))
+    if options.tanks:
+        rms = identified(options.tanks, options.folder / "cascaded_tanks")
+        print(f"\nCascaded Tanks: {rms:.4f} V")
+
+
+if __name__ == "__main__":
+    main()
