@@ -146,9 +146,22 @@ def test_bad_rows_become_gaps_on_demand():
     log = checked(signals(0.1 * np.arange(100), force=force), PLANT, drop=True)
     assert len(log.times) == 95
     parts = resample(log, PLANT)
-    # Four rows make a pause of 0.5 s, longer than three intervals; one row a pause of 0.2 s, which is bridged.
-    assert [len(segment.actions) for segment in parts.segments] == [29, 65]
-    assert parts.gaps == [(pytest.approx(2.9), pytest.approx(3.4))]
+    # A pause of one row is shorter than three intervals, but nobody knows what the force was in it.
+    assert [len(segment.actions) for segment in parts.segments] == [29, 25, 38]
+    assert np.allclose(parts.gaps, [(2.9, 3.4), (5.9, 6.1)])
+    # The longest pause that is bridged is of rows that were never there.
+    assert [len(segment.actions) for segment in resample(log, PLANT, gap=9.0).segments] == [29, 25, 38]
+    with pytest.raises(ValueError, match=r"or a row that was left out \(2 such places\)"):
+        resample(log, PLANT, shortest=50)
+
+
+def test_cuts_stay_where_a_log_is_cut_again():
+    log = signals(0.1 * np.arange(10))
+    once = log.chosen(np.array([k not in (0, 3, 4, 9) for k in range(10)]))  # 1 2 | 5 6 7 8
+    assert log.cuts == () and once.cuts == (2,) and once.without(["velocity"]).cuts == (2,)
+    assert once.chosen(np.array([1, 1, 0, 1, 1, 1], dtype=bool)).cuts == (2,)
+    assert once.chosen(np.array([0, 1, 1, 1, 0, 1], dtype=bool)).cuts == (1, 3)
+    assert once.chosen(np.array([0, 0, 1, 1, 1, 1], dtype=bool)).cuts == ()
 
 
 def test_the_turbine_completes_its_filters():

@@ -1,6 +1,7 @@
 """What the sensors of a log read at a plant's control intervals, where some states have no sensor or lack samples."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -76,7 +77,7 @@ def filled(log: SensorLog, plant: Plant, guesses: Mapping[str, float] | None = N
     if hidden:
         usual = dict(zip((state.name for state in plant.states), usual_initial_state(plant).tolist(), strict=True))
         columns |= {name: np.full(len(log.times), guesses.get(name, usual[name])) for name in hidden}
-    return SensorLog(times=log.times, columns=columns)
+    return replace(log, columns=columns)
 
 
 def initial_spread(plant: Plant, log: SensorLog) -> Float[Tensor, " n_s"]:

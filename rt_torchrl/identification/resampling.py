@@ -39,7 +39,7 @@ class Resampled(NamedTuple):
 
 
 def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest: int = 10) -> Resampled:
-    """Cut a log at its gaps and bring each part to the plant's control intervals.
+    """Cut a log at its gaps and where rows were left out, and bring each part to the plant's control intervals.
 
     Args:
         log: log that :func:`rt_torchrl.identification.sensor_log.checked` has returned.
@@ -52,14 +52,15 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
         ValueError: if an argument is out of its range, no part is long enough, there are far more control intervals
             than rows, or a state is missing that the plant cannot complete.
     """
-    intervals = np.diff(log.times)
-    interval = float(np.median(intervals))
+    intervals, left_out = np.diff(log.times), np.array(log.cuts, dtype=int) - 1
+    sampled = np.delete(intervals, left_out)
+    interval = float(np.median(sampled if len(sampled) else intervals))
     if gap is not None and not gap > 0.0:
         raise ValueError(f"gap={gap} s must be positive; it is the longest time between two rows that is bridged.")
     if shortest < 2:
         raise ValueError(f"shortest={shortest} control intervals must be at least 2.")
     limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
-    cuts = np.flatnonzero(intervals > limit * (1.0 + ROUNDING))
+    cuts = np.union1d(np.flatnonzero(intervals > limit * (1.0 + ROUNDING)), left_out)
     ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
     parts = [(first, last, _steps(log.times[first], log.times[last], plant.dt)) for first, last in ends]
     too_short = [(float(log.times[first]), float(log.times[last])) for first, last, steps in parts if steps < shortest]
@@ -69,7 +70,8 @@ def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest
     if not segments:
         raise ValueError(
             f"log of {len(log.times)} rows has no part of {shortest} control intervals of {plant.dt:g} s without a gap "
-            f"longer than {limit:g} s; raise --gap above {interval:g} s, its median sampling interval, or log longer."
+            f"longer than {limit:g} s or a row that was left out ({len(left_out)} such places); raise --gap above "
+            f"{interval:g} s, its median sampling interval, or log longer."
         )
     within = np.delete(intervals, cuts)
     gaps = [(float(log.times[k]), float(log.times[k + 1])) for k in cuts]

@@ -1,7 +1,7 @@
 """Recorded logs of a real system's sensors and actuators, in CSV or Parquet files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,8 @@ class SensorLog:
     Args:
         times: instants of the rows [s], increasing.
         columns: values of every signal by name, in the signal's unit; NaN where a sensor gave no value.
+        cuts: numbers of the rows before which other rows were left out. What the actions did there is not known, so
+            that no part of the log goes over a cut, however short the time.
 
     Raises:
         ValueError: if the times are not finite and increasing, or a column has another length.
@@ -61,6 +63,7 @@ class SensorLog:
 
     times: Float[np.ndarray, " rows"]
     columns: dict[str, Float[np.ndarray, " rows"]]
+    cuts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         t = array_of("times", self.times)
@@ -87,11 +90,17 @@ class SensorLog:
 
     def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":
         """The log of some of its rows; rows that are left out become a gap."""
-        return SensorLog(times=self.times[rows], columns={name: values[rows] for name, values in self.columns.items()})
+        kept = np.flatnonzero(rows)
+        cuts = {*(np.flatnonzero(np.diff(kept) > 1) + 1).tolist(), *np.searchsorted(kept, self.cuts).tolist()}
+        return SensorLog(
+            times=self.times[rows],
+            columns={name: values[rows] for name, values in self.columns.items()},
+            cuts=tuple(sorted(cuts - {0, len(kept)})),
+        )
 
     def without(self, names: Sequence[str]) -> "SensorLog":
         """The log without the columns of these names."""
-        return SensorLog(times=self.times, columns={k: v for k, v in self.columns.items() if k not in names})
+        return replace(self, columns={k: v for k, v in self.columns.items() if k not in names})
 
     def write(self, path: Path) -> None:
         """Write the log as Parquet if the path ends in ``.parquet``, otherwise as CSV.
