@@ -10,12 +10,16 @@ from straight_line import Line, Slope, line_segment, noise_of
 from torch import nn
 
 from rt_torchrl.figures import uncertainty as charts
+from rt_torchrl.identification.covariance import standard_errors
 from rt_torchrl.identification.curve import band
 from rt_torchrl.identification.design import next_manoeuvres, weight_information
 from rt_torchrl.identification.estimation import Estimation, EstimationConfig
+from rt_torchrl.identification.output_error import InitialStates, OutputError
+from rt_torchrl.identification.prediction import predict
 from rt_torchrl.identification.profile import profile
 from rt_torchrl.identification.sensor_record import sensor_record
 from rt_torchrl.identification.sensors import Sensor, sensors_of
+from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -84,6 +88,80 @@ def test_the_profile_of_an_unknown_weight_is_open():
     assert found.uncertainty.warnings() == ["the data say nothing of w[1]; it keeps its first value"]
     shown = profile(found.likelihood, 1, math.inf, reach=3)
     assert shown.interval == (-math.inf, math.inf) and shown.rise.abs().max() < 1e-9
+
+
+class InUnits(Slope):
+    """The line's law with weights and values in other units."""
+
+    def __init__(self, weights, values):
+        super().__init__()
+        self.by_weight, self.by_value = torch.tensor(weights).double(), torch.tensor(values).double()
+        self.w = nn.Parameter(self.w.detach() / self.by_weight)
+
+    def forward(self, features):
+        slope = self.w * self.by_weight
+        return slope[:1] + slope[1:] * features
+
+    def named_coefficients(self):
+        return dict(zip(("calm", "wind"), self.w * self.by_weight / self.by_value, strict=True))
+
+
+UNITS = [(1.0, 1.0), (1e6, 1.0), (1.0, 1e6), (1e-9, 1e9), (1e-20, 1.0)]
+
+
+@pytest.mark.parametrize(
+    "weights, values", [*zip(UNITS, UNITS[:1] * 5, strict=True), *zip(UNITS[:1] * 5, UNITS, strict=True)]
+)
+def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
+    """Calm air tells nothing of the second slope; one wind tells a sum of both, of which neither is known."""
+    slope_error = NOISE * math.sqrt(1.0 / ((TIMES - TIMES.mean()) ** 2).sum())
+    for wind, known in ((0.0, slope_error), (2.0, math.inf)):
+        segment = line_segment((0.5 + 0.3 * wind) * TIMES + NOISE * noise_of(81, 0), wind=wind)
+        records, closure = [sensor_record(Line(), position(), segment)], InUnits(weights, values)
+        found = Estimation(DigitalTwin(Line(), closure), position()).run(records).uncertainty
+        errors = [error * unit for error, unit in zip(found.standard_errors().values(), values, strict=True)]
+        assert errors == pytest.approx([known, math.inf], rel=1e-6)
+        (warning,) = (text for text in found.warnings() if "hardly" not in text)
+        assert "the data say nothing of wind" in warning if wind == 0.0 else "calm and wind apart: 1 comb" in warning
+        by_cost = OutputError(DigitalTwin(Line(), closure), [segment], InitialStates.as_measured([segment]))
+        assert [math.isinf(error) for error in standard_errors(by_cost).values()] == [math.isinf(known), True]
+        assert found.correlations()[:, 1].isnan().all()
+        # The slope in the wind of the record is known, that in any other wind is not.
+        x = torch.tensor([wind, wind + 1.0]).double()
+        width = band(found, x, x[:, None])
+        assert (width.high - width.low).isinf().tolist() == [False, True]
+        with pytest.raises(ValueError, match="has no end, as the data say nothing of them"):
+            found.ellipse("calm", "wind")
+
+
+def test_a_prior_bounds_what_the_data_do_not_say():
+    """A belief of the slope in wind from elsewhere is all that is known of it after a record in calm air."""
+    closure, generator = Slope(), torch.Generator().manual_seed(0)
+    belief = Belief(torch.tensor([0.5, 0.3]).double(), torch.diag(torch.tensor([1.0, 0.04])).double())
+    task = Estimation(DigitalTwin(Line(), closure), position())
+    values = 0.5 * TIMES + NOISE * torch.randn(81, generator=generator).double().numpy()
+    records = [sensor_record(Line(), position(), line_segment(values))]
+    found = task.run(records, BeliefPrior(closure, belief, drift=0.15)).uncertainty
+    assert found.standard_errors()["w[1]"] == pytest.approx(0.25) and not found.unknown()
+
+
+def test_a_prediction_in_a_wind_of_which_no_record_tells_has_no_bound():
+    task = Estimation(DigitalTwin(Line(), Slope()), position())
+    sensors, values = position(), 0.5 * TIMES + NOISE * noise_of(81, 0)
+    estimate = task.run([sensor_record(Line(), sensors, line_segment(values))])
+    calm, wind = (predict(task, estimate, sensor_record(Line(), sensors, line_segment(values, wind=z))) for z in (0, 1))
+    assert calm.deviation.isfinite().all() and wind.deviation[1:].isinf().all()
+
+
+def test_a_manoeuvre_that_shows_nothing_leaves_an_infinite_error():
+    task = Estimation(DigitalTwin(Line(), InUnits((1.0, 1e9), (1.0, 1.0))), position())
+    noise = torch.tensor([NOISE]).double()
+    (calm,) = next_manoeuvres(task, {"calm": line_segment(0.0 * TIMES)}, noise)
+    assert calm.errors.isinf().tolist() == [False, True]
+    known = [sensor_record(Line(), position(), line_segment(0.0 * TIMES, wind=3.0))]
+    (both,) = next_manoeuvres(task, {"calm": line_segment(0.0 * TIMES)}, noise, known=known)
+    expected = np.sqrt(np.diag(exact_covariance((0.0, 3.0)))) / [1.0, 1e9]
+    np.testing.assert_allclose(both.errors.numpy(), expected, rtol=1e-4)
 
 
 def test_the_next_manoeuvre_is_the_one_that_tells_most():
@@ -162,6 +240,8 @@ def test_figures_of_regions_show_every_pair():
     figure = charts.ellipses(found)
     drawn = [ax for ax in figure.axes if ax.lines]
     assert len(drawn) == 3 and drawn[0].lines[1].get_xdata()[0] == pytest.approx(found.values[0].item())
+    (without,) = charts.ellipses(line_estimate(winds=(0.0,)).uncertainty).axes
+    assert len(without.lines) == 1  # the estimate, as one of the two values has no end
 
 
 def test_what_makes_no_region_is_refused():

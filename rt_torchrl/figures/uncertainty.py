@@ -66,8 +66,8 @@ def correlations(uncertainty: Uncertainty) -> Figure:
 
 
 def ellipses(uncertainty: Uncertainty, *, level: float = 0.95) -> Figure:
-    """Joint confidence regions of all pairs of a closure's values, which are few."""
-    names = uncertainty.names
+    """Joint confidence regions of all pairs of a closure's values, which are few; none where the data say nothing."""
+    names, untold = uncertainty.names, set(uncertainty.unknown())
     n = max(len(names) - 1, 1)
     title = f"Joint {level:.0%} regions of the weights"
     figure, axes = panels(n, n, title=title, size=(2.2 * n + 1.0, 2.2 * n + 0.8))
@@ -77,7 +77,8 @@ def ellipses(uncertainty: Uncertainty, *, level: float = 0.95) -> Figure:
             if j > i:
                 ax.set_axis_off()
                 continue
-            ax.plot(*array(uncertainty.ellipse(*pair, level=level)).T, color=TWIN)
+            if not untold & set(pair):
+                ax.plot(*array(uncertainty.ellipse(*pair, level=level)).T, color=TWIN)
             ax.plot(*(uncertainty.values[names.index(name)].item() for name in pair), "+", color=REAL)
             ax.set_xlabel(pair[0] if i == n - 1 else "")
             ax.set_ylabel(pair[1] if j == 0 else "")

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from rt_torchrl.identification.output_error import OutputError
 
@@ -35,6 +36,54 @@ def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
 
     It is infinite on the diagonal for a weight of which the segments say nothing.
     """
+    found, inverse = _scatter(output_error)
+    each = torch.eye(len(inverse.matrix), dtype=found.dtype, device=found.device)
+    found.diagonal()[inverse.unknown(each)] = math.inf
+    n = output_error.weight_count
+    return found[:n, :n]
+
+
+class InverseInformation(NamedTuple):
+    """The pseudo-inverse of an information matrix, and the directions of which the matrix says nothing, in columns.
+
+    The pseudo-inverse is that of the matrix scaled to unit diagonal, so that it does not depend on the units of the
+    unknowns. A direction is one long in these scales. ``silent`` marks unknowns of which the matrix says nothing
+    whatever the others are; they have no scale.
+    """
+
+    matrix: Float[Tensor, "n n"]
+    null: Float[Tensor, "n n_null"]
+    silent: Bool[Tensor, " n"]
+
+    def unknown(self, slopes: Float[Tensor, "*quantities n"]) -> Bool[Tensor, "*quantities"]:
+        """Whether quantities change in a direction of which the matrix says nothing.
+
+        Along such a direction the unknowns scatter by more than LEAST_EIGENVALUE^(-1/2). A quantity is unknown if this
+        scatter is more, in the quantity, than that of all other directions. No unit has a part in this.
+
+        Args:
+            slopes: derivatives of each quantity by the unknowns.
+        """
+        told = ((slopes @ self.matrix) * slopes).sum(-1).clamp_min(0.0)
+        free = (slopes @ self.null).square().sum(-1)
+        return (free > LEAST_EIGENVALUE * told) | (slopes[..., self.silent] != 0.0).any(-1)
+
+
+def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
+    """The inverse of an information matrix in the directions that it shows."""
+    diagonal = H.diagonal()
+    seen = diagonal > 0.0
+    unit = diagonal[seen].sqrt()
+    values, vectors = torch.linalg.eigh(H[seen][:, seen] / unit / unit[:, None])
+    shown = values > LEAST_EIGENVALUE
+    every = torch.eye(len(H), dtype=H.dtype, device=H.device)
+    directions = every[:, seen] @ (vectors / unit[:, None])
+    inverse = (directions[:, shown] / values[shown]) @ directions[:, shown].T
+    return InverseInformation(inverse, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
+
+
+def _scatter(output_error: OutputError) -> tuple[Float[Tensor, "n n"], InverseInformation]:
+    """Covariance of all unknowns in the directions that the segments show, and the inverse of their information."""
     replays = output_error.replays()
     H = output_error.normal_equations(replays).matrix
     M, samples = torch.zeros_like(H), 0
@@ -43,35 +92,9 @@ def covariance(output_error: OutputError) -> Float[Tensor, "n_w n_w"]:
         places = replayed.places
         M[places[:, None], places] += newey_west(scores)
         samples += len(scores)
-    inverse, null = inverse_information(H)
+    inverse = inverse_information(H)
     freedom = samples / max(samples - len(H), 1)
-    found = freedom * inverse @ M @ inverse
-    found.diagonal()[touched(null)] = math.inf
-    n = output_error.weight_count
-    return found[:n, :n]
-
-
-class InverseInformation(NamedTuple):
-    """The pseudo-inverse of an information matrix, and the directions of which the matrix says nothing, in columns."""
-
-    matrix: Float[Tensor, "n n"]
-    null: Float[Tensor, "n n_null"]
-
-
-def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
-    """The inverse of an information matrix in the directions that it shows."""
-    diagonal = H.diagonal().clamp_min(0.0).sqrt()
-    unit = torch.where(diagonal > 0.0, diagonal, 1.0)
-    values, vectors = torch.linalg.eigh(H / unit / unit[:, None])
-    shown = values > LEAST_EIGENVALUE
-    inverse = (vectors[:, shown] / values[shown]) @ vectors[:, shown].T / unit / unit[:, None]
-    null = vectors[:, ~shown] / unit[:, None]
-    return InverseInformation(inverse, null / null.norm(dim=0))
-
-
-def touched(null: Float[Tensor, "n n_null"]) -> Bool[Tensor, " n"]:
-    """Whether each unknown takes part in a direction of which nothing is known."""
-    return (null**2).sum(-1) > 1e-6
+    return freedom * inverse.matrix @ M @ inverse.matrix, inverse
 
 
 def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
@@ -89,13 +112,12 @@ def standard_errors(output_error: OutputError) -> dict[str, float]:
 
     It is infinite for a value of which the segments say nothing.
     """
-    found = covariance(output_error)
-    unknown = found.diagonal().isinf()
-    found = torch.where(unknown | unknown[:, None], 0.0, found)
+    with torch.no_grad():
+        found, inverse = _scatter(output_error)
     names, slopes = named_slopes(output_error.twin.closure)
-    hidden = (slopes[:, unknown] != 0.0).any(-1)
+    slopes = pad(slopes, (0, len(found) - slopes.shape[-1]))
     errors = (slopes @ found * slopes).sum(-1).clamp_min(0.0).sqrt()
-    return dict(zip(names, torch.where(hidden, math.inf, errors).tolist(), strict=True))
+    return dict(zip(names, torch.where(inverse.unknown(slopes), math.inf, errors).tolist(), strict=True))
 
 
 def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named n_w"]]:

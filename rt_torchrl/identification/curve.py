@@ -31,14 +31,14 @@ class Band(NamedTuple):
 
 
 def scatter(
-    closure: nn.Module, features: Float[Tensor, "points n_f"], covariance: Float[Tensor, "n_w n_w"]
+    closure: nn.Module, features: Float[Tensor, "points n_f"], uncertainty: Uncertainty
 ) -> tuple[Float[Tensor, "points n_c"], Float[Tensor, "points n_c"]]:
-    """What a closure says of features, and the standard deviation of it.
+    """What a closure says of features, and the standard deviation of it; infinite where the data say nothing.
 
     Args:
         closure: the closure.
         features: features at which it is asked.
-        covariance: covariance of the closure's trained weights, in the order of ``parameters()``.
+        uncertainty: uncertainty of the closure's trained weights, in the order of ``parameters()``.
     """
     trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
 
@@ -48,9 +48,9 @@ def scatter(
 
     jacobians = torch.func.vmap(torch.func.jacrev(said), in_dims=(None, 0))(trained, features)
     J = torch.cat([jacobian.flatten(2) for jacobian in jacobians.values()], -1)
-    variance = torch.einsum("pcw,wv,pcv->pc", J, covariance, J)
+    variance = torch.einsum("pcw,wv,pcv->pc", J, uncertainty.weights_covariance, J)
     with torch.no_grad():
-        return closure(features), variance.clamp_min(0.0).sqrt()
+        return closure(features), torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
 
 
 def band(
@@ -74,7 +74,7 @@ def band(
         ValueError: if the level does not lie between 0 and 1.
     """
     closure = uncertainty.likelihood.twin.closure
-    said, deviation = scatter(closure, features, uncertainty.weights_covariance)
+    said, deviation = scatter(closure, features, uncertainty)
     half = normal_factor(level) * deviation[:, output]
     middle = said[:, output]
     return Band(x, middle, middle - half, middle + half)

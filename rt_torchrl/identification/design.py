@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.identification.covariance import inverse_information
 from rt_torchrl.identification.estimation import Estimation
 from rt_torchrl.identification.likelihood import Likelihood
 from rt_torchrl.identification.sensor_record import SensorRecord, sensor_record
@@ -27,7 +28,10 @@ LEAST_INFORMATION = 1e-12
 
 
 class Choice(NamedTuple):
-    """A manoeuvre that is to be flown: its name, its gain, and the standard errors of the weights after it."""
+    """A manoeuvre that is to be flown: its name, its gain, and the standard errors of the weights after it.
+
+    An error is infinite where neither this manoeuvre nor what was known before says anything of the weight.
+    """
 
     name: str
     gain: float
@@ -41,7 +45,7 @@ def weight_information(likelihood: Likelihood) -> Float[Tensor, "n_w n_w"]:
     """
     H, n = likelihood.normal_equations().matrix, likelihood.weight_count
     cross, own = H[:n, n:], H[n:, n:]
-    return H[:n, :n] - cross @ torch.linalg.pinv(own, hermitian=True, rtol=1e-12) @ cross.T
+    return H[:n, :n] - cross @ inverse_information(own).matrix @ cross.T
 
 
 def next_manoeuvres(
@@ -73,16 +77,22 @@ def next_manoeuvres(
 
     found = {name: of([sensor_record(estimation.twin.plant, estimation.sensors, m)]) for name, m in manoeuvres.items()}
     size = torch.stack([F.diagonal() for F in found.values()]).sum(0)
-    total = torch.diag(LEAST_INFORMATION * size.clamp_min(1e-300))  # so that weights that nothing shows are no obstacle
-    total = total + (of(known) if known else 0.0)
+    least = torch.diag(LEAST_INFORMATION * size.clamp_min(1e-300))  # so that weights that nothing shows are no obstacle
+    told = of(known) if known else torch.zeros_like(least)
     chosen: list[Choice] = []
     while len(chosen) < count:
-        gains = {name: volume(total + F) - volume(total) for name, F in found.items()}
+        gains = {name: volume(least + told + F) - volume(least + told) for name, F in found.items()}
         name = max(gains, key=lambda one: gains[one])
-        total = total + found[name]
-        errors = torch.linalg.pinv(total, hermitian=True, rtol=1e-15).diagonal().clamp_min(0.0).sqrt()
-        chosen.append(Choice(name, gains[name], errors))
+        told = told + found[name]
+        chosen.append(Choice(name, gains[name], _errors(told)))
     return chosen
+
+
+def _errors(F: Tensor) -> Tensor:
+    """Standard errors of the weights by their information; infinite for those of which it says nothing."""
+    inverse = inverse_information(F)
+    each = torch.eye(len(F), dtype=F.dtype, device=F.device)
+    return torch.where(inverse.unknown(each), math.inf, inverse.matrix.diagonal().sqrt())
 
 
 def volume(F: Tensor) -> float:

@@ -84,13 +84,15 @@ def predict(estimation: Estimation, estimate: Estimate, record: SensorRecord, *,
         raise ValueError(f"first={first} samples of the record must be at least 1.")
     noise = estimate.likelihood.noise
     begun = estimation.fit_initial_states([record.masked(0, first)], noise)
-    start = inverse_information(begun.normal_equations().matrix).matrix
+    start = inverse_information(begun.normal_equations().matrix)
     whole = Likelihood(estimation.twin, [record], estimation.sensors, begun.initial, noise, biases=begun.biases)
     (block,) = whole.residuals()
     n = whole.weight_count
     C = estimate.uncertainty.weights_covariance
     by_weights, by_start = block.jacobian[..., :n], block.jacobian[..., n:]
-    variance = ((by_weights @ C) * by_weights).sum(-1) + ((by_start @ start) * by_start).sum(-1)
+    variance = ((by_weights @ C) * by_weights).sum(-1) + ((by_start @ start.matrix) * by_start).sum(-1)
+    untold = estimate.uncertainty.untold(by_weights) | start.unknown(by_start)
+    variance = torch.where(untold, torch.inf, variance)
     simulated = whole.simulated()
     deviation = torch.where(record.seen, noise * variance.clamp_min(0.0).sqrt(), torch.nan)
     return Prediction(simulated, record.readings - simulated, deviation, noise.clone(), whole.initial().detach()[0])

@@ -12,15 +12,15 @@ import math
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from rt_torchrl.identification.covariance import (
     inverse_information,
     named_slopes,
     named_values,
     newey_west,
-    touched,
 )
 from rt_torchrl.identification.likelihood import Likelihood
 
@@ -47,7 +47,7 @@ class Uncertainty:
 
     Attributes:
         covariance: covariance of all unknowns in their order; zero in directions of which nothing is known.
-        null: these directions, in columns.
+        null: these directions, in columns, each as long as the information of the single unknowns makes it.
         names: names of the closure's values.
         values: these values.
     """
@@ -57,7 +57,8 @@ class Uncertainty:
         self.likelihood, self.errors = likelihood, errors
         blocks = likelihood.residuals()
         self.information = likelihood.normal_equations(blocks).matrix
-        self.covariance, self.null = inverse_information(self.information)
+        self._inverse = inverse_information(self.information)
+        self.covariance, self.null = self._inverse.matrix, self._inverse.null
         if errors == "robust":
             M = torch.zeros_like(self.information)
             for block in blocks:
@@ -84,10 +85,17 @@ class Uncertainty:
         """Changes of the named values in the directions of which nothing is known."""
         return self._slopes @ self.null[: self.likelihood.weight_count]
 
+    def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
+        """Whether quantities change in a direction of which the data say nothing.
+
+        Args:
+            slopes: derivatives of each quantity by the closure's weights.
+        """
+        return self._inverse.unknown(pad(slopes, (0, len(self.covariance) - slopes.shape[-1])))
+
     def unknown(self) -> list[str]:
         """Names of the values that take part in a direction of which the data say nothing."""
-        free = touched(self._free).tolist() if self.null.shape[-1] else [False] * len(self.names)
-        return [name for name, one in zip(self.names, free, strict=True) if one]
+        return [name for name, one in zip(self.names, self.untold(self._slopes).tolist(), strict=True) if one]
 
     def standard_errors(self) -> dict[str, float]:
         """Standard error of every named value; infinite for one of which the data say nothing."""
@@ -95,9 +103,9 @@ class Uncertainty:
         return dict(zip(self.names, errors, strict=True)) | dict.fromkeys(self.unknown(), math.inf)
 
     def correlations(self) -> Float[Tensor, "n_named n_named"]:
-        """Correlations of the named values."""
+        """Correlations of the named values; nan for one of which the data say nothing."""
         C = self.named_covariance
-        scale = C.diagonal().sqrt()
+        scale = torch.where(self.untold(self._slopes), math.nan, C.diagonal().sqrt())
         return C / torch.outer(scale, scale)
 
     def intervals(self, level: float = 0.95) -> dict[str, Interval]:
@@ -114,11 +122,14 @@ class Uncertainty:
         """Boundary of the joint confidence region of two named values.
 
         Raises:
-            ValueError: if a name does not exist, or the level does not lie between 0 and 1.
+            ValueError: if a name does not exist, the data say nothing of a value, or the level does not lie between 0
+                and 1.
         """
         unknown = [name for name in (first, second) if name not in self.names]
         if unknown:
             raise ValueError(f"ellipse of {unknown}: the closure's values are {', '.join(self.names)}.")
+        if untold := sorted({first, second} & set(self.unknown())):
+            raise ValueError(f"ellipse of {untold}: it has no end, as the data say nothing of them; choose others.")
         pair = torch.tensor([self.names.index(first), self.names.index(second)])
         values, vectors = torch.linalg.eigh(self.named_covariance[pair[:, None], pair])
         radius = math.sqrt(-2.0 * math.log(1.0 - _level(level)))  # the quantile of χ² with two degrees of freedom
@@ -132,8 +143,8 @@ class Uncertainty:
         shape = initial.offsets.shape
         held = slice(n, n + shape.numel())
         variance = self.covariance.diagonal()[held].clone()
-        if self.null.shape[-1]:
-            variance[touched(self.null)[held]] = math.inf
+        each = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[held]
+        variance[self._inverse.unknown(each)] = math.inf
         found = torch.zeros_like(initial.measured)
         found[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
         return found
@@ -155,7 +166,11 @@ class Uncertainty:
         """What to say of values that take part in directions of which the data say nothing."""
         if not names:
             return []
-        rank = int(torch.linalg.matrix_rank(self._free, rtol=1e-3))
+        # The rank must not depend on the units of values and weights.
+        free = self._free[[self.names.index(name) for name in names]]
+        for dim in (1, 0):
+            free = normalize(free, dim=dim, eps=1e-300)
+        rank = int(torch.linalg.matrix_rank(free, rtol=1e-3))
         if rank == len(names):
             return [f"the data say nothing of {name}; it keeps its first value" for name in names]
         return [

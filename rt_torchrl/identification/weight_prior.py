@@ -75,7 +75,7 @@ class Belief(NamedTuple):
         """What an estimation has found of the weights; directions of which the data say nothing stay unknown."""
         closure, n = uncertainty.likelihood.twin.closure, uncertainty.likelihood.weight_count
         mean = torch.cat([w.detach().flatten() for w in closure.parameters() if w.requires_grad])
-        null = uncertainty.null[:n]
+        null = uncertainty.null[:n] / uncertainty.null.norm(dim=0)
         return cls(mean, uncertainty.weights_covariance + UNKNOWN**2 * null @ null.T)
 
 
