@@ -124,6 +124,16 @@ def test_dates_are_counted_from_the_first_row(tmp_path):
         (TABLE.replace("-1,0.5", "-2.5,0.5"), MAPPING, "force is -2.5 N in row 2 .* from -2 to 2 N"),
         (TABLE.splitlines()[0] + "\n", ["t=time"], "0 rows"),
         ("time,force\n2024-03-31,1\n2024-04-01,1\n", ["time=time[s]"], "holds dates; leave its unit 's' away"),
+        ("time;force\n0;1\n0.1;1\n", [], "no column 'time'; it has time;force"),
+        ("time,force,force\n0,1,2\n0.1,1,2\n", [], "'force' is there 2 times in .* columns time, force, force"),
+        ("time,f, f\n0,1,2\n0.1,1,2\n", ["f=force"], "column 'f' for 'force' is there 2 times"),
+        ("time,force\n0,1\n0.1\n", [], "line 3 has 1 entries; the header has 2: time, force"),
+        ("time,force\n0,1,7\n0.1,1,8\n", [], "line 2 has 3 entries; the header has 2: time, force"),
+        (",\n1,2\n", [], "it has no header"),
+        ("time,force\n0.0,1\n0.1,1\nend,1\n", [], "column 'time' .* not a number: 'end' in row 2"),
+        ("time,force\n0,1\n1,1,\n2,off\n", [], "column 'force' .* not a number: 'off' in row 2"),
+        ("time,force\n2024-03-31,1\nend,1\n", [], r"not a date .* 'end' in row 1 \(counted from 0\), 1 such rows"),
+        ("time,force\n2024-03-31T00:00Z,1\n2024-03-31T00:05,1\n", [], "an offset from UTC, .* 'T?2024-03-31T00:05'"),
     ],
 )
 def test_logs_that_cannot_drive_a_twin_are_refused(tmp_path, table, columns, message):
@@ -131,6 +141,55 @@ def test_logs_that_cannot_drive_a_twin_are_refused(tmp_path, table, columns, mes
     declared = [column if isinstance(column, Column) else Column.parse(column) for column in columns]
     with pytest.raises(ValueError, match=message):
         checked(read_log(tmp_path / "log.csv", PLANT, declared), PLANT)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("\n", ",\n"),
+        lambda text: text.replace("\n", ",\n").replace(",\n", "\n", 1),  # the header has no delimiter at its end
+        lambda text: text.replace("\n", ",\n", 1),  # the header alone has one
+        lambda text: text.replace("0.1,", "0.1 , "),
+        lambda text: text.replace("velocity", '" velocity "').replace("time", "\ufefftime "),
+        lambda text: "\n \n" + text.replace("\n", "\n\n"),
+        lambda text: text.replace("\n", ",\n").replace(",\n", ",spare\n", 1),
+    ],
+)
+def test_columns_are_as_the_header_says(tmp_path, change):
+    table = "time,position,velocity,force,disturbance\n0,1,0.1,1,0\n0.1,2,0.2,1,0.25\n0.2,3,0.3,-1,0.5\n"
+    (tmp_path / "log.csv").write_text(change(table), encoding="utf-8")
+    log = read_log(tmp_path / "log.csv", PLANT)
+    assert log.times.tolist() == [0.0, 0.1, 0.2]
+    found = {name: values.tolist() for name, values in log.columns.items()}
+    assert found["position"] == [1.0, 2.0, 3.0] and found["velocity"] == [0.1, 0.2, 0.3]
+    assert found["force"] == [1.0, 1.0, -1.0] and found["disturbance"] == [0.0, 0.25, 0.5]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "CSV", "parquet", "Parquet"])
+@pytest.mark.parametrize("index", [False, True])
+def test_times_may_be_durations_and_an_index(tmp_path, suffix, index):
+    import pandas as pd
+
+    path = tmp_path / f"log.{suffix}"
+    table = pd.DataFrame({"time": pd.to_timedelta([30.0, 90.5, 3600.0], unit="s"), "force": [1.0, 2.0, 3.0]})
+    table = table.set_index("time") if index else table
+    if suffix.lower() == "csv":
+        table.to_csv(path, index=index)
+    else:
+        pytest.importorskip("pyarrow")
+        table.to_parquet(path)
+    log = read_log(path, PLANT)
+    assert log.times.tolist() == [30.0, 90.5, 3600.0] and log.columns["force"].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_dates_are_no_values_of_a_signal(tmp_path):
+    pytest.importorskip("pyarrow")
+    import pandas as pd
+
+    table = pd.DataFrame({"time": [0.0, 1.0], "force": pd.to_datetime(["2024-03-31", "2024-04-01"])})
+    table.to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(ValueError, match="column 'force' .* holds dates; force needs numbers"):
+        read_log(tmp_path / "log.parquet", PLANT)
 
 
 def test_files_that_cannot_be_read_are_refused(tmp_path):

@@ -1,5 +1,6 @@
 """Recorded logs of a real system's sensors and actuators, in CSV or Parquet files."""
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +19,11 @@ from rt_torchrl.plants.signal import Signal
 
 TIME = "time"
 READERS = (".csv", ".parquet")
-"""Ends of the names of files that are read."""
+"""Ends of the names of files that are read, in small letters."""
 MOST_ENTRIES = 500_000_000
 """Greatest number of entries of a log, which take 4 GB."""
+WITH_OFFSET = r"\d[Tt ].*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
+"""A date whose time of day says by how much it is ahead of UTC."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +111,7 @@ class SensorLog:
         :func:`read_log` reads it without a mapping of columns.
         """
         frame = pandas().DataFrame({TIME: self.times, **self.columns})
-        if path.suffix == ".parquet":
+        if path.suffix.lower() == ".parquet":
             frame.to_parquet(path, index=False)
         else:
             frame.to_csv(path, index=False)
@@ -131,33 +134,48 @@ def logged_signals(plant: Plant) -> tuple[Signal, ...]:
 def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
     """Read the columns of a file that hold signals of a plant; other columns are ignored.
 
+    Blanks around a header do not count. Entries behind the last header are empty, as a delimiter at the end of a line
+    leaves them.
+
     Args:
-        path: file whose name ends in ``.csv`` or ``.parquet``. Its time is a number of seconds on the plant's clock, or
-            a date and time of day (ISO 8601), which is counted from the first row.
+        path: file whose name ends in ``.csv`` or ``.parquet``. Its time is a number of seconds on the plant's clock, a
+            duration on that clock (``0:01:30``), or a date and time of day (ISO 8601), which is counted from the first
+            row. Either all dates have an offset from UTC or none has.
         plant: plant whose signals the file holds.
         columns: columns whose header is not the name of their signal, or whose unit is not that of their signal.
 
     Raises:
-        ValueError: if the file cannot be read, a column is missing, names an unknown signal or is not numeric, the
-            times are not increasing, or the unit of a column measures another quantity than the unit of its signal.
+        ValueError: if the file cannot be read, a line has more or fewer entries than the header, a column is missing,
+            is there twice, names an unknown signal or is not numeric, the times are not increasing, or the unit of a
+            column measures another quantity than the unit of its signal.
     """
     frame = _read(path)
+    headers = list(frame)
     names = [signal.name for signal in logged_signals(plant)]
     for column in columns:
-        if column.header not in frame or column.signal not in (TIME, *names):
+        if column.header.strip() not in headers or column.signal not in (TIME, *names):
             raise ValueError(
-                f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(map(str, frame))}; "
+                f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(headers)}; "
                 f"plant {plant.name!r} has the signals {', '.join((TIME, *names))}."
             )
     declared = {column.signal: column for column in columns}
     if len(declared) < len(columns):
         raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; give each signal one column.")
-    by_name = {name: Column(header=name, signal=name) for name in (TIME, *names) if name in frame}
+    by_name = {name: Column(header=name, signal=name) for name in (TIME, *names) if name in headers}
     chosen = by_name | declared
     if TIME not in chosen:
-        raise ValueError(f"{path} has no column 'time'; say which it is, such as --columns t=time.")
+        raise ValueError(
+            f"{path} has no column 'time'; it has {', '.join(headers)}. Say which it is, such as --columns t=time. In "
+            "CSV files, commas part the columns."
+        )
+    for column in chosen.values():
+        if headers.count(column.header.strip()) > 1:
+            raise ValueError(
+                f"column {column.header!r} for {column.signal!r} is there {headers.count(column.header.strip())} times "
+                f"in {path}, which has the columns {', '.join(headers)}; give each a header of its own."
+            )
     units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
-    values = {name: _values(frame[column.header], column, units[name], path) for name, column in chosen.items()}
+    values = {name: _values(frame[column.header.strip()], column, units[name], path) for name, column in chosen.items()}
     return SensorLog(times=values.pop(TIME), columns=values)
 
 
@@ -202,16 +220,56 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
 
 
 def _read(path: Path) -> Any:
-    readers = dict(zip(READERS, (pandas().read_csv, pandas().read_parquet), strict=True))
-    if path.suffix not in readers:
+    readers = dict(zip(READERS, (_read_csv, _read_parquet), strict=True))
+    kind = path.suffix.lower()
+    if kind not in readers:
         raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
     try:
         require_bounded(path)
-        if path.suffix == ".parquet":
-            _require_entries(path)
-        return readers[path.suffix](path)
+        frame = readers[kind](path)
     except Exception as error:  # the readers of tables raise errors of many kinds at what is wrong in a file
         raise ValueError(f"log {path} cannot be read: {type(error).__name__}: {error}") from error
+    frame.columns = [str(header).strip() for header in frame]
+    return frame
+
+
+def _read_csv(path: Path) -> Any:
+    """The table with the columns as the header says; pandas alone would shift or fill the entries of ragged lines."""
+    headers = _headers(path)
+    frame = pandas().read_csv(path, index_col=False, usecols=range(len(headers)))
+    # pandas gives a name to a column without one, and another name to a header that is there twice.
+    frame.columns = [header or given for header, given in zip(headers, frame, strict=True)]
+    return frame
+
+
+def _headers(path: Path) -> list[str]:
+    """The headers of a CSV file, after a look at every line.
+
+    Raises:
+        ValueError: if there is no header, or a line lacks entries or has some behind the last header.
+    """
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        lines = csv.reader(file)
+        rows = (row for row in lines if row and not (len(row) == 1 and not row[0].strip()))  # blank lines do not count
+        headers = [header.strip() for header in next(rows, [])]
+        n = len(headers)
+        least = max((k for k, header in enumerate(headers, 1) if header), default=0)
+        if not least:
+            raise ValueError("it has no header")
+        for row in rows:
+            if len(row) != n and (len(row) < least or any(entry.strip() for entry in row[n:])):
+                raise ValueError(
+                    f"line {lines.line_num} has {len(row)} entries; the header has {n}: {', '.join(headers)}. Mend the "
+                    "line or the header"
+                )
+    return headers
+
+
+def _read_parquet(path: Path) -> Any:
+    _require_entries(path)
+    frame = pandas().read_parquet(path)
+    # An index with a name is a column of the file.
+    return frame.reset_index() if any(name is not None for name in frame.index.names) else frame
 
 
 def _require_entries(path: Path) -> None:
@@ -229,17 +287,21 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndar
     pd = pandas()
     if series.empty:
         return np.empty(0)
-    dates = column.signal == TIME and not pd.api.types.is_numeric_dtype(series)
-    if dates and column.unit is not None:
-        raise ValueError(f"column {column.header!r} of {path} holds dates; leave its unit {column.unit!r} away.")
+    of_clock = pd.api.types.is_datetime64_any_dtype(series) or pd.api.types.is_timedelta64_dtype(series)
     try:
-        if dates:
-            instants = pd.to_datetime(series, utc=True, format="ISO8601")
-            numbers = (instants - instants.iloc[0]).dt.total_seconds()
-        else:
-            numbers = pd.to_numeric(series)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"column {column.header!r} of {path} holds an entry that is not a number: {error}") from error
+        numbers = None if of_clock else pd.to_numeric(series)
+    except (ValueError, TypeError):
+        text = series.astype(str).str.strip().str.lower()
+        wrong = pd.to_numeric(series, errors="coerce").isna() & series.notna() & ~text.isin(("", "nan"))
+        if column.signal != TIME or not wrong[series.notna()].all():
+            raise _wrong_entry(series, wrong, column, path, "a number") from None
+        numbers = None
+    if numbers is None:
+        if column.signal != TIME:
+            raise ValueError(f"column {column.header!r} of {path} holds dates; {column.signal} needs numbers.")
+        if column.unit is not None:
+            raise ValueError(f"column {column.header!r} of {path} holds dates; leave its unit {column.unit!r} away.")
+        numbers = _seconds(series, column, path)
     values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
     if column.unit is None:
         return column.factor * values + column.offset
@@ -247,6 +309,38 @@ def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndar
         return converted(values, column.unit, unit)
     except ValueError as error:
         raise ValueError(f"column {column.header!r} of {path} for signal {column.signal!r}: {error}") from error
+
+
+def _seconds(series: Any, column: Column, path: Path) -> Any:
+    """Durations in seconds, or the seconds of dates since the first one."""
+    pd = pandas()
+    if pd.api.types.is_timedelta64_dtype(series):
+        return series.dt.total_seconds()
+    if pd.api.types.is_datetime64_any_dtype(series):
+        found = pd.to_datetime(series, utc=True)
+    else:
+        text, there = series.astype(str), series.notna()
+        found = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
+        durations = pd.to_timedelta(text, errors="coerce")
+        dates = int(found.notna().sum()) >= int(durations.notna().sum())
+        found = found if dates else durations
+        if (found.isna() & there).any():
+            raise _wrong_entry(series, found.isna() & there, column, path, "a date (ISO 8601) or a duration (0:01:30)")
+        if not dates:
+            return found.dt.total_seconds()
+        offset = text.str.contains(WITH_OFFSET)
+        other = there & (offset != offset[there].iloc[0])
+        if other.any():
+            raise _wrong_entry(series, other, column, path, "like the first one: with an offset from UTC, or without")
+    return (found - found.dropna().iloc[0]).dt.total_seconds()
+
+
+def _wrong_entry(series: Any, wrong: Any, column: Column, path: Path, what: str) -> ValueError:
+    k = int(np.argmax(wrong.to_numpy()))
+    return ValueError(
+        f"column {column.header!r} of {path} holds an entry that is not {what}: {series.iloc[k]!r} in row {k} (counted "
+        f"from 0), {int(wrong.sum())} such rows."
+    )
 
 
 def pandas() -> Any:

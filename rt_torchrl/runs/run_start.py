@@ -68,7 +68,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
     path = Path(name)
     if path.is_dir():
         return _of_run(path, config, plant)
-    if path.suffix in READERS and path.is_file():
+    if path.suffix.lower() in READERS and path.is_file():
         return _of_log(path, config, plant)
     raise ValueError(
         f"start={name!r} is none of {', '.join(STARTS)}, and there is no such run folder or log; a log ends in "
