@@ -39,6 +39,9 @@ from rt_torchrl.identification.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.shipped_plants import plant_class
 
+SLOW = 1.5
+"""Number of control intervals between rows above which many control instants have no sample."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
@@ -54,7 +57,8 @@ class Config:
         drop: leave out rows with a value that is missing or out of range; they become gaps.
         missing: keep rows in which a sensor lacks its sample; only that sample is left out.
         sensors: states and measurements whose columns the twin is fitted to by maximum likelihood; by default the
-            plant's own J_p is used, or all columns of sensors if a state is not measured or a sample is missing.
+            plant's own J_p is used, or all columns of sensors if a state is not measured, a sample is missing, or rows
+            are further apart than control intervals.
         biased: sensors that may be off by a constant, which is estimated; the fit is then by maximum likelihood.
         guess: first guesses of the initial values of states that are not measured, as STATE=VALUE.
         dt: control interval of the twin [s]; by default the plant's own.
@@ -130,9 +134,9 @@ class Config:
                 raise ValueError(f"guess={text!r} is not understood; write STATE=VALUE, such as wall=15.") from None
         return found
 
-    def by_likelihood(self, plant: Plant, log: SensorLog) -> bool:
-        """Whether the twin is fitted by maximum likelihood."""
-        holes = any(np.isnan(values).any() for values in log.columns.values())
+    def by_likelihood(self, plant: Plant, log: SensorLog, interval: float) -> bool:
+        """Whether the twin is fitted by maximum likelihood; J_p needs a sample in every control interval."""
+        holes = any(np.isnan(values).any() for values in log.columns.values()) or interval > SLOW * plant.dt
         return bool(self.sensors or self.biased or self.guess or holes or hidden_states(plant, log))
 
     def make_folder(self, plant: str) -> Path:
@@ -159,7 +163,7 @@ def main(config: Config) -> None:
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
-    if config.by_likelihood(plant, log):
+    if config.by_likelihood(plant, log, parts.interval):
         sensors = with_biases(sensors_in(plant, log, config.sensors), config.biased)
         task = Estimation(
             DigitalTwin(plant, closure), sensors, spread=initial_spread(plant, log), config=config.estimation

@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 import torch
 from hidden_wall import Room, room_records
+from linear_quadratic import LinearClosure, LinearQuadratic
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.identification.estimation import Estimation, EstimationConfig
 from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
 from rt_torchrl.identification.resampling import resample
+from rt_torchrl.identification.sensor_identification import autocorrelation
 from rt_torchrl.identification.sensor_log import SensorLog, checked
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 pd = pytest.importorskip("pandas")
 TESTS = Path(__file__).parent
@@ -132,3 +137,76 @@ def test_the_room_is_identified_from_a_file(room_log, capsys):
     torch.load(room_log / "results" / "weights.pt", weights_only=True)
     with pytest.raises(ValueError, match="guess='wall' is not understood"):
         identify.main(identify.Config(**given, missing=True, guess=("wall",)))
+
+
+def slow_log(seed=1, rows=240):
+    """The oscillator of the oracle at every tenth control instant, with a force held from row to row, and noise."""
+    plant, generator = LinearQuadratic(horizon=1.0 * rows), torch.Generator().manual_seed(seed)
+    force = torch.rand(1, rows, 1, generator=generator, dtype=torch.float64).round().repeat_interleave(10, 1) - 0.5
+    start = plant.draw_initial_state(1, generator)
+    with torch.no_grad():
+        states = Rollout(plant, plant.closure)(start, torch.zeros_like(force), force).states[0, :-1:10]
+    states = (states + 0.01 * torch.randn(states.shape, generator=generator, dtype=torch.float64)).numpy()
+    columns = {"position": states[:, 0], "velocity": states[:, 1], "force": force[0, ::10, 0].numpy()}
+    log = SensorLog(times=1.0 * np.arange(rows), columns=columns | {"disturbance": np.zeros(rows)})
+    return plant, log
+
+
+def test_what_lies_between_the_rows_of_a_slow_log_is_no_measurement():
+    plant, log = slow_log()
+    parts, sensors = resample(log, plant), sensors_in(plant, log)
+    record = logged_readings(log, plant, sensors, parts.segments[0], parts.gap)
+    assert np.flatnonzero(record.seen.all(-1)).tolist() == list(range(0, 2391, 10))
+    assert int(record.seen.sum()) == 2 * 240
+    closure = LinearClosure(torch.zeros(2, 2))
+    config = EstimationConfig(errors="robust")
+    found = Estimation(DigitalTwin(plant, closure), sensors, config=config).run([record])
+    errors = found.uncertainty.standard_errors()
+    for (name, value), true in zip(found.after.items(), np.ravel(plant.true_closure), strict=True):
+        assert abs(value - true) < 4.0 * errors[name] < 0.05
+    assert list(found.noise.values()) == pytest.approx([0.01, 0.01], rel=0.2)
+    # White noise correlates by 1/√240 = 0.065 from row to row.
+    assert autocorrelation(found.likelihood).abs().max() < 0.25
+
+
+def test_errors_of_a_slow_log_are_those_of_its_rows():
+    """Neighbours of which each is the mean of two noises: as many rows in between without a sample change nothing."""
+    plant, log = slow_log()
+    smooth = 0.01 * np.convolve(np.random.default_rng(0).normal(size=241), [1.0, 1.0], "valid")
+    log.columns["position"] += smooth - smooth[0]
+    found = []
+    for every in (10, 5):  # control intervals between rows
+        own = LinearQuadratic(dt=1.0 / every, horizon=240.0)
+        parts, sensors = resample(log, own), sensors_in(own, log, ["position"])
+        record = logged_readings(log, own, sensors, parts.segments[0], parts.gap)
+        closure = LinearClosure(torch.tensor(own.true_closure))
+        closure.matrix.requires_grad_(True)
+        config = EstimationConfig(errors="robust")
+        estimate = Estimation(DigitalTwin(own, closure), sensors, config=config).run([record])
+        found.append([estimate.uncertainty.covariance.diagonal()[-2:].sqrt(), autocorrelation(estimate.likelihood)])
+    # The two grids integrate the same system, to fourth order.
+    torch.testing.assert_close(found[0], found[1], rtol=0.02, atol=0)
+    assert 0.25 < found[0][1].item() < 0.6  # half, of the part of the noise that is smooth
+
+
+@pytest.mark.parametrize("step, expected", [(0.1, False), (0.14, False), (0.2, True)])
+def test_a_log_slower_than_the_twin_is_fitted_by_its_rows_alone(step, expected):
+    plant = LinearQuadratic(dt=0.1)
+    zero = np.zeros(60)
+    log = SensorLog(
+        times=step * np.arange(60), columns=dict.fromkeys(("position", "velocity", "force", "disturbance"), zero)
+    )
+    config = identify_recipe().Config(log=Path("log.csv"), plant="own")
+    assert config.by_likelihood(plant, log, resample(log, plant).interval) is expected
+
+
+def test_samples_are_not_interpolated_across_rows_that_were_left_out():
+    """The air lacks its sample before the cut, so that only rows on both sides of the cut are around it."""
+    plant = Room()
+    log = log_of(plant, ["air"], rows=40)
+    log.columns["air"][19] = np.nan
+    log = log.chosen(np.arange(40) != 20)
+    parts = resample(filled(log, plant), plant)
+    records = [logged_readings(log, plant, sensors_in(plant, log), part, 1e9) for part in parts.segments]
+    assert [len(record.readings) for record in records] == [20, 19]
+    assert records[0].readings[:, 0].isnan().nonzero().flatten().tolist() == [19] and records[1].seen.all()

@@ -94,8 +94,10 @@ def logged_readings(
 ) -> SensorRecord:
     """What sensors read along a segment of a resampled log.
 
-    A sample is interpolated between the two rows around it that the sensor has; it is missing if these are further
-    apart than ``gap`` [s].
+    There is a sample at the control instant nearest to each row that the sensor has, and nowhere else: what is
+    interpolated between rows is no measurement. The time from the row to that instant is interpolated, between the two
+    rows around it; the sample is missing if these are further apart than ``gap`` [s], or rows were left out between
+    them.
 
     Args:
         log: the log, with NaN where a sensor lacks a sample.
@@ -105,9 +107,18 @@ def logged_readings(
         gap: longest time between two rows that is bridged [s].
     """
     grid = float(segment.start) + plant.dt * np.arange(len(segment.states))
-    values = [_samples(one.measurement, log.times, log.columns[one.name], grid, gap) for one in sensors]
+    rows = _around(log, grid)
+    values = [_samples(one.measurement, log.times[rows], log.columns[one.name][rows], grid, gap) for one in sensors]
     readings = torch.from_numpy(np.stack(values, -1))
     return SensorRecord(readings, segment.actions, segment.exogenous, segment.states[0], float(segment.start))
+
+
+def _around(log: SensorLog, grid: Float[np.ndarray, " samples"]) -> slice:
+    """The rows between the cuts of the log around a segment."""
+    cuts = np.array((0, *log.cuts, len(log.times)))
+    middle = np.searchsorted(log.times, 0.5 * (grid[0] + grid[-1]), side="right") - 1
+    part = int(np.searchsorted(cuts, middle, side="right"))
+    return slice(int(cuts[part - 1]), int(cuts[part]))
 
 
 def _samples(
@@ -130,4 +141,6 @@ def _samples(
     # A row at the instant itself needs no neighbour.
     exact = np.minimum(np.abs(times[after] - grid), np.abs(times[after - 1] - grid)) <= slack
     found = np.where(exact, np.interp(grid, times, values), found)
-    return np.asarray(signal.wrapped(np.where(exact | (apart <= gap * (1.0 + ROUNDING)), found, np.nan)))
+    nearest = np.rint((times - grid[0]) * (len(grid) - 1) / (grid[-1] - grid[0]))
+    measured = np.isin(np.arange(len(grid)), nearest) & (exact | (apart <= gap * (1.0 + ROUNDING)))
+    return np.asarray(signal.wrapped(np.where(measured, found, np.nan)))

@@ -71,7 +71,11 @@ def judged(likelihood: Likelihood) -> SensorJudgement:
 
 
 def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
-    """Correlation of the residuals of neighbouring samples, for each sensor."""
-    blocks = [block.values for block in likelihood.residuals()]
-    products = torch.stack([(r[1:] * r[:-1]).sum(0) for r in blocks]).sum(0)
-    return products / torch.stack([r.square().sum(0) for r in blocks]).sum(0)
+    """Correlation of the residuals of neighbouring samples that exist, for each sensor."""
+    products, squares = torch.zeros_like(likelihood.noise), torch.zeros_like(likelihood.noise)
+    for block, record in zip(likelihood.residuals(), likelihood.records, strict=True):
+        for k, seen in enumerate(record.seen.T):
+            r = block.values[seen, k]
+            products[k] += r[1:] @ r[:-1]
+            squares[k] += r @ r
+    return products / squares

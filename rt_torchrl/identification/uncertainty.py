@@ -61,8 +61,8 @@ class Uncertainty:
         self.covariance, self.null = self._inverse.matrix, self._inverse.null
         if errors == "robust":
             M = torch.zeros_like(self.information)
-            for block in blocks:
-                scores = torch.einsum("kr,krp->kp", block.values, block.jacobian)
+            for block, record in zip(blocks, likelihood.records, strict=True):
+                scores = torch.einsum("kr,krp->kp", block.values, block.jacobian)[record.seen.any(-1)]
                 M[block.places[:, None], block.places] += newey_west(scores)
             self.covariance = self.covariance @ M @ self.covariance
         closure = likelihood.twin.closure
