@@ -1,5 +1,7 @@
 """Process noise and drift: against generalised least squares and the Kalman filter."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,9 @@ from test_uncertainty import NOISE, position
 
 from rt_torchrl.identification.estimation import Estimation
 from rt_torchrl.identification.sensor_record import chained, sensor_record
+from rt_torchrl.identification.sensors import sensors_of
 from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 N, LENGTH, PUSH = 60, 10, 0.5
@@ -51,6 +55,30 @@ def test_pushes_are_found_where_they_were():
     true = jumps[LENGTH + 1 :: LENGTH]
     # Ten samples of 0.2 on each side of a cut, and a slope that is shared.
     assert np.corrcoef(found, true)[0, 1] > 0.9 and np.abs(found - true).max() < 0.4
+
+
+class Turning(Line):
+    """The line on a circle, whose position is wrapped at the end of every interval."""
+
+    states = (Signal(symbol="x", name="position", unit="rad", low=-math.pi, high=math.pi, periodic=True),)
+    own_scheme = True
+
+    def advance(self, t, state, applied, exogenous, closure):
+        return self.states[0].wrapped(super().advance(t, state, applied, exogenous, closure))
+
+
+def test_a_push_across_the_seam_of_an_angle_goes_the_short_way():
+    """The first part ends half a turn from zero and 0.05 rad beyond, the second begins 0.05 rad before that place."""
+    plant = Turning()
+    sensors = sensors_of(plant, ["position"])
+    values = 3.13 - 0.5 + 0.5 * TIMES[: 2 * LENGTH + 1]
+    record = sensor_record(plant, sensors, line_segment(plant.states[0].wrapped(values)))
+    task = Estimation(DigitalTwin(plant, Slope()), sensors, process=torch.tensor([0.01]).double())
+    likelihood = task.likelihood(chained(record, LENGTH, 0.1))
+    with torch.no_grad():
+        likelihood.initial.offsets[0] = 0.05 / likelihood.initial.unit
+    (push,) = likelihood.pushes()
+    assert push.values.item() == pytest.approx(-5.0)
 
 
 def test_drifting_weights_are_followed_as_by_a_kalman_filter():

@@ -226,7 +226,7 @@ class Likelihood:
             if not record.follows:
                 continue
             (s, S), (before, S_before) = states[number], states[number - 1]
-            values = (s[0] - before[1]) / self.process
+            values = differences(self.plant.states, s[0], before[1]) / self.process
             own, places = S[0][:, self._shown :], self._places(number)
             rest = self._places(number - 1)
             jacobian = torch.cat([-S_before[1], own], -1) / self.process[:, None]
