@@ -15,7 +15,7 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.identification.estimation import Estimation, EstimationConfig
 from rt_torchrl.identification.first_values import first_noise
 from rt_torchrl.identification.sensor_record import sensor_record, usual_initial_state
-from rt_torchrl.identification.sensors import Sensor, read, sensors_of
+from rt_torchrl.identification.sensors import Sensor, known_sensors, read, read_slopes, sensors_of
 from rt_torchrl.plants.measurement import Measurement
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -136,6 +136,25 @@ def test_what_one_sensor_cannot_tell_is_said():
     assert "1 combination(s)" in message and "fix 1 of them" in message
     unknown = [name for name, error in found.uncertainty.standard_errors().items() if math.isinf(error)]
     assert unknown == ["matrix[0,0]", "matrix[1,0]", "matrix[1,1]"]
+
+
+def test_a_plants_own_sensor_of_a_state_reads_as_the_plant_says():
+    """A sensor of the position that saturates at half a metre, and one of the velocity that reads it as it is."""
+
+    class Saturating(LinearQuadratic):
+        position, velocity = LinearQuadratic.states
+        measurements = (
+            Measurement.of(position, lambda plant, t, state, exogenous: state[..., 0].clamp(-0.5, 0.5)),
+            Measurement.of(velocity),
+        )
+
+    plant = Saturating()
+    sensors, states = sensors_of(plant, ["position", "velocity"]), torch.tensor([[2.0, 3.0], [0.25, 4.0]]).double()
+    given = plant, torch.zeros(2).double(), states, torch.zeros(2, 1).double()
+    assert read(sensors, *given).tolist() == [[0.5, 3.0], [0.25, 4.0]]
+    slopes = read_slopes(sensors, plant, *(x[None] for x in given[1:]))
+    assert slopes[0, :, 0].tolist() == [[0.0, 0.0], [1.0, 0.0]]
+    assert list(known_sensors(plant)) == ["position", "velocity"]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement, Preview
+from rt_torchrl.plants.measurement import Component, Measurement, Named, Preview
 from rt_torchrl.plants.plant import Plant
 
 
@@ -51,7 +51,8 @@ class Sensor:
 def known_sensors(plant: Plant) -> dict[str, Sensor]:
     """A sensor for every signal of a plant that can be measured, by name: its states and its ``measurements``.
 
-    What drives the plant, its actions and inputs, is known and is no sensor.
+    A measurement with the name of a state is the sensor of that state, and reads it as the plant says. What drives the
+    plant, its actions and inputs, is known and is no sensor.
     """
     driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
     lacking = len(plant.states)  # states from here on are there only if they are asked for
@@ -67,7 +68,13 @@ def known_sensors(plant: Plant) -> dict[str, Sensor]:
         for k, signal in enumerate(plant.states)
         if signal.name not in driven
     }
-    return found | states
+    own = {name for name in found.keys() & states if not _reads_as_it_is(found[name], states[name])}
+    return found | {name: sensor for name, sensor in states.items() if name not in own}
+
+
+def _reads_as_it_is(own: Sensor, plain: Sensor) -> bool:
+    """Whether a plant's own measurement gives the state of its name as it is."""
+    return own.measurement.read in (plain.measurement.read, Named(plain.name))
 
 
 def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:

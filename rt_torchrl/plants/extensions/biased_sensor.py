@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.extensions.extension import Extension, OwnParameters
@@ -48,7 +48,8 @@ class BiasedSensor(Extension):
     r"""A plant with a sensor that reads y = s_i + b(t), with b(t) = b_0 + ḃt.
 
     The state s_i of the extended plant is what the sensor *reads*: policies and records hold the reading, while the
-    vector field and the cost of the plant get s_i − b. The hidden state holds b, so that the cost knows it.
+    vector field and the cost of the plant get s_i − b, and so do its end and its set points. The hidden state holds b,
+    so that the cost knows it.
 
     Args:
         base: the plant.
@@ -135,6 +136,15 @@ class BiasedSensor(Extension):
     def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
         read, hidden = self.split(states)
         return self.base.merit(self.true(read, hidden[..., 0]), applied, exogenous)
+
+    def ended(self, state: Float[Tensor, "*batch n_s"]) -> Bool[Tensor, "*batch"]:
+        """Whether the plant ends the episode in its true state."""
+        read, hidden = self.split(state)
+        return self.base.ended(self.true(read, hidden[..., 0]))
+
+    def setpoints(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
+        read, hidden = self.split(states)
+        return self.base.setpoints(self.true(read, hidden[..., 0]), applied, exogenous)
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 1"]:
         """The bias at the start as the true system has it; a twin's states hold its own from the first interval on."""
