@@ -17,6 +17,7 @@ from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import ROLES, judge
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import control_cost
 
 
@@ -64,6 +65,33 @@ def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
     judged = judge(unseen, dict.fromkeys(ROLES, unseen.fly(affine)), {"PD": PD(plant)})["PD"]
     own = PD(plant).fly(unseen.initial_state, unseen.exogenous, worn)
     assert torch.equal(judged.control_costs, control_cost(plant, own))
+
+
+class Wild(ClassicalController):
+    """A law that asks for what is no number."""
+
+    def act(self, state, memory):
+        return torch.nan * state[:, :1], memory
+
+
+def test_a_flight_that_diverges_is_refused():
+    plant = LinearQuadratic(horizon=3.0)
+    with pytest.raises(DivergenceError, match=r"diverged .* at t = 0.1 s: .* LinearClosure and Wild"):
+        Wild(plant).fly(*episodes(plant))
+    with pytest.raises(DivergenceError, match="gains that hold the system"):
+        PD(plant).fly(*episodes(plant), LinearClosure(torch.full((2, 2), 1e9)))
+    worse = LinearQuadratic(horizon=3.0)
+    worse.closure = LinearClosure(torch.full((2, 2), 1e9))
+    assert tune(PD(plant), *episodes(plant), evaluations=2, plant=worse).start == torch.inf
+
+
+def test_a_baseline_that_diverges_does_not_take_the_results():
+    plant = LinearQuadratic(horizon=3.0)
+    unseen = UnseenEpisodes(plant, 4)
+    affine = SaturatedAffine(2, plant.actions, generator=torch.Generator().manual_seed(0))
+    with pytest.warns(UserWarning, match="baseline 'wild' is left out of the results: .* diverged"):
+        found = judge(unseen, dict.fromkeys(ROLES, unseen.fly(affine)), {"wild": Wild(plant), "PD": PD(plant)})
+    assert list(found) == [*ROLES, "PD"]
 
 
 COMPARISON = """

@@ -9,9 +9,11 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.rollout import drive_of
+from rt_torchrl.trajectories.rollout import drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import RememberingInterval
 from rt_torchrl.trajectories.trajectory import Trajectory
+
+REMEDY = "Use a smaller dt, or gains that hold the system."
 
 
 class ClassicalController(nn.Module, ABC):
@@ -105,12 +107,16 @@ class ClassicalController(nn.Module, ABC):
             closure: closure of the system; None for that of its plant.
             plant: physics of the system, such as a twin's, or a real one that has more states than sensors read; None
                 for the controller's own plant.
+
+        Raises:
+            DivergenceError: if the system diverges.
         """
         plant = self.plant if plant is None else plant
         loop = RememberingInterval(plant, plant.closure if closure is None else closure, self)
         start = torch.cat([initial_state, self.first_memory(initial_state[..., : len(plant.readings)])], -1)
         drive = drive_of(plant, exogenous, None)
         carries = torch.cat([start.unsqueeze(0), self._engine.end_states(loop, start, drive)])
+        require_finite(plant, carries[1:, :, : len(plant.states)], initial_state, [loop.closure, self], remedy=REMEDY)
         states = carries[..., : len(plant.states)].transpose(0, 1)
         command = loop.command(carries[:-1], drive).transpose(0, 1)
         return Trajectory(states, plant.actuate(states[:, :-1], command), exogenous)

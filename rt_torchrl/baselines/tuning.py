@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import control_cost
 
 
@@ -55,8 +56,10 @@ def tune(
     @torch.no_grad()
     def cost(log_gains: np.ndarray) -> float:
         controller.log_gains.copy_(torch.as_tensor(log_gains, device=controller.log_gains.device))
-        value = control_cost(system, controller.fly(initial_state, exogenous, plant=system)).mean().item()
-        # A flight that leaves the finite numbers is worse than any other.
+        try:
+            value = control_cost(system, controller.fly(initial_state, exogenous, plant=system)).mean().item()
+        except DivergenceError:
+            return np.inf  # a flight that leaves the finite numbers is worse than any other
         return value if np.isfinite(value) else np.inf
 
     first = controller.log_gains.detach().cpu().numpy().copy()

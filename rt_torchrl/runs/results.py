@@ -1,5 +1,6 @@
 """The results of a run in numbers, as ``metrics.json`` holds them."""
 
+import warnings
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extensions.extension import ExtendedClosure
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -55,10 +57,15 @@ def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: di
     Args:
         unseen: unseen episodes on the real system as it is now.
         flights: flights of both policies on these episodes.
-        baselines: controllers to compare the policies with, by name.
+        baselines: controllers to compare the policies with, by name; one under which the system diverges is left out.
     """
     judged: dict[str, Judged] = {role: unseen.judge(flights[role]) for role in ROLES}
-    return judged | {name: unseen.judge(unseen.fly_baseline(law)) for name, law in baselines.items()}
+    for name, law in baselines.items():
+        try:
+            judged[name] = unseen.judge(unseen.fly_baseline(law))
+        except DivergenceError as error:  # a controller to compare with must not take the results of a training
+            warnings.warn(f"baseline {name!r} is left out of the results: {error}", stacklevel=2)
+    return judged
 
 
 @torch.no_grad()

@@ -205,7 +205,8 @@ class Run:
             if self.config.figures:
                 bar.doing("drawing the figures")
                 live = self.algorithm.referee.live
-                flown = first_flights(self.unseen, live, self.algorithm.policies[live], self.baselines)
+                laws = {name: law for name, law in self.baselines.items() if name in judged}
+                flown = first_flights(self.unseen, live, self.algorithm.policies[live], laws)
                 unseen = {"unseen": figures.unseen(judged, self.unseen.categories())}
                 images = self.drawing.save(self._snapshot(), self.folder / "figures", first=flown, last=unseen)
                 dashboard.images(images, len(self.episodes) - 1)
