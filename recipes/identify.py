@@ -32,7 +32,7 @@ from rt_torchrl.identification.column import Column
 from rt_torchrl.identification.estimate_table import metrics_of_sensors, table_of_sensors, weight_lines
 from rt_torchrl.identification.identification import Identified, held_back, measured_states
 from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
-from rt_torchrl.identification.resampling import Resampled, hold_out, resample
+from rt_torchrl.identification.resampling import ROUNDING, Resampled, hold_out, resample
 from rt_torchrl.identification.sensor_identification import identify
 from rt_torchrl.identification.sensor_log import SensorLog, checked
 from rt_torchrl.identification.sensors import with_biases
@@ -221,7 +221,11 @@ def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
         f"{rows} rows, {parts.interval:g} s apart (scatter {parts.jitter:.1%}), resampled to {sum(steps)} intervals of "
         f"{plant.dt:g} s in {len(steps)} segments"
     ]
-    lines += [f"  gap from {first:g} to {last:g} s (limit {parts.gap:g} s)" for first, last in parts.gaps]
+    lines += [
+        f"  gap from {first:g} to {last:g} s "
+        + (f"(limit {parts.gap:g} s)" if last - first > parts.gap * (1.0 + ROUNDING) else "of rows left out")
+        for first, last in parts.gaps
+    ]
     lines += [f"  left out as too short: {first:g} to {last:g} s" for first, last in parts.too_short]
     return "\n".join(lines)
 
