@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
 CURVATURE = torch.tensor([1.0, 4.0, 10.0], dtype=torch.float64)
@@ -245,3 +246,45 @@ def test_halving_a_step_of_adam_by_hand():
 def test_wrong_parameters_are_refused(change, unchecked):
     with pytest.raises(ValueError, match=next(iter(change))):
         DescentConfig(**change)
+
+
+@pytest.mark.parametrize("offset", [-10.0, -4.0, 10.0])
+@pytest.mark.parametrize("optimiser, rate", [("lbfgs", 1.0), ("adam", 0.1)])
+def test_a_cost_of_any_sign_descends(optimiser, rate, offset):
+    """(w − 1)² + c from w = 3 has its minimum c at 1; with c = −4 it starts at zero."""
+    point = Point((3.0, 3.0, 3.0))
+    config = DescentConfig(optimiser=optimiser, rate=rate)
+    found = Descent(point, config).run(lambda: (point.at[0] - 1.0) ** 2 + offset, 200)
+    assert found.start == pytest.approx(4.0 + offset, abs=1e-14)
+    # L-BFGS stops at a change of the relative cost below 1e-9, Adam circles within a fraction of its step of 0.1.
+    assert point.at[0].item() == pytest.approx(1.0, abs=0.01)
+    assert found.best == pytest.approx(offset, abs=1e-4)
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_a_negative_cost_has_no_share_below_which_a_run_stops(optimiser):
+    point = Point()
+    config = DescentConfig(optimiser=optimiser, rate=0.1)
+    found = Descent(point, config).run(Bowl(point, offset=-20.0), 300, stop_below=0.5)
+    assert found.start == -10.25 and found.best == pytest.approx(-20.0, abs=0.01)
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_the_gradient_at_which_a_run_stops_is_counted(optimiser):
+    point = Point()
+    cost = Bowl(point)
+    found = Descent(point, DescentConfig(optimiser=optimiser, rate=0.1)).run(cost, 500, stop_below=0.25)
+    assert found.iterations == cost.with_gradient == len(cost.seen)
+
+
+@pytest.mark.parametrize("stop_below", [0.0, 0.5])
+def test_newton_steps_take_a_negative_cost_to_its_minimum(stop_below):
+    """They end where a step promises less than 1e-4 of the cost."""
+    point = Point()
+    cost = Bowl(point, offset=-20.0)
+
+    def equations():
+        return NormalEquations(cost(), CURVATURE * (point.at - MINIMUM), torch.diag(CURVATURE))
+
+    found = LevenbergMarquardt(point).run(equations, 30, stop_below=stop_below)
+    assert found.start == -10.25 and found.best == pytest.approx(-20.0, abs=0.01)

@@ -119,7 +119,8 @@ class Descent:
         Args:
             cost: function that returns the scalar cost at the module's present weights; it stays the same in a run.
             iterations: number of gradients; 0 does nothing.
-            stop_below: share of the first cost below which the run stops early; 0 never stops it.
+            stop_below: share of the first cost below which the run stops early; 0 never stops it, and neither does
+                any share of a first cost that is not positive.
 
         Raises:
             FloatingPointError: if the cost diverges at the weights that the descent starts from.
@@ -211,8 +212,8 @@ class _Seen:
         if self.count == 0:
             self.gradient = norm * (abs(self.start) or 1.0)
         self._sound = [w.detach().clone() for w in self._weights]
-        self._note(cost)
         self.count += 1
+        self._note(cost)
         return relative
 
     def or_infinite(self) -> Tensor:
@@ -249,7 +250,7 @@ class _Seen:
             value = cost.item()
             if self.count == 0:
                 self.start = value
-            # A cost that starts at zero is at its minimum; its gradient is zero too.
+            # A cost that starts at zero is no unit for later ones, which then keep their own.
             relative = cost / (abs(self.start) or 1.0)
             relative.backward()
         weights = [w for w in self._module.parameters() if w.grad is not None]
@@ -276,5 +277,6 @@ class _Seen:
     def _note(self, cost: float) -> None:
         if cost < self.best or math.isnan(self.best):
             self.best, self.best_weights = cost, copy.deepcopy(self._module.state_dict())
-        if cost < self._stop_below * self.start:
+        least = self._stop_below * self.start
+        if cost < least and least > 0.0:  # a cost that starts at or below zero has no shares
             raise _Finished

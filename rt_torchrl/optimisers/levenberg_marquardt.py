@@ -70,15 +70,16 @@ class LevenbergMarquardt:
         Args:
             equations: function that returns the equations at the module's present weights.
             iterations: number of trial steps; 0 does nothing.
-            stop_below: share of the first cost below which the run stops early; 0 never stops it.
+            stop_below: share of the first cost below which the run stops early; 0 never stops it, and neither does
+                any share of a first cost that is not positive.
         """
         if iterations == 0:
             return Descended(float("nan"), float("nan"), float("nan"), 0)
         weights = [w for w in self.module.parameters() if w.requires_grad]
         current = equations()
         start, gradient, count = current.cost.item(), current.gradient.norm().item(), 0
-        scale, growth = torch.zeros_like(current.gradient), 2.0
-        while count < iterations and not current.cost < stop_below * start:
+        scale, growth, least = torch.zeros_like(current.gradient), 2.0, stop_below * start
+        while count < iterations and not (current.cost < least and least > 0.0):
             safe_point()
             if self._arrived(current):
                 break
@@ -102,7 +103,7 @@ class LevenbergMarquardt:
         if not current.gradient.any():
             return True  # where the record shows no weight, the matrix may be singular
         newton = _step(current, self.least_damping, current.matrix.diagonal())
-        little = promised(current, newton) <= self.tolerance * current.cost
+        little = promised(current, newton) <= self.tolerance * current.cost.abs()
         return bool(little or newton.abs().max() < self.least_step)
 
     def _limited_step(self, current: NormalEquations, scale: Tensor) -> tuple[Tensor, float]:
