@@ -92,7 +92,8 @@ def test_numbers_that_differ_are_refused():
     "real, predicted, d",
     [
         (2.0, 1.0, math.log(2.0)),
-        (-1.0, -2.0, -math.log(2.0)),
+        (-1.0, -2.0, 0.0),
+        (1.0, -2.0, 0.0),
         (1.0, math.inf, LARGEST),
         (1.0, 0.0, 0.0),
         (1e9, 1.0, LARGEST),
@@ -130,6 +131,8 @@ KNOWN, UNKNOWN, ALIKE = Belief(0.0, 0.03), Belief(0.0, 0.5), Belief(0.0, 0.0)
         (-1.0, 1.0, KNOWN, "keep"),
         (1.0, 1.0, ALIKE, "keep"),
         (1.0, 0.9, ALIKE, "swap"),
+        (-1.0, -2.0, KNOWN, "swap"),
+        (-2.0, -1.0, UNKNOWN, "keep"),
     ],
 )
 def test_who_acts_follows_from_what_is_at_stake(live, idle, difference, event):

@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from test_algorithm import twinning
@@ -93,6 +94,24 @@ def test_episodes_fly_again_where_the_twin_or_they_are_new():
     assert virtual.flights == 2
     flown(1.0, found=found).differences(virtual)
     assert virtual.flights == 5
+
+
+class Profit(LinearQuadratic):
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(t, state, applied, exogenous) - 100.0
+
+
+@pytest.mark.parametrize("arm", ["twinning", "model_based"])
+def test_a_real_episode_of_negative_cost_is_refused_where_a_twin_says_what_it_costs(arm):
+    found = twinning(Profit(horizon=2.0), arm=arm)
+    with pytest.raises(
+        ValueError, match=r"J_a=-\d+.* of a real episode of plant 'linear_quadratic' is negative.* add a constant"
+    ):
+        found.episode()
+
+
+def test_without_a_twin_costs_may_be_negative():
+    assert twinning(Profit(horizon=2.0), arm="model_free").episode()["real_cost"] < 0.0
 
 
 def test_a_saved_record_goes_on_alike():

@@ -110,6 +110,9 @@ class TrackRecord:
         """The paired differences of all episodes that are kept, but not of state feedback, whose flights are long.
 
         The episodes are flown again only where the twin has changed.
+
+        Raises:
+            ValueError: if the cost of one is negative, because differences are logs of the ratio of two costs.
         """
         state = virtual.twin.state_dict()
         if self._found is None or not equal(state, self._found[0]):
@@ -122,6 +125,13 @@ class TrackRecord:
             for part in (self._flown[:-LATEST], self._flown[-LATEST:])
         )
         flown = [*earlier, *latest]
+        negative = next((one.cost for one in flown if one.cost < 0.0), None)
+        if negative is not None:
+            raise ValueError(
+                f"J_a={negative:.4g} of a real episode of plant {virtual.twin.plant.name!r} is negative; a training "
+                "with a twin compares costs by their ratio. Let running_cost and terminal_cost of the plant add a "
+                "constant that keeps them positive, or penalise squares of errors; arm='model_free' takes any cost."
+            )
         pairs = [difference(one.cost, self._predicted(one, virtual)) for one in flown]
         explored = [one.exploration for one in flown]
         return Differences([self._policy(one) for one in flown], pairs, explored, flown, len(earlier))

@@ -134,11 +134,11 @@ class PairedDifferences:
 def difference(real: float, predicted: float) -> float:
     """The paired difference d of an episode, within ±LARGEST; LARGEST if the twin diverges, although nothing did.
 
-    Costs of one sign have a ratio; of others, as near a perfect one, the difference is taken as zero.
+    Costs above zero have a ratio; of others, as of a perfect one, the difference is taken as zero.
     """
     if not math.isfinite(predicted):
         return LARGEST
-    if not real * predicted > 0.0:
+    if not (real > 0.0 and predicted > 0.0):
         return 0.0
     return max(-LARGEST, min(LARGEST, math.log(real / predicted)))
 

@@ -105,7 +105,7 @@ class ShortHorizon:
         batch, count = len(exogenous), exogenous.shape[1] // n
         with torch.no_grad():
             flown = self.twin.control(self.learner, initial_state, exogenous)
-        self.reference = self.reference or control_cost(plant, flown).mean().item() or 1.0
+        self.reference = self.reference or abs(control_cost(plant, flown).mean().item()) or 1.0
         inputs = exogenous[:, : count * n].unflatten(1, (count, n))
         rows, norms = torch.arange(batch, device=exogenous.device), []
         over = self._over(flown.states[:, : count * n : n])

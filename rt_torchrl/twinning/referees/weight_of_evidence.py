@@ -61,7 +61,7 @@ def stakes(evidence: Evidence) -> tuple[float, float]:
         return 0.0, math.inf
     if not math.isfinite(evidence.live_cost):
         return math.inf, 0.0
-    if not evidence.live_cost * evidence.idle_cost > 0.0:  # costs of two signs have no ratio
+    if not (evidence.live_cost > 0.0 and evidence.idle_cost > 0.0):  # others have no ratio that says how much dearer
         better = evidence.idle_cost < evidence.live_cost
         return float(better), float(not better)
     error = evidence.difference()
