@@ -140,7 +140,7 @@ METHODS = [
 def test_a_fit_begins_anew_where_the_present_closure_diverges_on_the_record(assimilation):
     found = twinning(assimilation=assimilation)
     found.episode()
-    first = found.assimilation._first
+    first = found.assimilation.first
     with torch.no_grad():
         for weight in found.twin.closure.parameters():
             weight.fill_(1e3)
@@ -157,7 +157,7 @@ def test_a_twin_that_diverges_under_its_first_closure_too_says_so_and_keeps_what
     with torch.no_grad():
         for weight in found.twin.closure.parameters():
             weight.fill_(1e3)
-    found.assimilation._first = {name: torch.full_like(w, 1e4) for name, w in found.assimilation._first.items()}
+    found.assimilation.first = {name: torch.full_like(w, 1e4) for name, w in found.assimilation.first.items()}
     report = found.assimilate()
     assert report["J_p_before"].isinf() and report["J_p"].isinf()
     assert all((weight == 1e3).all() for weight in found.twin.closure.parameters())

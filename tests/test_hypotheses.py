@@ -346,7 +346,7 @@ def test_the_twin_alone_rests_where_it_explains_nothing(monkeypatch, always):
 
 def test_a_twin_that_diverges_leaves_the_hypotheses_out():
     """The step diverges for as long as a hypothesis counts."""
-    twin, _ = ensemble(PLANT)
+    twin, assimilation = ensemble(PLANT)
     twin.weights = {"late": 1.0}
     policy, weights = LinearGain([[1.0, 1.0]]), []
     generator = torch.Generator()
@@ -358,7 +358,7 @@ def test_a_twin_that_diverges_leaves_the_hypotheses_out():
             raise DivergenceError("late diverges")
         return findings()
 
-    report = EarlierClosure(twin, policy, planner, generator).sound(step)
+    report = EarlierClosure(twin, policy, planner, generator, assimilation).sound(step)
     assert weights == [{"late": 1.0}, {ALONE: 1.0}] and report["closure_refused"] == 1.0
     assert report["reason"] == "closure refused: late diverges" and "alarm" not in report
 

@@ -1,5 +1,6 @@
 """Closures with a perceptron in them: their start, the bounds that keep their physics, their identification."""
 
+import copy
 import importlib.util
 import sys
 from pathlib import Path
@@ -174,6 +175,24 @@ def test_a_prior_pulls_the_perceptron_against_the_record():
         # left to gain, some hundredths of the gradient.
         assert (found.gradient + prior * away).norm() <= 0.1 * found.gradient.norm()
     assert moved[0] > moved[1] > moved[2] > 0.0
+
+
+def test_a_prior_pulls_to_the_closure_that_a_training_begins_with_and_goes_on_doing_so():
+    """A stiff prior leaves a perceptron where it is: at the weights of an earlier training, not at random ones."""
+    plant = LinearQuadratic(horizon=4.0, noise=0.0)
+    twin, flown, exogenous = recorded(plant, batch=1)
+    record, config = flown.each()[0], AssimilationConfig(prior=1e9, inputs="record", method="levenberg_marquardt")
+    first = Assimilation(DigitalTwin(plant, Corrected(twin.closure)), config)
+    for weight in first.twin.closure.correction.parameters():
+        torch.nn.init.constant_(weight, 0.3)
+    first.begin()
+    again = Assimilation(DigitalTwin(plant, Corrected(copy.deepcopy(twin.closure))), config)
+    again.twin.closure.load_state_dict(first.twin.closure.state_dict())
+    again.load_state_dict(copy.deepcopy(first.state_dict()))
+    for assimilation in (first, again):
+        assimilation.update([record], [], 1, seeded())
+        for weight in assimilation.twin.closure.correction.parameters():
+            torch.testing.assert_close(weight, torch.full_like(weight, 0.3), rtol=0, atol=1e-4)
 
 
 def test_a_prior_leaves_the_law_free():

@@ -23,10 +23,12 @@ from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.cloning import clones
 from rt_torchrl.twinning.distillation import DistillationConfig
+from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.planners import PlannerConfig
@@ -83,6 +85,36 @@ def test_weights_of_a_run_are_taken_as_they_are(earlier, tmp_path):
     assert not len(found.start()) and found.referee.live == live_of(earlier)
     assert all(clones(policy, known.policy(role)) for role, policy in found.policies.items())
     assert torch.equal(found.twin.closure.matrix, known.closure.matrix) and not found.short_term
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_twin_that_diverges_falls_back_to_the_closure_that_the_training_started_with(earlier, tmp_path, resumed):
+    options = {"start": str(earlier), "model_free_policy": "mlp", "hidden": (6,)}
+    run, first = training(tmp_path, episodes=1, **options), load_run(earlier).closure.matrix.detach()
+    if resumed:
+        run.train()
+        run = training(tmp_path, resume=True, **options)
+        assert not torch.equal(run.algorithm.twin.closure.matrix, first)
+    else:
+        run.algorithm.start()
+    found = run.algorithm
+    closure, outcomes = found.twin.closure, [DivergenceError("the twin diverged"), findings()]
+
+    def step():
+        outcome = outcomes.pop(0)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    torch.nn.init.constant_(closure.matrix, 1e300)
+    assert found.earlier.sound(step)["closure_refused"] == 1.0
+    assert torch.equal(closure.matrix, first)
+    # In step 4, too: of a descent of one gradient the weights stay that it begins with.
+    torch.nn.init.constant_(closure.matrix, 1e3)
+    found.assimilation.config = dataclasses.replace(found.assimilation.config, iterations=1)
+    record = found.flights.fly_first(found.policies["model_based"]).record
+    assert found.assimilation.update([record], (), 1, torch.Generator()).start == torch.inf
+    assert torch.equal(closure.matrix, first)
 
 
 def test_a_policy_that_ended_on_trial_does_not_act_first(earlier, tmp_path):

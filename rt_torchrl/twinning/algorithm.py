@@ -106,7 +106,7 @@ class ReinforcementTwinning:
         self.flights = RealFlights(env, self.actor, lambda: self.collector.rollout(), twin.plant, config.least_sound)
         self.operating = Operating(env, self) if isinstance(env, Operation) else None
         self.episodes_done = 0
-        self.earlier = EarlierClosure(twin, model_based, self.planner, generator)
+        self.earlier = EarlierClosure(twin, model_based, self.planner, generator, self.assimilation)
 
     @property
     def judged(self) -> int:
@@ -142,6 +142,7 @@ class ReinforcementTwinning:
         """Before the first episode, twin and policies learn what ``first`` knows (paper: random weights)."""
         assert self.first is not None
         pupils = self.first.take(self.policies, self.twin.closure)
+        self.assimilation.begin()
         for part in (self.learner, self.planner):
             part.restart()
         if not pupils:

@@ -147,9 +147,17 @@ class Assimilation:
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
         self.second_order = LevenbergMarquardt(twin.closure)
-        device = next((x.device for x in twin.plant.buffers()), "cpu")
-        self.prior = WeightPrior(twin.closure, config.prior, device=device)
-        self._first = copy.deepcopy(twin.closure.state_dict())
+        self.begin()
+
+    def begin(self) -> None:
+        """Take the present closure for the ``first`` one, to which a twin that diverges goes back.
+
+        The prior holds perceptrons at its weights. A training that goes on from an earlier one begins with the closure
+        of that, which is not yet known when this object is made.
+        """
+        self.first = copy.deepcopy(self.twin.closure.state_dict())
+        device = next((x.device for x in self.twin.plant.buffers()), "cpu")
+        self.prior = WeightPrior(self.twin.closure, self.config.prior, device=device)
 
     def update(
         self,
@@ -193,7 +201,7 @@ class Assimilation:
         with contextlib.suppress(FloatingPointError):
             return self._descend(replayed)
         self.descent.restart()
-        self.twin.closure.load_state_dict(self._first)
+        self.twin.closure.load_state_dict(self.first)
         with contextlib.suppress(FloatingPointError):
             return self._descend(replayed)._replace(start=math.inf)
         self.twin.closure.load_state_dict(present)
@@ -226,7 +234,7 @@ class Assimilation:
         generator = torch.Generator().manual_seed(0)
         least, best = found.best, copy.deepcopy(closure.state_dict())
         for number in range(1, self.config.starts):
-            closure.load_state_dict(self._first if number % 2 else best)
+            closure.load_state_dict(self.first if number % 2 else best)
             if number > 1:
                 move(closure, generator)
             with contextlib.suppress(FloatingPointError):  # weights drawn at random may be nonsense
@@ -293,8 +301,14 @@ class Assimilation:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return {"descent": self.descent.state_dict(), "damping": self.second_order.damping}
+        return {"descent": self.descent.state_dict(), "damping": self.second_order.damping, "first": self.first}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.descent.load_state_dict(state["descent"])
         self.second_order.damping = state["damping"]
+        if "first" in state:  # earlier versions did not save it
+            closure = self.twin.closure
+            present = copy.deepcopy(closure.state_dict())
+            closure.load_state_dict(state["first"])
+            self.begin()
+            closure.load_state_dict(present)

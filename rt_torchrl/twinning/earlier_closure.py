@@ -10,6 +10,7 @@ from torch import nn
 
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.planners import Planner
 
@@ -22,12 +23,20 @@ class EarlierClosure:
         model_based: policy that is planned on the twin.
         planner: planner of that policy.
         generator: source of the draws of steps 5 and 6.
+        assimilation: step 4, which knows the first closure.
     """
 
-    def __init__(self, twin: DigitalTwin, model_based: nn.Module, planner: Planner, generator: torch.Generator):
+    def __init__(
+        self,
+        twin: DigitalTwin,
+        model_based: nn.Module,
+        planner: Planner,
+        generator: torch.Generator,
+        assimilation: Assimilation,
+    ):
         self.twin, self.model_based, self.planner, self.generator = twin, model_based, planner, generator
+        self.assimilation = assimilation
         self._closure: dict[str, Any] | None = None
-        self._first = copy.deepcopy(twin.closure.state_dict())
 
     def remember(self) -> None:
         """Keep the present closure."""
@@ -50,7 +59,7 @@ class EarlierClosure:
         except DivergenceError as error:
             found = error
         refused = f"closure refused: {found}"
-        for closure in filter(None, (self._closure, self._first)):
+        for closure in filter(None, (self._closure, self.assimilation.first)):
             self.model_based.load_state_dict(policy)  # state feedback holds the refused closure too
             self.twin.closure.load_state_dict(closure)
             self._closure = None

@@ -135,12 +135,13 @@ class Fit:
     def state_dict(self) -> dict[str, Any]:
         stages = {name: stage.state_dict() for name, stage in self.stages.items()}
         counters = {"least": self.least, **self.turns.state_dict()}
-        return counters | {"closure": self.twin.closure.state_dict(), **stages}
+        return counters | {"closure": self.twin.closure.state_dict(), "first": self._first, **stages}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.least = state["least"]
         self.turns.load_state_dict(state)
         self.twin.closure.load_state_dict(state["closure"])
+        self._first = state.get("first", self._first)  # earlier versions did not save it
         for name, stage in self.stages.items():
             stage.load_state_dict(state[name])
 
