@@ -14,7 +14,12 @@ from rt_torchrl.plants.state_bounds import StateBounds
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.twinning.exogenous import ExogenousConfig
+from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.planners import Constraints, ConstraintsConfig, WholeEpisodes
+from rt_torchrl.twinning.planning import Planning
+from rt_torchrl.twinning.track_record import TrackRecord
+from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 POSITION = {"position": (-1.0, 3.0)}
 
@@ -67,6 +72,16 @@ def from_rest_at(*positions):
     return Scenario(start, torch.zeros(len(positions), 40, 1, dtype=torch.float64))
 
 
+JUDGEMENT = Judgement(lambda cost, than: not cost <= than, TrackRecord({}))
+
+
+def judged(planner):
+    """Step 5 with this planner."""
+    virtual = VirtualEpisodes(planner.twin, ExogenousConfig(), 1, generator=torch.Generator().manual_seed(0))
+    virtual.judge_by(planner.constraints, 0)
+    return Planning(planner, virtual, planner.config)
+
+
 def test_plans_come_to_keep_bounds_that_the_cheapest_plan_leaves():
     episodes = from_rest_at(-1.2, -0.6, 0.8, 1.2)
 
@@ -76,8 +91,9 @@ def test_plans_come_to_keep_bounds_that_the_cheapest_plan_leaves():
     free, softly, bound = planner_of("penalty", 1e-9), planner_of("penalty"), planner_of("augmented_lagrangian")
     free.plan(episodes)
     softly.plan(episodes)
-    for _ in range(8):
-        bound.plan(episodes)
+    steps = judged(bound)
+    for episode in range(1, 9):
+        steps.plan(episode, episodes, episodes, JUDGEMENT)
     assert fastest(free) > 0.75
     assert 0.6 < fastest(softly) < fastest(free)
     # A thousandth of the width beyond.
@@ -86,6 +102,40 @@ def test_plans_come_to_keep_bounds_that_the_cheapest_plan_leaves():
     other = planner_of("augmented_lagrangian")
     other.load_state_dict(bound.state_dict())
     assert other.constraints.multipliers == bound.constraints.multipliers and other.constraints.reference > 0.0
+
+
+def test_a_plan_and_the_policy_that_it_would_replace_have_the_same_price():
+    """A plan is not dearer than the policy it starts from, so that each stays, and the multiplier settles."""
+    planner, episodes = planner_of("augmented_lagrangian"), from_rest_at(-1.2, -0.6, 0.8, 1.2)
+    steps, multipliers = judged(planner), []
+    for episode in range(1, 13):
+        before = steps.virtual.price(planner.policy, episodes).item()
+        mu = list(planner.constraints.multipliers)
+        report = steps.plan(episode, episodes, episodes, JUDGEMENT)
+        raised, planner.constraints.multipliers = planner.constraints.multipliers, mu
+        assert report["plan_accepted"] == 1.0
+        assert steps.virtual.price(planner.policy, episodes).item() <= before
+        planner.constraints.multipliers = raised
+        multipliers += raised
+    assert multipliers == sorted(multipliers) and multipliers[-1] - multipliers[5] < 0.1 * multipliers[5]
+
+
+def test_what_is_refused_raises_no_multiplier():
+    """Where a plan and others from wild weights are refused, the policy that stays raises it as much as without."""
+    episodes, refusing = from_rest_at(-1.2, -0.6, 0.8, 1.2), JUDGEMENT._replace(worse=lambda cost, than: True)
+    raised = []
+    for iterations, others in ((0, ()), (40, ()), (40, (3.0, -0.05))):
+        planner = planner_of("augmented_lagrangian")
+        planner.policy.load_state_dict({"gain": torch.tensor([[0.5, 0.5]], dtype=torch.float64)})
+        steps, stays = judged(planner), planner.policy.gain.clone()
+        planner.config = dataclasses.replace(planner.config, iterations=iterations)
+        steps.others += [{"gain": torch.full((1, 2), gain, dtype=torch.float64)} for gain in others]
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr("rt_torchrl.twinning.planning.saves", lambda cost, of, share: False)
+            steps.plan(1, episodes, episodes, refusing)
+        assert torch.equal(planner.policy.gain, stays)
+        raised.append(planner.constraints.multipliers)
+    assert raised[0] == raised[1] == raised[2] and raised[0][0] > 0.0
 
 
 def test_a_planner_without_whole_episodes_is_refused():

@@ -1,9 +1,11 @@
 """Step 5: the planner's plan, which stays unless the referee finds it worse."""
 
+import contextlib
 import copy
 import math
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -80,8 +82,21 @@ class Planning:
         refuted = self._refuted(judgement)
         if refuted:
             found.update(findings(withheld=max(refuted, float(found.get("withheld", 0.0)))))
+        return merged(found, self._raised(planned_on))
+
+    @torch.no_grad()
+    def _raised(self, episodes: Scenario) -> TensorDict:
+        """Raise the multipliers by the excess of the policy that stays, once all plans of this episode are judged.
+
+        Plans and what they would replace are so compared at the same price. What a refused plan exceeds is no matter.
+        """
         constraints = self.virtual.constraints
-        return merged(found, findings(**constraints.report())) if constraints else found
+        if not constraints:
+            return findings()
+        # Further rounds may have drawn episodes in which the twin diverges: these say nothing of a bound.
+        with contextlib.suppress(FloatingPointError):
+            constraints.update(self.virtual.twin.control(self.planner.policy, *episodes))
+        return findings(**constraints.report())
 
     def _refuted(self, judgement: Judgement) -> float:
         """What flights of earlier weights refute, wherever the plan of this episode lies."""

@@ -6,9 +6,10 @@ augmented Lagrangian of Powell, Hestenes and Rockafellar and, with μ = 0, a pen
 .. math::
     J_a + J_0\sum_i\overline{\frac{\max(0, \mu_i + \rho g_i)^2}{2\rho}}
 
-with the mean over all intervals and episodes. After every plan :math:`\mu_i` grows by ρ times the mean excess where
-there is one: it is the common multiplier of a bound in all intervals. States within μ/ρ of a bound have a price, too,
-so that plans keep some distance from it. J_0 is the cost of the first policy that is priced.
+with the mean over all intervals and episodes. Once the plans of a real episode are judged, :math:`\mu_i` grows by ρ
+times the mean excess, where there is one, of the policy that stays: it is the common multiplier of a bound in all
+intervals. Until then it is the same for a plan and for the policy that the plan would replace. States within μ/ρ of a
+bound have a price, too, so that plans keep some distance from it. J_0 is the cost of the first policy that is priced.
 """
 
 from typing import Any
@@ -62,7 +63,7 @@ class Constraints:
 
     @torch.no_grad()
     def update(self, flown: Trajectory) -> None:
-        """Raise the multipliers of an augmented Lagrangian by the excess of a plan's trajectories."""
+        """Raise the multipliers of an augmented Lagrangian by the excess of trajectories of the policy that stays."""
         shares = self.bounds.shares(flown.states[:, 1:])
         self._excess = shares.mean((0, 1)).tolist()
         if self.config.method == "augmented_lagrangian":
@@ -71,7 +72,7 @@ class Constraints:
             self.multipliers = [mu + self.config.weight * excess for mu, excess in raised]
 
     def report(self) -> dict[str, float]:
-        """Mean excess of the last plan in shares of the width, and the multiplier, of each bounded state."""
+        """Mean excess of the policy that stays in shares of the width, and the multiplier, of each bounded state."""
         found = {f"excess/{name}": share for name, share in zip(self.bounds.names, self._excess, strict=True)}
         return found | {f"multiplier/{name}": mu for name, mu in zip(self.bounds.names, self.multipliers, strict=True)}
 

@@ -15,8 +15,9 @@ class ConstraintsConfig:
 
     Args:
         states: least and greatest value of states, by name, in their units; inf or -inf for no bound.
-        method: augmented_lagrangian for a price whose multipliers grow with every plan that leaves the bounds, until
-            plans keep them; penalty for a fixed price of the squared excess, which bends plans back but leaves some.
+        method: augmented_lagrangian for a price whose multipliers grow with every episode after whose plans the policy
+            leaves the bounds, until plans keep them; penalty for a fixed price of the squared excess, which bends plans
+            back but leaves some.
         weight: weight of the price, in units of J_a of the first policy that is planned.
 
     Raises:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from rt_torchrl.optimisers.descent import Descended, Descent, stuck
@@ -24,7 +23,7 @@ class WholeEpisodes:
         config: parameters of step 5.
 
     The attribute ``constraints`` prices what leaves the bounds of ``config.constraints``, in the plans and where the
-    algorithm compares policies on the twin.
+    algorithm compares policies on the twin. A plan leaves its multipliers as they are.
     """
 
     correction: Callable[[nn.Module], Tensor] | None = None
@@ -42,9 +41,6 @@ class WholeEpisodes:
         if self._stalled(found, limit):
             again = self.descent.run(lambda: self._cost(episodes, limit), self.config.iterations)
             found = found._replace(best=again.best, iterations=found.iterations + again.iterations)
-        if self.constraints:
-            with torch.no_grad():
-                self.constraints.update(self.twin.control(self.policy, *episodes))
         return found
 
     def _stalled(self, found: Descended, limit: float) -> bool:
