@@ -1,14 +1,16 @@
 """Step 2 by DDPG: isolated gradients, hand-computed TD errors, bootstrapping, targets."""
 
 import copy
+import re
 
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
 from tensordict import TensorDict
+from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.twinning.learners import DDPG, LearnerConfig
+from rt_torchrl.twinning.learners import DDPG, TD3, LearnerConfig
 from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
 from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory
 
@@ -20,10 +22,10 @@ def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def learner(seed=0, **options):
+def learner(seed=0, kind=DDPG, **options):
     plant = LinearQuadratic()
     options = {"discount": GAMMA, "critic_hidden": (16,), "batch_size": 32, **options}
-    return DDPG(plant, LinearGain([[0.2, 0.1]]), LearnerConfig(**options), generator=seeded(seed))
+    return kind(plant, LinearGain([[0.2, 0.1]]), LearnerConfig(**options), generator=seeded(seed))
 
 
 def explored(count, seed=0, spread=1.5):
@@ -75,6 +77,46 @@ def test_actor_loss_reaches_the_policy_alone_and_is_the_policy_gradient():
     expected = (slope * observation).mean(0, keepdim=True)
     # Step² times the third derivative, 1e-10, and rounding 1e-16/1e-5.
     torch.testing.assert_close(found.policy.gain.grad, expected, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [DDPG, TD3])
+@pytest.mark.parametrize("value", [float("nan"), -1e86])
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation"), ("next", "reward")])
+def test_a_transition_that_is_not_finite_is_refused_by_name(kind, key, value):
+    found, data = learner(kind=kind), explored(2)
+    before = copy.deepcopy(found.state_dict())
+    data[key][3, -1] = value
+    with pytest.raises(ValueError, match=re.escape(f"{key!r} of transition 3 is {value:g}")):
+        found.store(data)
+    assert not len(found.memory)
+    assert_equal(found.state_dict()["loss"], before["loss"])
+
+
+@pytest.mark.parametrize("update", ["explicit", "torchrl"])
+@pytest.mark.parametrize("kind", [DDPG, TD3])
+@pytest.mark.parametrize("rate", ["critic_rate", "actor_rate"])
+def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_said(kind, rate, update):
+    """A second step of 1e308 overflows."""
+    options = {rate: 1e308, "update": update, "critic_iterations": 6, "actor_iterations": 3}
+    found = learner(kind=kind, **options)
+    found.store(explored(20))
+    before = copy.deepcopy(found.state_dict()), copy.deepcopy(found.policy.state_dict())
+    report = found.update()
+    assert report["reason"].startswith("update of model_free taken back: ")
+    for name in ("loss", "critic_optimiser", "actor_optimiser"):
+        assert_equal(found.state_dict()[name], before[0][name])
+    assert_equal(found.policy.state_dict(), before[1])
+    # It can go on with other rates.
+    for optimiser in (found.critic_optimiser, found.actor_optimiser):
+        optimiser.param_groups[0]["lr"] = 1e-3
+    assert "reason" not in found.update() and not torch.equal(found.policy.gain, before[1]["gain"])
+
+
+def assert_equal(state, other):
+    """Two states hold the same numbers."""
+    (ours, structure), (its, its_structure) = tree_flatten(dict(state)), tree_flatten(dict(other))
+    assert structure == its_structure
+    assert all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b for a, b in zip(ours, its, strict=True))
 
 
 @pytest.mark.parametrize("done", [False, True])

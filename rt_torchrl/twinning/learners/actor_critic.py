@@ -1,7 +1,8 @@
 """The common part of learners with a critic: transitions with sums of rewards, prioritised memory, optimisers."""
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.utils._pytree import tree_flatten
 from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
 from torchrl.objectives import LossModule, SoftUpdate
@@ -17,7 +19,8 @@ from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.systems.refusal import finite_errors
+from rt_torchrl.systems.refusal import finite_errors, finite_transitions
+from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.learners.config import LearnerConfig
 from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory
 
@@ -132,9 +135,9 @@ class ActorCritic(ABC):
         """Keep the transitions of a real episode, with their TD errors as priorities.
 
         Raises:
-            ValueError: if a TD error is not finite, because the critic has diverged.
+            ValueError: if a number of the episode is not finite, or a TD error, because the critic has diverged.
         """
-        transitions = self.transitions(episode)
+        transitions = self.transitions(finite_transitions(episode.select(*TRANSITION)))
         self.memory.store(transitions, finite_errors(self.td_errors(transitions)))
 
     def transitions(self, episode: TensorDictBase) -> TensorDictBase:
@@ -160,6 +163,31 @@ class ActorCritic(ABC):
         r"""What comes after the last reward of an episode that ends early, :math:`-\gamma L_e/(1 - \gamma)`."""
         discount = self.config.discount
         return -discount * (self._end_cost or 0.0) / (1.0 - discount)
+
+    def sound(self, iterate: Callable[[], TensorDict]) -> TensorDict:
+        """Make the iterations of an update, and take them back if they end with numbers that are not finite.
+
+        Such weights would stay so for good, and with them all that is learned later.
+
+        Args:
+            iterate: function that makes the iterations and returns the report.
+
+        Returns:
+            The report, or the ``reason`` why the update was taken back.
+        """
+        parts = {"policy": self.policy} | {name: getattr(self, name) for name in UPDATED}
+        before = copy.deepcopy({name: part.state_dict() for name, part in parts.items()})
+        try:
+            found = iterate()
+            broken = [name for name, part in parts.items() if not finite(part.state_dict())]
+            if not broken:
+                return found
+            said = f"numbers of {' and '.join(broken)} are not finite"
+        except FloatingPointError as error:
+            said = str(error)
+        for name, part in parts.items():
+            part.load_state_dict(before[name])
+        return findings(f"update of model_free taken back: {said}; use smaller learning rates or reward_scale")
 
     @torch.no_grad()
     def td_errors(self, transitions: TensorDictBase) -> Float[Tensor, " n"]:
@@ -231,7 +259,14 @@ CRITIC_FINDINGS = {"critic_loss": 2, "td_error": 1, "critic_gradient": 0}
 """What :meth:`Iterations.critic_step` returns, and the power of the rewards' scale in it that a report leaves out."""
 ACTOR_FINDINGS = {"value": 1, "actor_gradient": 0}
 """The same of :meth:`Iterations.actor_step`."""
-COMPONENTS = ("loss", "critic_optimiser", "actor_optimiser", "memory")
+UPDATED = ("loss", "critic_optimiser", "actor_optimiser")
+COMPONENTS = (*UPDATED, "memory")
+
+
+def finite(state: Mapping[str, Any]) -> bool:
+    """Whether all numbers of a state are finite."""
+    tensors = (part for part in tree_flatten(dict(state))[0] if isinstance(part, Tensor))
+    return all(bool(part.isfinite().all()) for part in tensors)
 
 
 def means(critic: Sequence[tuple[Tensor, ...]], actor: Sequence[tuple[Tensor, ...]], scale: float) -> TensorDict:

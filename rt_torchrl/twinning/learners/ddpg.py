@@ -55,8 +55,12 @@ class DDPG(ActorCritic):
 
         Returns:
             Means of ``critic_loss``, ``td_error``, ``value`` and both gradient norms over the iterations; the first
-            three are for the rewards without ``reward_scale``.
+            three are for the rewards without ``reward_scale``. Of an update that leaves numbers that are not finite,
+            and so is taken back, the ``reason`` instead.
         """
+        return self.sound(self._iterate)
+
+    def _iterate(self) -> TensorDict:
         iterations, critic = iterations_of(self, DDPG, ExplicitDDPG), []
         for _ in range(self.config.critic_iterations):
             critic.append(iterations.critic_step())

@@ -80,9 +80,16 @@ class LongTermMemory:
         return self.transitions()["observation"]
 
     def refresh(self, index: Int[Tensor, " n"], td_errors: Float[Tensor, " n"]) -> None:
-        """Give sampled transitions their new TD errors δ."""
+        """Give sampled transitions their new TD errors δ.
+
+        Raises:
+            FloatingPointError: if one is not finite in single precision; none is then given.
+        """
         # A sampler with a generator draws in single precision.
-        self.sampler.renew(index.cpu(), td_errors.detach().float().cpu().abs())
+        errors = td_errors.detach().float().cpu().abs()
+        if not errors.isfinite().all():
+            raise FloatingPointError("a TD error is not finite")
+        self.sampler.renew(index.cpu(), errors)
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions in their places, and the leaves of the trees that sample them.

@@ -74,6 +74,9 @@ class TD3(ActorCritic):
         Returns:
             The same means as :meth:`DDPG.update <rt_torchrl.twinning.learners.ddpg.DDPG.update>`.
         """
+        return self.sound(self._iterate)
+
+    def _iterate(self) -> TensorDict:
         iterations, critic, actor = iterations_of(self, TD3, ExplicitTD3), [], []
         for iteration in range(1, self.config.critic_iterations + 1):
             critic.append(iterations.critic_step())
