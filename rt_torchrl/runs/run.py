@@ -15,7 +15,7 @@ from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline
-from rt_torchrl.evaluation.gradient_check import engine_gap
+from rt_torchrl.evaluation.gradient_check import engine_gap, require_agreement
 from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
@@ -190,8 +190,10 @@ class Run:
             # Model predictive control has no weights of its own whose gradient could be checked.
             checked: Role = "model_free" if self.config.twinning.planner.method == "receding_horizon" else "model_based"
             physics = self.algorithm.twin.plant
-            gap = engine_gap(physics, self.initial_closure, self.initial_policies[checked], self.unseen)
-            dashboard.scalar("gradient/relative gap of parallel to the reference engine, short horizon", gap)
+            engine = self.config.engine
+            gap = engine_gap(physics, self.initial_closure, self.initial_policies[checked], self.unseen, engine)
+            dashboard.scalar(f"gradient/relative gap of {engine} to autograd, short horizon", gap)
+            require_agreement(gap, engine, physics)
             self._all_episodes(dashboard, bar)
             if not self.episodes:
                 raise Interrupted("interrupted before the first episode was done; nothing to report.")
