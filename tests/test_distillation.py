@@ -65,6 +65,14 @@ def test_a_perceptron_learns_an_affine_law():
     assert costs[1] == pytest.approx(costs[0], rel=1e-2)
 
 
+def test_without_observations_of_the_real_system_the_clone_learns_from_the_twin():
+    live, idle = affine([-0.8, -1.1]), perceptron()
+    distillation = Distillation(DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), DistillationConfig())
+    found = distillation.imitate(live, idle, seen=torch.empty(0, 2, dtype=torch.float64), draw=draw)
+    # As near as with 300 observations of the real system beside those of the twin.
+    assert found < 5e-3
+
+
 def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
     """The best affine imitation, found here by trying its neighbours."""
     live, idle = perceptron(7), affine([0.0, 0.0])

@@ -123,6 +123,29 @@ def test_a_plan_that_diverges_is_refused_and_the_policy_before_stays(monkeypatch
     assert report["J_a_model_based"].isfinite()
 
 
+@pytest.mark.parametrize("closures", [0, 1])
+def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closures):
+    """Neither in the first plan, nor in that which repeats it with an earlier closure."""
+    found = twinning()
+    before, left = weights(found.policies["model_based"]), closures
+
+    def interrupted(episodes):
+        nonlocal left
+        torch.nn.init.zeros_(found.policies["model_based"].gain)
+        left -= 1
+        raise KeyboardInterrupt if left < 0 else DivergenceError("the twin diverged")
+
+    monkeypatch.setattr(found.planner, "plan", interrupted)
+
+    def unsound_twin(*arguments):
+        raise DivergenceError("the twin diverged under what has flown")
+
+    monkeypatch.setattr(found.track_record, "require_sound_twin", unsound_twin)
+    with pytest.raises(KeyboardInterrupt):
+        found.episode()
+    assert left == -1 and torch.equal(weights(found.policies["model_based"]), before)
+
+
 def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch):
     found = twinning()
     monkeypatch.setattr(found.referee, "worse", lambda cost, than: True)

@@ -51,6 +51,19 @@ def test_the_cheapest_of_all_is_found_and_the_policy_keeps_its_weights(monkeypat
     assert sent.best(4, EPISODES)["gain"][0, 0] == found != sent.best(8, EPISODES)["gain"][0, 0]
 
 
+def test_an_interrupt_leaves_the_policy_its_weights(monkeypatch):
+    policy = LinearGain([[3.0, 0.0]])
+
+    def interrupted(one, episodes):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(VIRTUAL, "price", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            scouts(policy).best(4, EPISODES)
+    assert said(policy) == 3.0
+
+
 def test_policies_of_another_architecture_are_refused():
     with pytest.raises(ValueError, match=r"scouts=8 draws random policies of the class LinearGain.*make_policy"):
         scouts(Other([[3.0, 0.0]]))

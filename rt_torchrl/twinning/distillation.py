@@ -134,7 +134,7 @@ class Distillation:
         return seen.reshape(-1, seen.shape[-1])
 
     def _thinned(self, values: Float[Tensor, "n width"]) -> Float[Tensor, "m width"]:
-        return values[:: -(-len(values) // self.config.samples)]
+        return values[:: max(1, -(-len(values) // self.config.samples))]  # of none, none is left
 
 
 def match_actions(

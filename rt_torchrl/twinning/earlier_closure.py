@@ -52,8 +52,18 @@ class EarlierClosure:
         system bends every closure that is fitted, but not the one that it began with.
 
         Where it diverges with the first closure too, the step is left out: the real system goes on.
+
+        An interrupt or another error gives π_mb its weights back: it may have those of a scout, or of half a plan.
         """
-        state, policy = self.generator.get_state(), copy.deepcopy(self.model_based.state_dict())
+        policy = copy.deepcopy(self.model_based.state_dict())
+        try:
+            return self._sound(step, policy)
+        except BaseException:
+            self.model_based.load_state_dict(policy)
+            raise
+
+    def _sound(self, step: Callable[[], TensorDict], policy: dict[str, Any]) -> TensorDict:
+        state = self.generator.get_state()
         try:
             return step()
         except DivergenceError as error:

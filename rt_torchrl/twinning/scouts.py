@@ -70,12 +70,14 @@ class Scouts:
         kept, generator = copy.deepcopy(self.policy.state_dict()), self._generator(episode)
         trained = {name for name, weight in self.policy.named_parameters() if weight.requires_grad}
         found: list[tuple[float, dict[str, Tensor]]] = []
-        for _ in range(self.count):
-            drawn = self.make_policy(generator).state_dict()
-            weights = {name: drawn[name] if name in trained else value for name, value in kept.items()}
-            self.policy.load_state_dict(weights)
-            found.append((self.virtual.price(self.policy, planned_on).item(), weights))
-        self.policy.load_state_dict(kept)
+        try:
+            for _ in range(self.count):
+                drawn = self.make_policy(generator).state_dict()
+                weights = {name: drawn[name] if name in trained else value for name, value in kept.items()}
+                self.policy.load_state_dict(weights)
+                found.append((self.virtual.price(self.policy, planned_on).item(), weights))
+        finally:
+            self.policy.load_state_dict(kept)
         return min(found, key=lambda each: each[0])[1]
 
     def _generator(self, episode: int) -> torch.Generator:

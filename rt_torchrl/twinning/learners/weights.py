@@ -60,7 +60,9 @@ def change_of_actions(
         half_range: half the range of each action.
     """
     now, present = policy(seen), weights_of(policy)
-    policy.load_state_dict(earlier)
-    change = (now - policy(seen)) / half_range
-    policy.load_state_dict(present)
+    try:
+        policy.load_state_dict(earlier)
+        change = (now - policy(seen)) / half_range
+    finally:
+        policy.load_state_dict(present)
     return change.square().mean().sqrt().item()
