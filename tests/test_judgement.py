@@ -83,6 +83,17 @@ def test_an_update_that_flights_refute_is_taken_back(evidence, kept):
     assert said(learner.policy) == kept and report["update_accepted"] == float(evidence is None)
 
 
+@pytest.mark.parametrize(("evidence", "kept"), [(None, 2.0), (REFUTED, 3.0)])
+def test_an_update_that_was_taken_back_is_judged_again_where_the_step_is_repeated(evidence, kept):
+    """With another closure, of which the flights may say something else."""
+    learner = Hasty(LinearGain([[3.0, 0.0]]))
+    learning = Learning(learner, REFUTED.virtual, taught=False)
+    learning.update()
+    assert learning.judge(EPISODES, judgement(REFUTED))["update_accepted"] == 0.0
+    report = learning.judge(EPISODES, judgement(evidence))
+    assert said(learner.policy) == kept and report["update_accepted"] == float(evidence is None)
+
+
 @pytest.mark.parametrize("sound", [False, True])
 def test_an_unsound_twin_leaves_the_update_to_another_closure(sound, monkeypatch):
     """Nothing flies on the twin. If what has flown does not, either, the step is repeated, with the update."""

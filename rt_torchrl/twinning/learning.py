@@ -41,6 +41,7 @@ class Learning:
     def __init__(self, learner: Learner, virtual: VirtualEpisodes, *, taught: bool):
         self.learner, self.virtual = learner, virtual
         self._before: dict[str, Any] = {}
+        self._after: dict[str, Any] | None = None  # weights of an update that has been judged
         take = getattr(learner, "take_twin", None)
         if taught and take is not None:
             take(virtual.twin)
@@ -77,7 +78,7 @@ class Learning:
 
     def update(self) -> TensorDict:
         """Update the policy; see :meth:`Learner.update`."""
-        self._before = copy.deepcopy(self.learner.policy.state_dict())
+        self._before, self._after = copy.deepcopy(self.learner.policy.state_dict()), None
         return self.learner.update()
 
     @torch.no_grad()
@@ -96,7 +97,9 @@ class Learning:
         """
         policy = self.learner.policy
         self.adopt(policy)
-        after = copy.deepcopy(policy.state_dict())
+        if self._after is not None:  # it was taken back under another closure
+            policy.load_state_dict(self._after)
+        after = self._after = copy.deepcopy(policy.state_dict())
         found = judgement.costs(policy, self.virtual, judged_on).expected
         policy.load_state_dict(self._before)
         earlier = judgement.costs(policy, self.virtual, judged_on).expected
