@@ -85,6 +85,21 @@ def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
     assert found.covariance[1:4, 0, 0].abs().max() < (0.25 + 0.08) * 0.04
 
 
+@pytest.mark.parametrize("redrawn", [False, True])
+def test_samples_have_the_mean_of_the_record(redrawn):
+    """Gusts are skewed: the regression, which follows the median rather than the mean, leaves residuals of one sign."""
+    record = torch.stack(
+        [torch.as_tensor(10.0 + np.exp(autoregressive(600, rho, seed))) for seed, rho in enumerate((0.9, 0.98))], -1
+    )
+    found = process(record, signals=FREE * 2)
+    torch.testing.assert_close(found.mean.mean(0), record.mean(0), rtol=1e-12, atol=0)
+    count = 4000
+    means = found.sample(count, seeded(3), redrawn=redrawn).mean((0, 1))
+    # Five standard errors of the mean over all samples, by the sum of the covariances over all lags.
+    spread = (found.covariance.diagonal(dim1=1, dim2=2).abs().sum(0) * 2.0 / (600 * count)).sqrt()
+    assert ((means - record.mean(0)).abs() < 5.0 * spread).all()
+
+
 def test_constant_input_stays_constant():
     found = process(np.full(50, 3.25))
     assert torch.equal(found.sample(3, seeded()), torch.full((3, 50, 1), 3.25, dtype=torch.float64))

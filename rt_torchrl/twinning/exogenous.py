@@ -54,8 +54,9 @@ class ExogenousProcess:
     r"""Gaussian process of one recorded episode, :math:`\mathcal N_z(\tilde d(t), \Sigma_\varepsilon)`.
 
     The large scale d̃ of each component is a support vector regression with a Gaussian kernel (paper, eq. svr), fitted
-    to block means of the record. The residuals z − d̃ are taken to be jointly stationary: components that moved
-    together in the record, at once or one after the other, do so in every realisation too. Their covariances,
+    to block means of the record, and shifted to the mean of the record. The residuals z − d̃ are taken to be jointly
+    stationary: components that moved together in the record, at once or one after the other, do so in every realisation
+    too. Their covariances,
 
     .. math:: \Gamma_{kl}(h) = \mathrm E\,\varepsilon_k(t + h)\,\varepsilon_l(t)
 
@@ -101,6 +102,7 @@ class ExogenousProcess:
         large = np.empty_like(values)
         for k, column in enumerate(values.T):
             large[:, k] = _large_scale(column, config)
+        large += (values - large).mean(0)  # what a regression with a tube leaves over, and no sample would have
         self.mean: Float[Tensor, "n n_z"] = like(large)
         covariance = like(_windowed_covariance(values - large))
         self.covariance: Float[Tensor, "n n_z n_z"] = covariance
