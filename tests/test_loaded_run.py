@@ -195,7 +195,11 @@ def test_recipes_that_cannot_be_found_are_told(tmp_path):
         json.dumps({"class": "Config", "module": None, "file": str(tmp_path / "evil.py")}): "came with the folder",
         json.dumps({"class": "Config", "module": None, "file": "evil.py"}): "came with the folder",
         json.dumps({"class": "Config", "module": None, "file": "/gone.py"}): "/gone.py does not exist.*If it has moved",
-        json.dumps({"class": "Config", "module": "gone", "file": None}): "No module named 'gone'.*If it has moved",
+        json.dumps({"class": "Config", "module": "gone", "file": None}): "module gone .* is not imported.*give the rec",
+        json.dumps({"class": "Config", "module": "gone", "file": "/gone.py"}): "module gone .* is not imported",
+        json.dumps({"class": 3, "module": "gone", "file": None}): "does not say which recipe made the run",
+        json.dumps({"class": "Config", "module": 3, "file": None}): "does not say which recipe made the run",
+        json.dumps({"class": "Config", "module": None, "file": 3}): "does not say which recipe made the run",
         json.dumps({"class": "Config", "module": "rt_torchrl", "file": None}): "defines no Config.*If it has moved",
         json.dumps({"class": "Plant", "module": "rt_torchrl", "file": None}): "Plant is no class derived from RunConf",
     }.items():
@@ -211,6 +215,65 @@ def test_recipes_that_cannot_be_found_are_told(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=message):
             load_run(tmp_path, given)
+
+
+CALLED = "open({mark!r}, 'w').close()\nraise SystemExit('code of the run folder')\n"
+
+
+@pytest.fixture
+def evil(tmp_path, monkeypatch):
+    """A run folder, the current folder, with code of its own, and a mark that is there once that code has run."""
+    folder, mark = tmp_path / "run", tmp_path / "called"
+    (folder / "pack").mkdir(parents=True)
+    leave_run_of(folder, Own())
+    for name in ("evil.py", "pack/__init__.py", "pack/recipe.py"):
+        (folder / name).write_text(CALLED.format(mark=str(mark)))
+    (tmp_path / "outside.py").write_text("from rt_torchrl.runs.run_config import RunConfig\nConfig = RunConfig\n")
+    (folder / "pack" / "linked.py").symlink_to(tmp_path / "outside.py")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend("")
+    monkeypatch.syspath_prepend(folder)
+    yield folder, mark
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("evil", "pack", "rt_torchrl_recipe_out")]:
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize("file", [None, "", "/gone/evil.py", "gone.py"])
+@pytest.mark.parametrize("module", ["evil", "pack", "pack.recipe"])
+def test_a_module_of_the_run_folder_is_not_imported(module, file, evil):
+    folder, mark = evil
+    settings = json.loads((folder / "config.json").read_text())
+    settings["recipe"] = {"class": "Config", "module": module, "file": file}
+    (folder / "config.json").write_text(json.dumps(settings))
+    with pytest.raises(ValueError, match=r"is not (imported|run).*give the recipe"):
+        load_run(folder, plant=LinearQuadratic())
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("module", ["evil", "pack.linked", "pack.outside"])
+def test_a_recipe_elsewhere_does_not_make_way_for_a_module_of_the_run_folder(module, evil):
+    """The file is imported; the packages of the module's name are those of the run folder."""
+    folder, mark = evil
+    settings = json.loads((folder / "config.json").read_text())
+    settings["recipe"] = {"class": "Config", "module": module, "file": str(folder.parent / "outside.py")}
+    (folder / "config.json").write_text(json.dumps(settings))
+    assert type(load_run(folder, plant=LinearQuadratic()).config) is RunConfig
+    assert not mark.exists()
+
+
+def test_a_recipe_in_a_package_elsewhere_is_imported_by_its_name(evil, monkeypatch):
+    folder, _ = evil
+    package = folder.parent / "elsewhere" / "own_package"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "base.py").write_text("from rt_torchrl.runs.run_config import RunConfig as Config\n")
+    (package / "recipe.py").write_text("from .base import Config\n")
+    monkeypatch.syspath_prepend(package.parent)
+    settings = json.loads((folder / "config.json").read_text())
+    settings["recipe"] = {"class": "Config", "module": "own_package.recipe", "file": str(package / "recipe.py")}
+    (folder / "config.json").write_text(json.dumps(settings))
+    assert type(load_run(folder, plant=LinearQuadratic()).config) is RunConfig
+    assert "own_package.recipe" in sys.modules
 
 
 def test_hypotheses_come_back_with_their_closures_and_weights(tmp_path):

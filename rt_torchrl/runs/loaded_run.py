@@ -161,7 +161,8 @@ def load_run(
     """Read the plant, the policies and the closure of a finished run back from its folder.
 
     ``config.json`` names the recipe that made the run, and that recipe is imported, which runs its code. A recipe that
-    lies in the run folder itself is not imported unless it is given here.
+    lies in the run folder itself is not imported unless it is given here, nor is a module whose file is not there,
+    unless it is one of this library.
 
     Args:
         folder: the run folder, with ``config.json`` and ``weights.pt``.

@@ -1,12 +1,14 @@
 """The file ``config.json`` of a run folder: the options of the run, its plant, and the recipe that made it."""
 
 import dataclasses
-import importlib.util
+import importlib
+import itertools
 import json
 import sys
 import typing
 from collections.abc import Callable, Sequence
 from functools import cache
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import GenericAlias, ModuleType
 from typing import Any, Literal
@@ -23,6 +25,7 @@ RAN = "ran"
 """Key of the list with an entry for every start of the run."""
 BESIDE = ("plant", "recipe", RAN)
 """Keys of ``config.json`` that are not options."""
+LIBRARY = __name__.partition(".")[0]
 GIVE = "give the recipe: its file, package.module:Config, or in code the class itself"
 
 
@@ -77,22 +80,32 @@ def config_of(config_class: type[RunConfig], options: dict[str, Any]) -> RunConf
 def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
     """The configuration class that the settings of a run name, from its module, which is imported.
 
+    What is imported is a file outside the run folder or, without one, a module of this library. Any other name of a
+    module may lead into the run folder, which comes from somewhere else and may be the current folder.
+
     Raises:
         ValueError: if the settings name no class, or the name is not found any more, belongs to no configuration, or
-            is defined in the run folder itself.
+            may be defined in the run folder itself.
     """
     origin: Any = settings.get("recipe")
     place = folder / FILE
     try:
         name, module, file = (origin[key] for key in ("class", "module", "file"))
     except (TypeError, KeyError):
-        raise ValueError(f"{place} does not say which recipe made the run; {GIVE}.") from None
+        name = module = file = 0
+    if not isinstance(name, str) or not all(part is None or isinstance(part, str) for part in (module, file)):
+        raise ValueError(f"{place} does not say which recipe made the run; {GIVE}.")
     if "<locals>" in name or not (module or file):
         raise ValueError(f"the class {name} that made the run in {folder} was defined on the way; {GIVE}.")
-    if file and (not Path(file).is_absolute() or Path(file).resolve().is_relative_to(folder.resolve())):
+    if file and (not Path(file).is_absolute() or _lies_in(file, folder)):
         raise ValueError(f"recipe {file} in {place} is not run: it came with the folder. To trust it, {GIVE}.")
+    if module and module.partition(".")[0] != LIBRARY and not (file and Path(file).is_file()):
+        raise ValueError(
+            f"module {module} in {place} is not imported, because its file {file or '(none is named)'} is not there, "
+            f"and a module of this name may have come with the folder. To trust it, {GIVE}."
+        )
     try:
-        return require_config(attribute(_module(module, file), name), name)
+        return require_config(attribute(_module(module, file, folder), name), name)
     except (ValueError, ImportError) as error:
         raise ValueError(f"the recipe that {place} names is not found: {error} If it has moved, {GIVE}.") from error
 
@@ -123,7 +136,7 @@ def _origin(config_class: type) -> dict[str, str | None]:
     return {"class": config_class.__qualname__, "module": name, "file": str(Path(file).resolve()) if file else None}
 
 
-def _module(name: str | None, file: str | None) -> ModuleType:
+def _module(name: str | None, file: str | None, folder: Path) -> ModuleType:
     """The module of a recipe: imported by its name if the name leads to the file or the file is missing, else by file.
 
     A script that is running is not run again.
@@ -131,18 +144,29 @@ def _module(name: str | None, file: str | None) -> ModuleType:
     for loaded in (sys.modules.get("__main__"), sys.modules.get(name or "")):
         if file and loaded and _same(getattr(loaded, "__file__", None), file):
             return loaded
-    if name and (not file or not Path(file).is_file() or _same(_found(name), file)):
+    if name and (not file or not Path(file).is_file() or _same(_found(name, folder), file)):
         return importlib.import_module(name)
     if not file:
         raise ValueError("neither a module nor a file of it is named.")
     return module_of(Path(file))
 
 
-def _found(name: str) -> str | None:
-    try:
-        return getattr(importlib.util.find_spec(name), "origin", None)
-    except (ImportError, ValueError):
-        return None
+def _found(name: str, folder: Path) -> str | None:
+    """The file of a module, None if there is none or if a package on the way to it lies in the run folder.
+
+    Unlike ``importlib.util.find_spec``, the search imports none of these packages.
+    """
+    places, origin = None, None
+    for package in itertools.accumulate(name.split("."), "{}.{}".format):
+        spec = PathFinder.find_spec(package, places)
+        if spec is None or (spec.origin and _lies_in(spec.origin, folder)):
+            return None
+        places, origin = spec.submodule_search_locations or (), spec.origin
+    return origin
+
+
+def _lies_in(file: str, folder: Path) -> bool:
+    return Path(file).resolve().is_relative_to(folder.resolve())
 
 
 def _same(one: str | None, other: str) -> bool:
