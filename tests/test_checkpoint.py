@@ -1,6 +1,9 @@
 """Checkpoints: what they hold, what a damaged one does, and a run that has none yet."""
 
+import errno
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,6 +65,41 @@ def test_a_damaged_checkpoint_is_told_by_its_name_and_what_to_do(folder, tmp_pat
     with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
         small_run(tmp_path, resume=True, **QUICK)
     assert (tmp_path / "config.json").read_bytes() == before
+
+
+def stale(_):
+    raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))  # as a read in an open file does, without a name
+
+
+def without_memory(_):
+    raise MemoryError
+
+
+def without_memory_for_a_tensor(*_, **__):
+    torch.empty(2**57)
+
+
+@pytest.mark.parametrize(
+    ("where", "failing", "said"),
+    [
+        ((Path, "read_bytes"), stale, os.strerror(errno.ESTALE)),
+        ((Path, "read_bytes"), without_memory, os.strerror(errno.ENOMEM)),
+        ((torch, "load"), without_memory_for_a_tensor, os.strerror(errno.ENOMEM)),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_a_damaged_one(
+    where, failing, said, folder, tmp_path, monkeypatch
+):
+    """The earlier checkpoint would be sound: a training that took it would fly an episode again."""
+    algorithm = small_run(tmp_path / "run", **QUICK).algorithm
+    for name in ("checkpoint.pt", "checkpoint-0001.pt"):
+        (tmp_path / name).write_bytes((folder / "checkpoint.pt").read_bytes())
+    with monkeypatch.context() as patched:
+        patched.setattr(*where, failing)
+        with pytest.raises(OSError, match=rf"{said}.*not changed.*checkpoint\.pt"):
+            checkpoint.load(tmp_path / "checkpoint.pt", algorithm)
+    assert sorted(path.name for path in tmp_path.glob("check*")) == ["checkpoint-0001.pt", "checkpoint.pt"]
+    assert len(checkpoint.load(tmp_path / "checkpoint.pt", algorithm)) == 2
 
 
 @pytest.mark.parametrize("part", ["policies", "learner", "short_term", "virtual", "referee", "env"])

@@ -99,6 +99,7 @@ def load(path: Path, algorithm: ReinforcementTwinning) -> list[dict[str, Any]]:
     Raises:
         ValueError: if there is no checkpoint, all of them are damaged, or the newest sound one has another format,
             belongs to another plant, or does not fit.
+        OSError: if a checkpoint cannot be read, which does not make it a damaged one; nothing is renamed.
     """
     candidates = [*([path] if path.is_file() else []), *earlier(path)]
     if not candidates:

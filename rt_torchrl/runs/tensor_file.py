@@ -1,7 +1,9 @@
 """Files of tensors in plain containers, which run no code when they are read, and whose damage is noticed."""
 
+import errno
 import hashlib
 import io
+import os
 import pickle
 import zipfile
 from collections.abc import Mapping
@@ -44,20 +46,37 @@ def load_tensors(path: Path) -> dict[str, Any]:
     Raises:
         DamagedFileError: if the file is damaged, or holds any object that is not a tensor or a plain container; such an
             object is not built.
+        OSError: if the file cannot be read, or memory is short, which says nothing of what it holds.
     """
     try:
-        sound = _verified(path.read_bytes())
-    # The kind of error depends on the byte that is wrong, and all of them come from reading the file.
+        return _loaded(path)
+    except (OSError, MemoryError) as error:
+        number = errno.ENOMEM if isinstance(error, MemoryError) else error.errno
+        reason = os.strerror(number) if number else str(error)
+        raise OSError(number, f"{reason}; the file is not read and not changed, try again", str(path)) from error
+
+
+def _loaded(path: Path) -> dict[str, Any]:
+    file = path.read_bytes()
+    try:
+        sound = _verified(file)
+    except MemoryError:
+        raise
+    # The kind of error depends on the byte that is wrong, and all of them come from the content of the file.
     except Exception as error:
         raise DamagedFileError(f"{path} is damaged, or no file of a run: {error}") from error
     try:
         content = torch.load(sound, weights_only=True, map_location="cpu")
+    except MemoryError:
+        raise
     except pickle.UnpicklingError as error:
         raise DamagedFileError(
             f"{path} is not loaded: it is of another version, or it would run code, because it holds more than tensors "
             f"in plain containers. {first_line(error)}"
         ) from error
     except Exception as error:  # of as many kinds
+        if "allocate memory" in str(error):  # torch has no class of its own for it on the CPU
+            raise MemoryError from error
         raise DamagedFileError(f"{path} is damaged, or no file of a run: {first_line(error)}") from error
     if not isinstance(content, dict):
         raise DamagedFileError(f"{path} is no file of a run: it holds a {type(content).__name__}.")
