@@ -25,6 +25,7 @@ from benchmarking.timing import Cell, Stopwatch
 from benchmarking.trainings import seconds_of_steps
 
 from rt_torchrl import Engine, main_of
+from rt_torchrl.runs.results_file import new_folder
 from rt_torchrl.trajectories.rollout import ENGINES
 
 SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0, "updates": 1.0}
@@ -241,7 +242,7 @@ def _tell(doing: str) -> None:
 
 def main(config: Config) -> None:
     config = config.effective()
-    folder = config.log_dir or Path("runs") / "benchmark" / time.strftime("%Y%m%d-%H%M%S")
+    folder = config.log_dir or new_folder(Path("runs") / "benchmark")
     folder.mkdir(parents=True, exist_ok=True)
     benchmark = Benchmark(config, folder)
     try:

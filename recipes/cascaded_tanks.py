@@ -31,6 +31,7 @@ from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
 from rt_torchrl.identification.cross_validation import Fold, folds, pooled
 from rt_torchrl.identification.prediction import Prediction, predict, residual_tests
+from rt_torchrl.runs.results_file import write_results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +159,7 @@ def main(config: Config) -> None:
     if config.plan:
         closures = list(drawn_closures(neural[1], config.draws, config.seed))
         found["plan"] = planned_under_uncertainty(twins.plant, closures, iterations=config.plan, seed=config.seed)
-    (config.log_dir / "results.json").write_text(json.dumps(found, indent=2) + "\n")
+    write_results(config.log_dir / "results.json", found)
     print(table(found))
     print(f"results in {config.log_dir}")
 

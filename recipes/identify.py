@@ -1,9 +1,7 @@
 """Train a plant's twin on a recorded log, without control: ``identify.py log.csv --plant wind_turbine``."""
 
 import dataclasses
-import json
 import math
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,7 +35,9 @@ from rt_torchrl.identification.sensor_identification import identify
 from rt_torchrl.identification.sensor_log import SensorLog, checked
 from rt_torchrl.identification.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
+from rt_torchrl.runs.results_file import new_folder, write_results
 from rt_torchrl.runs.shipped_plants import plant_class
+from rt_torchrl.runs.tensor_file import save_tensors
 
 SLOW = 1.5
 """Number of control intervals between rows above which many control instants have no sample."""
@@ -66,7 +66,7 @@ class Config:
         shortest: least number of control intervals of a part between gaps; shorter parts are left out.
         held_out: share at the end of the log on which the twin is judged and not trained.
         seed: seed of the closure's first weights, if these are random.
-        log_dir: folder of the results; by default runs/identify/PLANT/TIME.
+        log_dir: folder of the results, which holds none yet; by default runs/identify/PLANT/TIME.
         identification: options of the search for the weights.
         estimation: options of the search by maximum likelihood.
     """
@@ -140,12 +140,24 @@ class Config:
         return bool(self.sensors or self.biased or self.guess or holes or hidden_states(plant, log))
 
     def make_folder(self, plant: str) -> Path:
-        """Create the folder of the results and return its path."""
-        folder = self.log_dir or Path("runs") / "identify" / plant / time.strftime("%Y%m%d-%H%M%S")
+        """Create the folder of the results and return its path.
+
+        Raises:
+            ValueError: if the folder holds a training or an identification already, or cannot be written.
+        """
+        from rt_torchrl.runs.run_folder import WRITTEN  # here, because --help need not wait for TorchRL
+
+        folder = self.log_dir
+        there = [name for name in WRITTEN if folder and (folder / name).exists()]
+        if there:
+            raise ValueError(f"log_dir={folder} holds results already ({', '.join(there)}); choose another folder.")
         try:
+            folder = folder or new_folder(Path("runs") / "identify" / plant)
             (folder / "figures").mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ValueError(f"log_dir={folder} cannot be written ({error}); choose another with --log-dir.") from error
+            raise ValueError(
+                f"the folder of the results cannot be written ({error}); choose another with --log-dir."
+            ) from error
         return folder
 
 
@@ -181,8 +193,8 @@ def main(config: Config) -> None:
     described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
     metrics = {"plant": plant.name} | metrics | {"log": described, "config": dataclasses.asdict(config)}
     metrics["held_back"] = held_back(plant, parts.segments)
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2, default=str) + "\n")
-    torch.save({"closure": closure.state_dict()}, folder / "weights.pt")
+    write_results(folder / "metrics.json", metrics)
+    save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
     print(shown(metrics))

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,23 @@ def test_a_log_is_identified_and_the_results_are_written(log, tmp_path, capsys):
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"twin_and_log.png", "weights.png"}
     shown = capsys.readouterr().out
     assert "gap from" in shown and "c8" in shown and "J_p, held out" in shown
+
+
+@pytest.mark.parametrize("name", ["config.json", "checkpoint.pt", "weights.pt", "metrics.json"])
+def test_results_of_a_training_or_an_identification_are_not_overwritten(name, tmp_path):
+    (tmp_path / name).write_text("kept")
+    config = recipe("identify").Config(log=tmp_path / "log.csv", plant="wind_turbine", log_dir=tmp_path)
+    with pytest.raises(ValueError, match=rf"log_dir={tmp_path} holds results already.*{name}.*choose another folder"):
+        config.make_folder("wind_turbine")
+    assert (tmp_path / name).read_text() == "kept" and [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_identifications_within_a_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda *_: "20260101-000000")
+    config = recipe("identify").Config(log=tmp_path / "log.csv", plant="wind_turbine")
+    folders = [config.make_folder("wind_turbine") for _ in range(3)]
+    assert len(set(folders)) == 3 and all((folder / "figures").is_dir() for folder in folders)
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ HOMES = {
 ROOMS_OF = {
     "accuracy.py": {"evaluation", "runs", "study", "trajectories", "twinning"},
     "asynchronous.py": {"runs"},
-    "benchmark.py": {"trajectories"},
-    "cascaded_tanks.py": {"figures", "identification"},
+    "benchmark.py": {"runs", "trajectories"},
+    "cascaded_tanks.py": {"figures", "identification", "runs"},
     "coverage.py": {"evaluation", "identification"},
     "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},

@@ -1,7 +1,8 @@
-"""The JSON file of results that a recipe writes at its end."""
+"""The JSON file of results that a recipe writes at its end, and the folder that holds it."""
 
 import dataclasses
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,26 @@ def make_folder(option: str, folder: Path) -> None:
         raise ValueError(f"{option}={folder} cannot be made ({error.strerror}); choose another folder.") from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"{option}={folder} cannot be written; choose another folder.")
+
+
+def new_folder(parent: Path) -> Path:
+    """Make a folder with the present time in its name, which no other process has made.
+
+    Args:
+        parent: folder in which it is made; it need not exist.
+
+    Raises:
+        OSError: if the folder cannot be made.
+    """
+    stamp, number = time.strftime("%Y%m%d-%H%M%S"), 1
+    while True:
+        folder = parent / (stamp if number == 1 else f"{stamp}-{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:  # of the same second
+            number += 1
+        else:
+            return folder
 
 
 def write_results(path: Path, content: dict[str, Any]) -> Path:
