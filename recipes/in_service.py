@@ -24,8 +24,9 @@ class Config:
     """Let an exported policy act on a served wind turbine.
 
     Args:
-        policy: file of recipes/export.py: a PyTorch program (.pt2), an ONNX model (.onnx, with the extra onnx), or
-            C (.c, with a C compiler).
+        policy: file of recipes/export.py: an ONNX model (.onnx, with the extra onnx); or, with --trusted, a PyTorch
+            program (.pt2) or C (.c, with a C compiler), which run code of their own here as any program does.
+        trusted: whether a .pt2 or .c file may run its code, because you know who has written it.
         observe: what the policy observes, as in the training; a run's config.json says it.
         protocol: what the server speaks, opcua or modbus.
         port: port of the server on this machine.
@@ -37,6 +38,7 @@ class Config:
     """
 
     policy: Annotated[Path, Positional]
+    trusted: bool = False
     observe: tuple[str, ...] = ("measured+wind",)
     protocol: Literal["opcua", "modbus"] = "modbus"
     port: int = 5020
@@ -67,7 +69,7 @@ def main(config: Config) -> None:
     make_folder("log_dir", config.log_dir)
     served = config.served()
     plant = served.plant()
-    policy = load_policy(config.policy, plant)
+    policy = load_policy(config.policy, plant, trusted=config.trusted)
     options = {"protocol": config.protocol, "port": config.port, "period": served.period}
     log = config.log_dir / "safety.jsonl"
     log.unlink(missing_ok=True)

@@ -33,7 +33,12 @@ def test_an_exported_policy_acts_on_the_served_turbine(tmp_path):
     module = recipe("in_service")
     module.main(
         module.Config(
-            policy=tmp_path / "law.pt2", port=free_port(), pace=PACE, seconds=20.0, log_dir=tmp_path / "found"
+            policy=tmp_path / "law.pt2",
+            trusted=True,
+            port=free_port(),
+            pace=PACE,
+            seconds=20.0,
+            log_dir=tmp_path / "found",
         )
     )
     found = json.loads((tmp_path / "found" / "in_service.json").read_text())

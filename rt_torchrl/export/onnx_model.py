@@ -5,13 +5,14 @@ import importlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached, require_agreement
 from rt_torchrl.export.program import INTERFACE, interface, trace
 from rt_torchrl.plants.plant import Plant
@@ -44,7 +45,7 @@ def export_onnx(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     entry = model.metadata_props.add()
     entry.key, entry.value = INTERFACE, json.dumps(interface(plant))
     difference = require_agreement(policy, runtime(model.SerializeToString(), name), plant, what="the ONNX model")
-    Path(path).write_bytes(model.SerializeToString())
+    write_atomically(Path(path), model.SerializeToString())
     return difference
 
 
@@ -69,13 +70,16 @@ def _converted(program: torch.export.ExportedProgram, name: str) -> Any:
     return exported.model_proto
 
 
-def require_packages() -> None:
-    """Refuse to go on without the packages of the extra ``onnx``.
+def require_packages(needed: Sequence[str] | None = None) -> None:
+    """Refuse to go on without packages of the extra ``onnx``.
+
+    Args:
+        needed: packages; by default all that an export needs.
 
     Raises:
         ValueError: if a package is not installed.
     """
-    for package in NEEDED:
+    for package in NEEDED if needed is None else needed:
         try:
             importlib.import_module(package)
         except ImportError as error:

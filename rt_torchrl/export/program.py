@@ -11,6 +11,7 @@ import torch
 from torch import nn
 from torch.export import Dim, ExportedProgram
 
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.export.agreement import detached, require_agreement, sample_observations
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
@@ -80,7 +81,8 @@ def interface(plant: Plant) -> dict[str, Any]:
 def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     """Write a policy as a program of torch.export, (batch, n_o) -> (batch, n_a) in double precision.
 
-    A program runs without this library. Its extra file ``interface.json`` describes observations and actions::
+    A program runs without this library. Its extra file ``interface.json`` describes observations and actions. Who loads
+    it must trust where it comes from, because ``torch.export.load`` runs the code of objects that are pickled in it::
 
         policy = torch.export.load("policy.pt2").module()
         action = policy(observation)
@@ -101,5 +103,5 @@ def export_program(policy: nn.Module, path: Path | str, plant: Plant) -> float:
     torch.export.save(trace(policy, plant), file, extra_files={INTERFACE: json.dumps(interface(plant), indent=2)})
     loaded = torch.export.load(io.BytesIO(file.getvalue())).module()
     error = require_agreement(policy, loaded, plant, what="the exported program")
-    Path(path).write_bytes(file.getvalue())
+    write_atomically(Path(path), file.getvalue())
     return error
