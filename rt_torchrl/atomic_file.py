@@ -10,14 +10,23 @@ from pathlib import Path
 from typing import Any
 
 PARTIAL = ".partial"
+REMEDY = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room"),
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), "make its folder"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "write where you may, or allow it here"),
+}
+"""What to do about an error of the operating system."""
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file whole or not at all: whatever happens, it has its old content or ``content``.
 
     Raises:
-        OSError: if the file cannot be written, such as on a full disk; its old content stays.
+        OSError: if the file cannot be written, such as on a full disk; its old content stays. The one exception is a
+            folder that cannot be flushed: the new content is there, and a power cut may undo it. The message says what
+            is the case.
     """
+    written = False
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PARTIAL}")
     try:
         with partial.open("xb") as file:
@@ -25,13 +34,19 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
+        written = True
         _flush_folder(path.parent)
     except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         if isinstance(error, OSError):
             reason = error.strerror or str(error)
-            raise OSError(error.errno, f"{reason}; what was there before is intact, make room", str(path)) from error
+            if written:
+                state = "the file is written, but a power cut may undo it"
+            else:
+                state = "what was there before is intact" if os.path.lexists(path) else "nothing is written"
+                state = "; ".join(filter(None, [state, REMEDY.get(error.errno or 0)]))
+            raise OSError(error.errno, f"{reason}; {state}", str(path)) from error
         raise
 
 

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pickle
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -154,10 +155,49 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     opened = Path.open
     with monkeypatch.context() as patched:
         patched.setattr(Path, "open", lambda self, mode="r": Full(opened(self, mode)))
-        with pytest.raises(OSError, match="No space left on device.*intact, make room.*checkpoint.pt"):
+        with pytest.raises(OSError, match="No space left on device.*intact; make room.*checkpoint.pt"):
             save_tensors(file, {"other": 1})
     assert same(load_tensors(file), CONTENT)
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_a_write_into_a_missing_folder_says_so(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing is written; make its folder.*gone/metrics\.json") as error:
+        write_json(tmp_path / "gone" / "metrics.json", {})
+    assert "intact" not in str(error.value) and "room" not in str(error.value)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
+def test_a_write_without_permission_says_so(number, tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    (tmp_path / "metrics.json").write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", refused)
+        with pytest.raises(
+            OSError, match=r"what was there before is intact; write where you may.*metrics\.json"
+        ) as error:
+            write_json(tmp_path / "metrics.json", {})
+    assert "room" not in str(error.value) and (tmp_path / "metrics.json").read_text() == "old"
+
+
+def test_an_error_after_the_new_content_does_not_speak_of_the_old_one(tmp_path, monkeypatch):
+    """The folder cannot be flushed, so that only a power cut would bring the old content back."""
+    flush = os.fsync
+
+    def failing(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        flush(descriptor)
+
+    file = tmp_path / "metrics.json"
+    file.write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", failing)
+        with pytest.raises(OSError, match=r"is written, but a power cut may undo it.*metrics\.json") as error:
+            write_json(file, {"new": 1})
+    assert "intact" not in str(error.value) and json.loads(file.read_text()) == {"new": 1}
 
 
 def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
