@@ -118,12 +118,18 @@ def test_a_file_may_hold_a_few_options(tmp_path):
         ("[1]", "must hold an object"),
         ('{"epsodes": 3}', "has no option epsodes"),
         ('{"episodes": 0}', "episodes=0 must be at least 1"),
+        ("[" * 100_000, "config=.*cannot be read: maximum recursion depth"),
+        ('{"twinning": ' * 100_000, "config=.*cannot be read: maximum recursion depth"),
+        ('\ufeff{"episodes": 3}', "config=.*byte-order mark; save it as UTF-8 without one"),
+        ('{"recipe": "x"}', "config=.*its recipe is 'x'; it must be an object"),
+        ('{"recipe": 0}', "config=.*its recipe is 0; it must be an object"),
+        ('{"recipe": {"file": 3}}', "config=.*its recipe is .*it must be an object"),
         ('{"recipe": {"file": "/a/flapping_wing.py"}}', "is of the recipe flapping_wing.py, not of wind_turbine.py"),
     ],
 )
 def test_a_file_that_cannot_be_carried_out_is_refused(content, message, tmp_path):
     file = tmp_path / "config.json"
-    file.write_text(content)
+    file.write_text(content, encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         from_command_line(TURBINE, ["--config", str(file)])
 

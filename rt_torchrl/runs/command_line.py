@@ -10,6 +10,7 @@ from typing import Any, TypeVar, cast
 
 import tyro
 
+from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.runs.machine import quieten_libraries
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
@@ -78,15 +79,23 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
             value that it does not take.
     """
     from rt_torchrl.runs.run_settings import as_written  # here, because --help needs none of it
-    from rt_torchrl.runs.settings import BESIDE, config_of
+    from rt_torchrl.runs.settings import BESIDE, GREATEST_BYTES, config_of
 
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        require_bounded(path, GREATEST_BYTES)
+        text = path.read_text(encoding="utf-8")
+        if text.startswith("\ufeff"):
+            raise ValueError("it begins with a byte-order mark; save it as UTF-8 without one.")
+        found = json.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"config={path} cannot be read: {error}") from error
     if not isinstance(found, dict):
         raise ValueError(f"config={path} must hold an object with options, such as config.json of a run.")
-    made, mine = (found.get("recipe") or {}).get("file"), getattr(sys.modules[type(asked).__module__], "__file__", None)
+    recipe: Any = {} if found.get("recipe") is None else found["recipe"]
+    made = recipe.get("file") if isinstance(recipe, dict) else 0
+    if not isinstance(made, str | None):
+        raise ValueError(f"config={path}: its recipe is {recipe!r}; it must be an object, as in config.json of a run.")
+    mine = getattr(sys.modules[type(asked).__module__], "__file__", None)
     if made and mine and Path(made).name != Path(mine).name:
         raise ValueError(f"config={path} is of the recipe {Path(made).name}, not of {Path(mine).name}; use its recipe.")
     options = {name: value for name, value in found.items() if name not in (*BESIDE, *OF_THE_CALL)}

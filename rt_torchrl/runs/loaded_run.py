@@ -68,7 +68,7 @@ class LoadedRun:
         file = self.folder / "metrics.json"
         try:
             found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise ValueError(f"{file} cannot be read ({error}); a training writes it at its end.") from error
         return found
 

@@ -122,7 +122,7 @@ def event_of(path: Path, number: int, line: str) -> dict[str, Any]:
         if found["event"] == "resumed":
             return {"event": "resumed", "window": int(found["window"]), "version": int(found["version"])}
         raise ValueError(f"event {found['event']!r} is unknown")
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(
             f"replay={path} line {number} is no event of an operation: {line[:80]!r} ({error})."
         ) from error
