@@ -1,7 +1,7 @@
 """A coverage-guided fuzzer of the readers of files, with atheris (extra ``fuzz``, on Linux).
 
-``uv run --extra fuzz tests/fuzz.py log.csv -max_total_time=60`` fuzzes one reader; the options after its name are those
-of libFuzzer. The corpus and the files that break a reader lie in the folder ``fuzzing/NAME``.
+``uv run --group test --extra fuzz tests/fuzz.py log.csv -max_total_time=60`` fuzzes one reader; the options after its
+name are those of libFuzzer. The corpus and the files that break a reader lie in the folder ``fuzzing/NAME``.
 """
 
 import sys

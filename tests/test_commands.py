@@ -17,7 +17,8 @@ from rt_torchrl.runs.user_code import module_of
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 CONFIGS = {name: module_of(ROOT / "recipes" / f"{name}.py").Config for name in RECIPES}
 OF_A_RECIPE = [command for command in commands() if "recipes/" in command]
-BUILD = "uv run --extra docs sphinx-build -W --keep-going docs docs/_build"
+PYTEST, MYPY = "uv run --group test pytest", "uv run --group test --group lint mypy"
+BUILD = "uv run --group docs sphinx-build -W --keep-going docs docs/_build"
 
 
 def whole(name, arguments):
@@ -107,15 +108,64 @@ def test_every_choice_of_a_policy_is_taken():
 def test_checks_that_are_printed_are_what_ci_runs():
     """The tests do not run themselves, nor the type checker over everything."""
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert {"uv run mypy", BUILD} <= set(script)
-    assert any(line.startswith("uv run pytest -n 2 --dist loadfile") for line in script)
+    assert {MYPY, BUILD} <= set(script)
+    assert any(line.startswith(f"{PYTEST} -n 2 --dist loadfile") for line in script)
     rest = [command for command in commands() if command not in OF_A_RECIPE]
-    known = {"uv run mypy", "uv run pytest -n 2 --dist loadfile", "uv run pytest -m slow", "uv run pytest -m nightly"}
-    known |= {'uv run pytest tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
+    known = {MYPY, f"{PYTEST} -n 2 --dist loadfile", f"{PYTEST} -m slow", f"{PYTEST} -m nightly"}
+    known |= {f'{PYTEST} tests/test_neural_residual.py -n 0 -s -m "slow or nightly"'}  # they are run as tests
     known |= {"uv run quadrotor.py", "uv run heated_room.py"}  # tests/test_own_plants.py
-    known |= {"uv run pytest -m faults", "uv run --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
-    assert set(rest) - known == {"uv run pre-commit install", "uv run tensorboard --logdir runs", BUILD}
+    known |= {f"{PYTEST} -m faults", "uv run --group test --extra fuzz tests/fuzz.py wind.bts -max_total_time=60"}
+    assert set(rest) - known == {"uv run --group lint pre-commit install", "uv run tensorboard --logdir runs", BUILD}
     assert Path(ROOT / ".pre-commit-config.yaml").exists() and len(TEXTS) >= 5
+
+
+PACKAGES = {
+    "lint-imports": "import-linter",
+    "mypy": "mypy",
+    "pre-commit": "pre-commit",
+    "pytest": "pytest",
+    "ruff": "ruff",
+    "sphinx-build": "sphinx",
+    "tensorboard": "tensorboard",
+}
+"""The package of each program that ``uv run`` starts."""
+FILES = [".ci/run", ".pre-commit-config.yaml", "pyproject.toml", "tests/fuzz.py", "tests/test_fault_campaign.py"]
+
+
+def test_a_command_asks_for_the_groups_that_have_its_program():
+    """A clone in which nothing was installed before has no other packages."""
+    tomllib = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    texts = [(ROOT / name).read_text(encoding="utf-8") for name in FILES]
+    given = [*commands(), *(found for text in texts for found in re.findall(r"uv run [^`\n]+", text))]
+    tried = set()
+    for command in given:
+        words = shlex.split(command)[2:]
+        asked = {"--group": [], "--extra": []}
+        while words[0] in asked:
+            asked[words[0]].append(words[1])
+            words = words[2:]
+        extras = declared["project"]["optional-dependencies"]
+        there = [text for group in asked["--group"] for text in declared["dependency-groups"][group]]
+        there += [f"rt_torchrl[{extra}]" for extra in asked["--extra"]]
+        there = [*declared["project"]["dependencies"], *(text for one in there for text in direct(one, extras))]
+        names = {re.match(r"[\w.-]+", text).group().lower() for text in there}
+        if words[0] in PACKAGES:
+            assert PACKAGES[words[0]] in names, command
+            tried.add(words[0])
+        else:
+            assert words[0].endswith(".py"), command
+    assert tried == PACKAGES.keys()
+
+
+def direct(requirement, extras):
+    """The requirement; of the library with some of its extras, the requirements of these."""
+    own = re.fullmatch(r"rt_torchrl\[(.+)\]", requirement)
+    return [text for extra in own[1].split(",") for text in direct_of(extra, extras)] if own else [requirement]
+
+
+def direct_of(extra, extras):
+    return [text for requirement in extras[extra] for text in direct(requirement, extras)]
 
 
 def test_one_word_for_the_folder_of_the_results():

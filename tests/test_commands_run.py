@@ -145,7 +145,7 @@ def test_the_dashboard_opens(clone, tmp_path):
 def test_the_hooks_are_installed(clone):
     pytest.importorskip("pre_commit")
     subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
-    done("uv run pre-commit install", clone)
+    done("uv run --group lint pre-commit install", clone)
     assert (clone / ".git" / "hooks" / "pre-commit").exists()
 
 

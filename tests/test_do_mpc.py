@@ -163,7 +163,7 @@ def main():
 
 
 def test_the_receding_horizon_costs_what_do_mpc_costs_in_an_eighth_of_the_time():
-    pytest.importorskip("do_mpc", reason="the extra mpc is not installed")
+    pytest.importorskip("do_mpc", reason="the group nightly is not installed")
     done = fresh_process.run(Path(__file__))
     assert done.returncode == 0, done.stderr
     (cost, seconds), (own_cost, own_seconds), plans = json.loads(done.stdout.splitlines()[-1])

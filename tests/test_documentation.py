@@ -144,7 +144,7 @@ def test_the_front_page_is_short():
 
 
 @pytest.mark.nightly  # .ci/run builds the site in every run; this is for those who run no .ci/run
-@pytest.mark.skipif(importlib.util.find_spec("sphinx") is None, reason="the site needs the extra docs")
+@pytest.mark.skipif(importlib.util.find_spec("sphinx") is None, reason="the site needs the group docs")
 def test_the_site_builds_without_warnings(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

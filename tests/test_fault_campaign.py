@@ -1,5 +1,6 @@
-"""The campaign of faults, `uv run pytest -m faults`: kills, signals, damaged checkpoints, a full disk, faulty machines.
+"""The campaign of faults: kills, signals, damaged checkpoints, a full disk, faulty machines.
 
+`uv run --group test pytest -m faults` runs it.
 Its first tests of each kind run in the fast suite too. Trainings run in processes that a clean server forks, so that
 each of them takes a second.
 """

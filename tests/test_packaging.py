@@ -1,6 +1,7 @@
 """The folder ``envs`` is ``rt_torchrl.envs``, in a checkout and in a built wheel."""
 
 import importlib
+import importlib.metadata
 import importlib.util
 import subprocess
 import sys
@@ -8,6 +9,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import rt_torchrl
 
@@ -38,6 +41,42 @@ def test_no_file_imports_the_folder_by_its_own_name():
     for path in [p for folder in ("rt_torchrl", "envs", "tests", "recipes") for p in (ROOT / folder).rglob("*.py")]:
         lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
         assert not [line for line in lines if line.startswith(("import envs", "from envs"))], path
+
+
+def installed_with(requirements, declared):
+    """Names of the packages that come with requirements, by what the packages that are installed here say they need.
+
+    Args:
+        requirements: texts of requirements.
+        declared: ``project`` of ``pyproject.toml``, which stands for the library itself.
+    """
+    found, open_ = set(), [(Requirement(text), "") for text in requirements]
+    while open_:
+        needed, extra = open_.pop()
+        if needed.marker and not needed.marker.evaluate({"extra": extra}):
+            continue
+        name = canonicalize_name(needed.name)
+        for asked in {"", *needed.extras}:
+            if (name, asked) in found:
+                continue
+            found.add((name, asked))
+            if name == "rt-torchrl":
+                texts = declared["optional-dependencies"].get(asked, []) if asked else declared["dependencies"]
+            else:
+                texts = importlib.metadata.requires(name) or []
+            open_ += [(Requirement(text), asked) for text in texts]
+    return {name for name, _ in found}
+
+
+def test_the_first_command_installs_few_packages():
+    """What tests, style, types and documentation need comes only to those who ask for it."""
+    tomllib = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    groups = declared["tool"]["uv"].get("default-groups", ["dev"])
+    of_groups = [text for group in groups for text in declared["dependency-groups"][group]]
+    found = installed_with(["rt_torchrl", *of_groups], declared["project"])
+    assert {"torch", "torchrl", "tensorboard", "tyro"} <= found and len(found) <= 80, sorted(found)
+    assert not {"pytest", "mypy", "basedpyright", "playwright", "jax", "pandas", "onnxruntime"} & found
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,7 @@ def test_a_run_without_results_has_no_report(page, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; apt-get install chromium")
 def test_a_browser_draws_it_at_both_widths(page):
-    playwright = pytest.importorskip("playwright.sync_api", reason="a browser is driven by the extra report")
+    playwright = pytest.importorskip("playwright.sync_api", reason="a browser is driven by the group test")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         for width, height in SIZES.values():
