@@ -4,10 +4,12 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
+from test_saved_files import Full
 from torch import nn
 
 from rt_torchrl import shipped_plants
@@ -93,6 +95,25 @@ def test_onnx_without_its_packages_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(onnx_model, "NEEDED", ("onnx_of_no_one",))
     with pytest.raises(ValueError, match=r"package onnx_of_no_one.*pip install 'rt_torchrl\[onnx\]'"):
         export_onnx(LinearGain([[0.1, 0.2]]), tmp_path / "policy.onnx", LinearQuadratic())
+
+
+@pytest.mark.parametrize(("export", "name"), [(export_onnx, "policy.onnx"), (export_program, "policy.pt2")])
+def test_an_export_onto_a_full_disk_leaves_the_old_file(export, name, tmp_path, monkeypatch):
+    if export is export_onnx:
+        pytest.importorskip("onnxruntime")
+        pytest.importorskip("onnxscript")
+    (tmp_path / name).write_text("old")
+    opened = Path.open
+
+    def full(self, mode="r", *others, **named):
+        found = opened(self, mode, *others, **named)
+        return Full(found) if self.parent == tmp_path else found
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", full)
+        with pytest.raises(OSError, match="No space left on device"):
+            export(LinearGain([[0.1, 0.2]]), tmp_path / name, LinearQuadratic())
+    assert (tmp_path / name).read_text() == "old" and [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_what_onnxruntime_cannot_run_is_refused(tmp_path, monkeypatch):
