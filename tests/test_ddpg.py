@@ -1,5 +1,6 @@
 """Step 2 by DDPG: isolated gradients, hand-computed TD errors, bootstrapping, targets."""
 
+import contextlib
 import copy
 import re
 
@@ -117,6 +118,29 @@ def assert_equal(state, other):
     (ours, structure), (its, its_structure) = tree_flatten(dict(state)), tree_flatten(dict(other))
     assert structure == its_structure
     assert all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b for a, b in zip(ours, its, strict=True))
+
+
+@pytest.mark.parametrize("kind", [DDPG, TD3])
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt, FloatingPointError])
+def test_small_operations_run_on_one_thread_of_torch(kind, error, monkeypatch):
+    found, before, seen = learner(kind=kind, critic_iterations=2, actor_iterations=2), torch.get_num_threads(), []
+    filled(explored(20), found)
+    draw = LongTermMemory.draw
+
+    def counted(memory, *arguments):
+        seen.append(torch.get_num_threads())
+        if error is not None:
+            raise error("stop")
+        return draw(memory, *arguments)
+
+    monkeypatch.setattr(LongTermMemory, "draw", counted)
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(KeyboardInterrupt) if error is KeyboardInterrupt else contextlib.nullcontext():
+            found.update()
+        assert seen and set(seen) == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("done", [False, True])

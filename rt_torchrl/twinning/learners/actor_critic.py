@@ -167,7 +167,8 @@ class ActorCritic(ABC):
     def sound(self, iterate: Callable[[], TensorDict]) -> TensorDict:
         """Make the iterations of an update, and take them back if they end with numbers that are not finite.
 
-        Such weights would stay so for good, and with them all that is learned later.
+        Such weights would stay so for good, and with them all that is learned later. The iterations run on one thread
+        of torch: on several, each of their small operations waits for all threads.
 
         Args:
             iterate: function that makes the iterations and returns the report.
@@ -177,6 +178,8 @@ class ActorCritic(ABC):
         """
         parts = {"policy": self.policy} | {name: getattr(self, name) for name in UPDATED}
         before = copy.deepcopy({name: part.state_dict() for name, part in parts.items()})
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
         try:
             found = iterate()
             broken = [name for name, part in parts.items() if not finite(part.state_dict())]
@@ -185,6 +188,8 @@ class ActorCritic(ABC):
             said = f"numbers of {' and '.join(broken)} are not finite"
         except FloatingPointError as error:
             said = str(error)
+        finally:
+            torch.set_num_threads(threads)
         for name, part in parts.items():
             part.load_state_dict(before[name])
         return findings(f"update of model_free taken back: {said}; use smaller learning rates or reward_scale")
