@@ -1,5 +1,6 @@
 """Reinforcement twinning of Gymnasium's pendulum, a real system that is not this library's own."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -43,8 +44,9 @@ class Config(RunConfig):
         horizon: length of an episode T_o [s]; Gymnasium's is 10.
         gravity: gravity g [m/s²].
         guess: share of the true mass and length that the twin starts from.
-        judged_on: system of the unseen episodes: real for Gymnasium's pendulum, or plant for this library's pendulum
-            with Gymnasium's mass and length, which is quicker and which --reference needs.
+        judged_on: system on which policies are judged: real for the twin and, in as many episodes of the live policy as
+            unseen says unless real_unseen does, Gymnasium's pendulum; or plant for this library's pendulum with
+            Gymnasium's mass and length, which is quicker and which --reference needs.
     """
 
     episodes: int = 10
@@ -63,6 +65,8 @@ def main(config: Config) -> None:
     from rt_torchrl import Run
     from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 
+    if config.judged_on == "real" and not config.real_unseen:
+        config = dataclasses.replace(config, real_unseen=config.unseen)
     plant = config.plant()
     known = plant.closure if config.judged_on == "plant" else None
     device = require_device(config.device)

@@ -118,7 +118,8 @@ class Config(RunConfig):
         unknown: what the real system has beside its twin, one or more of anemometer_low, anemometer_high, torque_loss,
             inflow, pitch and all; docs/unknown_systems.md describes them.
         real: real system: simulation of the plant, or rosco for the simulator of NREL's ROSCO toolbox. With rosco,
-            policies are judged in that simulator and compared with ROSCO's controller; this needs the extra rosco.
+            policies are judged on the twin, and with real_unseen the live one in that simulator, too, where ROSCO's
+            controller flies as many episodes; this needs the extra rosco.
     """
 
     paper: bool = False

@@ -20,7 +20,6 @@ from torchrl.envs.utils import check_env_specs
 from rt_torchrl import Actuation, PlantEnv, Reading, RealSystem
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 
@@ -136,15 +135,16 @@ def test_a_run_on_it_is_resumed_to_the_bit(tmp_path):
     assert "true" in whole["summary"]["closure"]
 
 
-def test_one_of_unknown_closure_is_judged_itself(tmp_path):
+def test_one_of_unknown_closure_is_judged_itself_where_that_is_asked_for(tmp_path):
     system = connected(LinearQuadratic(horizon=2.0))
-    run = run_on(system, tmp_path, episodes=2, unseen_every=1, figures=True)
-    assert isinstance(run.unseen, RealEpisodes)
+    run = run_on(system, tmp_path, episodes=2, unseen_every=1, figures=True, real_unseen=3)
     metrics = run.train()
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     summary = metrics["summary"]
     assert "true" not in summary["closure"] and (tmp_path / "figures" / "states.png").exists()
-    policy, costs = run.algorithm.policies["model_based"], summary["unseen"]["costs"]["model_based"]
+    live = summary["live"]
+    policy, costs = run.algorithm.policies[live], summary["real_unseen"]["costs"][live]
+    assert len(costs) == 3
     # The same episodes again, in a loop of our own.
     again = connected(LinearQuadratic(horizon=2.0))
     again.set_seed(1_000_000)

@@ -26,6 +26,8 @@ class RealEpisodes(UnseenEpisodes):
         device: device of the twin, which replays the episodes.
     """
 
+    judged_on = "real system"
+
     def __init__(self, system: RealSystem, count: int = 20, *, device: torch.device | str = "cpu"):
         super().__init__(system.plant, count, device=device)
         self.closure = None
@@ -39,10 +41,6 @@ class RealEpisodes(UnseenEpisodes):
 
     def validation(self) -> None:
         """No validation episodes, because a real episode may take hours."""
-
-    def untrained_cost(self, policy: nn.Module) -> float:
-        """J_a of one episode, which is enough because only the magnitude of a random policy's cost matters."""
-        return self.judge(self._flown(policy, 1)).control_costs.mean().item()
 
     def fly_baseline(self, law: Baseline) -> Trajectory:
         """As many episodes on the real system.

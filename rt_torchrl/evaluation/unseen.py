@@ -41,6 +41,9 @@ class UnseenEpisodes:
         seed: seed of the draws of initial states and disturbances.
     """
 
+    judged_on = "simulation"
+    """Where the episodes are flown: simulation of the real system, twin, or real system."""
+
     def __init__(
         self,
         plant: Plant,
@@ -124,10 +127,6 @@ class UnseenEpisodes:
         found.closure = self.closure
         return found
 
-    def untrained_cost(self, policy: nn.Module) -> float:
-        """Mean J_a of one random initial policy."""
-        return self.control_costs(policy).mean().item()
-
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities in flown episodes."""
         costs = control_cost(self.plant, flown)
@@ -206,7 +205,7 @@ def untrained_costs(
     """
     device = unseen.initial_state.device
     generator = torch.Generator(device=device).manual_seed(seed)
-    costs = [unseen.untrained_cost(make_policy(generator).to(device)) for _ in range(starts)]
+    costs = [unseen.control_costs(make_policy(generator).to(device)).mean().item() for _ in range(starts)]
     return torch.tensor(costs, dtype=torch.float64, device=device)
 
 

@@ -17,18 +17,19 @@ WIDEST_LINEAR = 30.0
 """Ratio of the greatest to the least value above which a panel is logarithmic."""
 
 
-def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count"]]) -> Figure:
+def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count"]], *, where: str = "") -> Figure:
     """J_a and every quantity of the plant's merit by controller, a point for each episode and a bar at each mean.
 
     Args:
         judged: results of each controller by name, with the policies first.
         categories: episodes of each kind by name; each kind has its own marker.
+        where: words of the title that say where the episodes were flown, such as "on the twin".
     """
     first = next(iter(judged.values()))
     quantities = {"$J_a$": {name: found.control_costs for name, found in judged.items()}}
     quantities |= {name: {who: found.merit[name] for who, found in judged.items()} for name in first.merit}
     count = len(first.control_costs)
-    title = f"{count} unseen episodes, a point each; bar: mean"
+    title = f"{count} unseen episodes{f' {where}' if where else ''}, a point each; bar: mean"
     figure, axes = panels(1, len(quantities), title=title, size=(max(4.5, 3.1 * len(quantities)), 4.2))
     kinds = {kind: array(chosen) for kind, chosen in categories.items()} or {"": np.ones(count, dtype=bool)}
     for ax, (name, values) in zip(axes.flat, quantities.items(), strict=True):

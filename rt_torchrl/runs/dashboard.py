@@ -8,6 +8,8 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
+from rt_torchrl.runs.summary import on_the_twin
+
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger  # only its type
 
@@ -18,6 +20,7 @@ TAGS = {
     "J_a_model_based": "cost/J_a model-based (twin)",
     "J_a_model_free": "cost/J_a model-free (twin)",
     "J_a_unseen": "cost/J_a live policy (real system, unseen episodes)",
+    "J_a_unseen_on_the_twin": "cost/J_a live policy (twin, unseen episodes)",
     "J_a_plan_before": "cost/J_a before planning (twin)",
     "J_a_plan": "cost/J_a after planning (twin)",
     "plan_accepted": "switch/plan accepted",
@@ -56,7 +59,9 @@ TAGS = {
 """Tag of each scalar entry of an episode's record."""
 
 
-COSTS = [TAGS[key] for key in ("real_cost", "J_a_model_based", "J_a_model_free", "J_a_unseen")]
+COSTS = [
+    TAGS[key] for key in ("real_cost", "J_a_model_based", "J_a_model_free", "J_a_unseen", "J_a_unseen_on_the_twin")
+]
 """Curves that one chart of TensorBoard's custom scalars shows together."""
 
 
@@ -150,8 +155,12 @@ class Dashboard:
 def final_costs(summary: Mapping[str, Any]) -> dict[str, float]:
     """Final costs of a run by name; those that are not finite are left out."""
     unseen, paid = summary["unseen"], summary["cost_of_learning"]
-    found = {f"J_a {role.replace('_', '-')}": unseen[f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
-    found["J_a live"] = unseen[f"J_a_{summary['live']}"]["mean"]
+    where = " on the twin" if on_the_twin(unseen) else ""
+    roles = ("model_based", "model_free")
+    found = {f"J_a {role.replace('_', '-')}{where}": unseen[f"J_a_{role}"]["mean"] for role in roles}
+    found[f"J_a live{where}"] = unseen[f"J_a_{summary['live']}"]["mean"]
     found |= {f"J_a {name}": baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    flown = summary.get("real_unseen", {}).get("controllers", {})
+    found |= {f"J_a {name} on the real system": one["J_a"]["mean"] for name, one in flown.items()}
     found |= {"J_p": unseen["J_p"]["mean"], "sum of the real costs": paid["sum"], "largest real cost": paid["largest"]}
     return {name: float(value) for name, value in found.items() if value is not None and np.isfinite(value)}

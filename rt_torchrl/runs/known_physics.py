@@ -45,6 +45,11 @@ def require_simulation(
     """
     if env is not None and (config.noise or config.wear(plant) is not None):
         raise ValueError(f"noise={config.noise} and wear need a plant in simulation; this run has a real system.")
+    if env is None and config.real_unseen:
+        raise ValueError(
+            f"real_unseen={config.real_unseen} episodes after the training needs a real system, and this run simulates "
+            "its own; leave it out, and unseen says how many episodes are simulated."
+        )
     real = [name for name, law in (baselines or {}).items() if _acts_on_the_real_system(law)]
     on_the_plant = [name for name in baselines or {} if name not in real]
     if real and (env is None or env.closure is not None):

@@ -7,7 +7,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.baselines.acting import ActingController
 from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.evaluation.real_episodes import RealEpisodes
+from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.state_bounds import StateBounds
@@ -16,6 +16,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 
 class Resting:
@@ -67,15 +68,17 @@ def simulated(
 
 
 def judged_on(
-    plant: Plant, physics: Plant, env: RealSystem | None, config: RunConfig, *, device: torch.device, compiled: bool
+    plant: Plant, twin: DigitalTwin, env: RealSystem | None, config: RunConfig, *, device: torch.device, compiled: bool
 ) -> UnseenEpisodes:
-    """The unseen episodes: on the plant, or on the real system itself if its closure is not known.
+    """The unseen episodes, for which no real system moves: on the plant, or on the twin if nobody knows the closure.
 
     Policies for them are made for the physics that the twin knows, and leaving the bounds of states counts.
     """
     if env is None or env.closure is not None:
         unseen = UnseenEpisodes(plant, config.unseen, compiled=compiled, device=device)
+        unseen.judged_on = "simulation" if env is None else "simulation of the real system"
     else:
-        unseen = RealEpisodes(env, config.unseen, device=device)
+        unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
+    physics = twin.plant
     unseen.physics, unseen.bounds = physics, StateBounds(plant, config.twinning.bounded_states)
     return unseen

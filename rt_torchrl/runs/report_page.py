@@ -13,6 +13,7 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.plants.state_bounds import OUTSIDE
 from rt_torchrl.runs.loaded_run import LoadedRun
 from rt_torchrl.runs.settings import RAN, read_settings
+from rt_torchrl.runs.summary import on_the_twin
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go  # only its types
@@ -75,11 +76,15 @@ def numbers(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """What a reader wants to know first: a number as text, and what it is."""
     found = metrics["summary"]
     unseen, live = found["unseen"], found["live"]
-    shown = [(_text(unseen[f"J_a_{live}"]["mean"]), f"cost of the live policy ({role_name(live)})")]
+    where = " on the twin" if on_the_twin(unseen) else ""
+    shown = [(_text(unseen[f"J_a_{live}"]["mean"]), f"cost of the live policy ({role_name(live)}){where}")]
     shown += [(_text(law["J_a"]["mean"]), f"cost of {name}") for name, law in unseen["baselines"].items()]
+    for name, one in found.get("real_unseen", {}).get("controllers", {}).items():
+        shown.append((_text(one["J_a"]["mean"]), f"cost of {role_name(name)} on the real system"))
     paid = found["cost_of_learning"]
     shown.append((_text(paid["sum"]), f"paid on the real system in {paid['episodes']} episodes"))
-    shown.append((_text(found["J_p_ratio"]), "the twin's error, after over before"))
+    if not where:  # a twin has no error on episodes that it has flown itself
+        shown.append((_text(found["J_p_ratio"]), "the twin's error, after over before"))
     return shown
 
 
@@ -96,7 +101,8 @@ def bounds(metrics: dict[str, Any]) -> list[list[str]]:
     bounded = {name.removesuffix(OUTSIDE) for name in first if name.endswith(OUTSIDE)}
     shown = [name for name in first if name.split(" ")[0] in bounded]
     rows = [[name, *(_text(merit[name]["mean"]) for merit in merits.values())] for name in shown]
-    return [["mean over the episodes", *merits], *rows] if rows else []
+    where = " on the twin" if on_the_twin(unseen) else ""
+    return [[f"mean over the episodes{where}", *merits], *rows] if rows else []
 
 
 def story(metrics: dict[str, Any]) -> list[str]:
@@ -134,13 +140,13 @@ def story(metrics: dict[str, Any]) -> list[str]:
 def plots_of(run: LoadedRun, metrics: dict[str, Any]) -> "list[tuple[str, str, go.Figure]]":
     """Title, explanation and plot of each part of the page."""
     flown = {role: run.simulate(run.policy(role), seed=UNSEEN_SEED) for role in ROLES}
-    live = run.live
+    live, where = run.live, " on the twin" if on_the_twin(metrics["summary"]["unseen"]) else ""
     record = flown[live]
     read = run.physics.at_rest(record.states[..., : len(run.plant.readings)])
     replay = run.twin.replayed(record._replace(states=read))
     found = [
         ("Cost", "What each real episode cost, by who acted, beside the twin's view of both policies.", costs(metrics)),
-        ("Cost on unseen episodes", "A box for each controller, over the same episodes.", boxes(metrics)),
+        (f"Cost on unseen episodes{where}", "A box for each controller, over the same episodes.", boxes(metrics)),
     ]
     if any("J_p" in episode for episode in metrics["episodes"]):
         says = "How far the twin was from each real episode, before and after it had learned from it."
@@ -172,6 +178,9 @@ def costs(metrics: dict[str, Any]) -> "go.Figure":
     if any("J_a_unseen" in episode for episode in episodes):
         seen = [episode.get("J_a_unseen") for episode in episodes]
         plot.add_trace(go.Scatter(x=number, y=seen, line={"color": REAL}, name="live policy, unseen episodes"))
+    if any("J_a_unseen_on_the_twin" in episode for episode in episodes):
+        seen = [episode.get("J_a_unseen_on_the_twin") for episode in episodes]
+        plot.add_trace(go.Scatter(x=number, y=seen, line={"color": TWIN}, name="live policy, unseen episodes, twin"))
     for name, law in metrics["summary"]["unseen"]["baselines"].items():
         ends = [number[0], number[-1]]
         line = {"color": REFERENCE, "dash": "dash"}

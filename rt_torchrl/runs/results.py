@@ -1,6 +1,7 @@
 """The results of a run in numbers, as ``metrics.json`` holds them."""
 
 import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -51,7 +52,9 @@ def twin_entries(twin: DigitalTwin) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def judge(unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: dict[str, Baseline]) -> dict[str, Judged]:
+def judge(
+    unseen: UnseenEpisodes, flights: dict[Role, Trajectory], baselines: Mapping[str, Baseline]
+) -> dict[str, Judged]:
     """Judge both policies by their flights, and fly and judge the classical controllers, on the unseen episodes.
 
     Args:
@@ -97,7 +100,7 @@ def summarise(
         "J_p_ratio": (J_p.mean() / J_p_before.mean()).item(),
         **{f"J_a_ratio_{role}": after[role] / before[role].mean().item() for role in ROLES},
         **over_untrained(after, untrained),
-        "unseen": {"episodes": len(unseen.initial_state)}
+        "unseen": {"episodes": len(unseen.initial_state), "judged_on": unseen.judged_on}
         | {name: mean_with_confidence(values) for name, values in means.items()}
         | results(unseen, judged),
         "cost_of_learning": cost_of_learning(episodes),
@@ -199,10 +202,17 @@ def hypotheses_of(twin: DigitalTwin) -> dict[str, Any]:
     return found
 
 
-def cost_of_learning(episodes: list[dict[str, Any]]) -> dict[str, float]:
-    """What the real system has paid: sum and largest of the J_a of all real episodes, with that of the start."""
+def cost_of_learning(episodes: list[dict[str, Any]], judging: Sequence[float | None] = ()) -> dict[str, Any]:
+    """What the real system has paid: sum and largest of the J_a of all real episodes, with that of the start.
+
+    Args:
+        episodes: records of the training.
+        judging: J_a of the flights on the real system after it, which count as well; None for one that is not finite.
+    """
     costs = [record[key] for record in episodes for key in ("start_cost", "real_cost") if key in record]
-    return {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
+    costs += [torch.inf if cost is None else cost for cost in judging]
+    found = {"sum": sum(costs), "largest": max(costs), "episodes": len(costs)}
+    return found | ({"judging": list(judging)} if judging else {})
 
 
 def seconds_per_step(episodes: list[dict[str, Any]]) -> dict[str, float]:

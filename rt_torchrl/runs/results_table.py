@@ -7,13 +7,18 @@ from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.summary import preferred_role
+from rt_torchrl.runs.summary import on_the_twin, preferred_role
 from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 from rt_torchrl.twinning.findings import in_words
 
 SCREEN = 24
 """Lines of a terminal that need no scrolling."""
 LEAST_WEIGHTS = 4
+WHERE = {
+    "simulation of the real system": " in simulation, with the closure that the real system was given",
+    "twin": " on the twin, not on the real system",
+}
+"""What the heading says of the place where the unseen episodes were flown; nothing where the system is simulated."""
 
 
 def progress(record: dict[str, Any]) -> str:
@@ -28,18 +33,22 @@ def results_table(metrics: dict[str, Any]) -> str:
     """The table of results that the terminal shows at the end of a run."""
     found = metrics["summary"]
     unseen, n = found["unseen"], found["unseen"]["episodes"]
-    lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones"]
-    lines.append(f"  {'cost':<22}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
-    rows = [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
+    where = WHERE.get(unseen.get("judged_on", ""), "")
+    twin = " on the twin" if on_the_twin(unseen) else ""
+    width = 22 + len(twin)
+    lines = ["", f"{metrics['plant']}, {len(metrics['episodes'])} episodes, judged on {n} unseen ones{where}"]
+    lines.append(f"  {'cost':<{width}}{'before':>12}{'after':>12}   {'95 % interval':<24}{'ratio':>10}")
+    # A twin has no J_p on episodes that it has flown itself.
+    rows = [] if twin else [("J_p (twin)", "J_p_before", "J_p", found["J_p_ratio"])]
     for role, before in (("model_based", "J_a_before"), ("model_free", "J_a_before_model_free")):
-        rows.append((f"J_a {role.replace('_', '-')}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
+        rows.append((f"J_a {role.replace('_', '-')}{twin}", before, f"J_a_{role}", found[f"J_a_ratio_{role}"]))
     for name, before, after, ratio in rows:
         means = f"{_number(unseen[before]['mean'], '.5g'):>12}{_number(unseen[after]['mean'], '.5g'):>12}"
-        lines.append(f"  {name:<22}{means}   {_interval(unseen[after]):<24}{_number(ratio, '.3g'):>10}")
+        lines.append(f"  {name:<{width}}{means}   {_interval(unseen[after]):<24}{_number(ratio, '.3g'):>10}")
     if "J_a_untrained" in unseen:
         shares = ", ".join(_share(role, found[f"J_a_over_untrained_{role}"]) for role in ROLES)
         mean = _number(unseen["J_a_untrained"]["mean"], ".4g")
-        lines.append(f"  over a random start's mean J_a of {mean}: {shares}")
+        lines.append(f"  over a random start's mean J_a{twin} of {mean}: {shares}")
     if "reference" in found:
         best, share = (found["reference"][key] for key in ("J_a", "better_over_reference"))
         best, share = _number(best, ".5g"), _number(share, ".3f")
@@ -50,9 +59,13 @@ def results_table(metrics: dict[str, Any]) -> str:
             f"  {f'J_a {name}':<22}{'':>12}{_number(baseline['J_a']['mean'], '.5g'):>12}   {_interval(baseline['J_a'])}"
         )
     lines += merit_lines(unseen)
+    lines += real_lines(found.get("real_unseen"))
     paid = found["cost_of_learning"]
     least, most = (_number(paid[key], ".4g") for key in ("sum", "largest"))
-    lines.append(f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes, largest {most}")
+    judging = f" ({len(paid['judging'])} of them after the training)" if "judging" in paid else ""
+    lines.append(
+        f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes{judging}, largest {most}"
+    )
     live, preferred = (role.replace("_", "-") for role in (found["live"], preferred_role(found)))
     trial = "" if preferred == live else f", on trial: {preferred} is expected to cost less"
     lines.append(f"  live at the end: {live}{trial}")
@@ -62,6 +75,21 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines += closure_lines(found["closure"], most=max(LEAST_WEIGHTS, room))
     lines.append("  seconds: " + ", ".join(f"{step} {value:.1f}" for step, value in found["seconds"].items()))
     return "\n".join(lines)
+
+
+def real_lines(found: dict[str, Any] | None) -> list[str]:
+    """Lines with what controllers have cost on the real system itself after the training, if they have flown it."""
+    if found is None:
+        return []
+    lines = []
+    if "J_p" in found:
+        before, after = (_number(found[key]["mean"], ".5g") for key in ("J_p_before", "J_p"))
+        lines.append(f"  J_p on the real system: {after}, with the first closure {before}")
+    for name, one in found["controllers"].items():
+        mean, who = _number(one["J_a"]["mean"], ".5g"), name.replace("_", "-")
+        lines.append(f"  J_a on the real system, {one['episodes']} flights of {who}: {mean} {_interval(one['J_a'])}")
+        lines += [f"    {name:<26}{_value(merit):>20}" for name, merit in one["merit"].items()]
+    return lines
 
 
 def limit_lines(reference: dict[str, Any]) -> list[str]:
@@ -98,7 +126,8 @@ def merit_lines(unseen: dict[str, Any]) -> list[str]:
     merits |= {name: baseline["merit"] for name, baseline in unseen["baselines"].items()}
     if not merits[ROLES[0]]:
         return []
-    lines = [f"  {'mean (median)':<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
+    heading = "on the twin, mean (median)" if on_the_twin(unseen) else "mean (median)"
+    lines = [f"  {heading:<28}" + "".join(f"{name.replace('_', '-'):>20}" for name in merits)]
     lines += _rows(merits)
     for kind, found in unseen["categories"].items():
         lines.append(f"  {kind}, {found['episodes']} of {unseen['episodes']} episodes")
@@ -110,12 +139,14 @@ def _rows(columns: dict[str, dict[str, Any]]) -> list[str]:
     """Lines of a table, one for each quantity."""
     lines = []
     for name in next(iter(columns.values())):
-        values = [merit[name] for merit in columns.values()]
-        shown = (
-            _number(v["mean"], ".4g") + (f" ({_number(v['median'], '.4g')})" if "median" in v else "") for v in values
-        )
+        shown = (_value(merit[name]) for merit in columns.values())
         lines.append(f"    {name:<26}" + "".join(f"{text:>20}" for text in shown))
     return lines
+
+
+def _value(found: dict[str, Any]) -> str:
+    """The mean of a quantity, and its median if it has one."""
+    return _number(found["mean"], ".4g") + (f" ({_number(found['median'], '.4g')})" if "median" in found else "")
 
 
 def closure_lines(closure: dict[str, Any], most: int = 1000) -> list[str]:
@@ -195,12 +226,17 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     unseen, live = found["unseen"], found["live"]
     cost = unseen[f"J_a_{live}"]["mean"]
     classical = {name: baseline["J_a"]["mean"] for name, baseline in unseen["baselines"].items()}
+    real = {name: one["J_a"]["mean"] for name, one in found.get("real_unseen", {}).get("controllers", {}).items()}
+    twin = on_the_twin(unseen) and live not in real
+    if live in real:  # a cost on the twin is not compared with one on the real system
+        cost, classical = real.pop(live), real
     known = {name: value for name, value in classical.items() if value is not None}
     best = min(known, key=known.__getitem__, default=None)
     call = f"rt_torchrl.load_run({str(folder)!r}{'' if alone else ', plant=...'})"
     steps = [f"look: tensorboard --logdir {folder}, or figures/ there; in code: {call}"]
     if cost is None:
-        steps.append("the live policy diverges on unseen episodes: see `reason` in metrics.json, and train longer")
+        where = "unseen episodes on the twin" if twin else "unseen episodes"
+        steps.append(f"the live policy diverges on {where}: see `reason` in metrics.json, and train longer")
     elif best is not None and cost >= known[best]:
         steps.append(f"{best} is better than the live policy: keep it, or go on with --resume and more --episodes")
     elif found["better"] != live:
@@ -208,6 +244,10 @@ def next_steps(metrics: dict[str, Any], folder: Path, config: RunConfig | None =
     else:
         planner = None if config is None else config.twinning.planner.method
         steps += _taking_away(live, folder, planner, found.get("believed"), alone=alone)
+    if twin:
+        steps.append(
+            "judge the live policy on the real system: go on with --resume and, for five flights, --real-unseen 5"
+        )
     return "\n".join(f"  next: {step}" for step in steps)
 
 

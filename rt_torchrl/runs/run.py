@@ -14,13 +14,14 @@ from torchrl.envs import EnvBase
 from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.evaluation.baseline import Baseline
+from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap, require_agreement
+from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import Judged, untrained_costs
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.runs import checkpoint, reference, results
+from rt_torchrl.runs import checkpoint, real_flights, reference, results
 from rt_torchrl.runs.callbacks import Callback
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.runs.drawing import Drawing, PlantFigures, first_flights
@@ -29,6 +30,7 @@ from rt_torchrl.runs.loggers import make_loggers
 from rt_torchrl.runs.machine import can_compile, quieten_libraries, require_device
 from rt_torchrl.runs.operated import EVENTS, acting_by_name, end_operation, learner_threads, operation_of
 from rt_torchrl.runs.progress import Progress
+from rt_torchrl.runs.real_flights import RealFlights
 from rt_torchrl.runs.real_side import judged_on, simulated
 from rt_torchrl.runs.results_table import next_steps, results_table
 from rt_torchrl.runs.run_config import RunConfig
@@ -52,14 +54,16 @@ class Run:
         config: options of the run.
         plant: the real system in simulation, and the twin's physics.
         env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run on
-            the wall clock needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``.
-            If that closure is not known, they are judged on real episodes: at most four times ``unseen`` (both policies
-            before and after the training, clones once), and one for each of the ``untrained`` random starts.
+            the wall clock needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``, or
+            on the twin if that closure is not known. After the training the real system flies only the
+            ``config.real_unseen`` episodes of each controller that are asked for, and those of a
+            :class:`RealController`.
         believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real
             system; None if it does not.
         plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
-            unknown closure, a :class:`RealController`.
+            unknown closure, a :class:`RealController`, which flies the real system ``config.real_unseen`` times, or
+            ``config.unseen`` times if that is 0.
         first: class of the controller that the real system has had so far, for ``start="controller"``.
         callbacks: functions that see the entries of all episodes after each one, and may end the training; see
             :data:`Callback`.
@@ -109,11 +113,14 @@ class Run:
                 make_env = functools.partial(simulated, plant, config, first, device=device, compiled=compiled)
             system = real or simulated(plant, config, first, device=device, compiled=compiled)
             self._make_algorithm(system, make_env, physics, device=device, compiled=compiled)
-            self.unseen = judged_on(plant, physics, real, self.config, device=device, compiled=compiled)
+            self.unseen = judged_on(plant, self.algorithm.twin, real, self.config, device=device, compiled=compiled)
+            self._real, self._first, self._device = real, first, device
             made = {name: law(physics, compiled=compiled) for name, law in (baselines or {}).items()}
             self.baselines = {name: law.to(device) for name, law in made.items()}
             self.episodes: list[dict[str, Any]] = []
+            self._paid: list[float | None] = []
             if self._held.resumes():
+                self._paid = real_flights.paid_before(self.folder)
                 self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
         except BaseException:
             self._held.release()
@@ -202,14 +209,17 @@ class Run:
             bar.doing("judging on unseen episodes")
             self._follow_wear()
             flights = of_each_role(self.algorithm.policies, self.unseen.fly)
-            judged = results.judge(self.unseen, flights, self.baselines)
-            metrics = self._results(gap, flights, judged)
+            laws = {name: law for name, law in self.baselines.items() if not isinstance(law, RealController)}
+            judged = results.judge(self.unseen, flights, laws)
+            real = self._fly_the_real_system(bar)
+            metrics = self._results(gap, flights, judged, real)
             if self.config.figures:
                 bar.doing("drawing the figures")
                 live = self.algorithm.referee.live
-                laws = {name: law for name, law in self.baselines.items() if name in judged}
-                flown = first_flights(self.unseen, live, self.algorithm.policies[live], laws)
-                unseen = {"unseen": figures.unseen(judged, self.unseen.categories())}
+                sound = {name: law for name, law in laws.items() if name in judged}
+                flown = first_flights(self.unseen, live, self.algorithm.policies[live], sound)
+                where = "on the twin" if self.unseen.judged_on == "twin" else ""
+                unseen = {"unseen": figures.unseen(judged, self.unseen.categories(), where=where)}
                 images = self.drawing.save(self._snapshot(), self.folder / "figures", first=flown, last=unseen)
                 dashboard.images(images, len(self.episodes) - 1)
         table = results_table(metrics)
@@ -251,7 +261,8 @@ class Run:
         if every and (len(self.episodes) + 1) % every == 0:
             self._follow_wear()
             acting = self.algorithm.policies[self.algorithm.referee.live]
-            record["J_a_unseen"] = self.unseen.control_costs(acting).mean().item()
+            key = "J_a_unseen_on_the_twin" if self.unseen.judged_on == "twin" else "J_a_unseen"
+            record[key] = self.unseen.control_costs(acting).mean().item()
         done = [*self.episodes, record]
         short = checkpoint.save(self._held.checkpoint, self.algorithm, done, kept=self.config.checkpoints)
         self.episodes.append(record)
@@ -273,11 +284,37 @@ class Run:
         if self.algorithm.episodes_done != len(self.episodes) or len(self.episodes) < self.config.episodes:
             self.episodes = checkpoint.load(self._held.checkpoint, self.algorithm)
 
-    def _results(self, gap: float, flights: dict[Role, Trajectory], judged: dict[str, Judged]) -> dict[str, Any]:
+    def _fly_the_real_system(self, bar: Progress) -> dict[str, RealFlights]:
+        """The flights after the training that were asked for; before the first one the run says how many of whom."""
+        if self._real is None:
+            return {}
+        if len(self.episodes) < self.config.episodes and self.ended is None:
+            return {}  # who has pressed Ctrl-C does not want the real system to go on
+        parts = self.initial_policies, self._first, self.baselines
+        found = real_flights.contenders(self.config, self._real, self.algorithm, *parts, device=self._device)
+        live = self.algorithm.referee.live
+        if self.config.real_unseen and live not in found:
+            bar.write(f"the live policy ({live}) has its random initial weights: it does not fly the real system")
+        if found:
+            bar.write(real_flights.announcement(found))
+            bar.doing("judging on the real system")
+        flown = {name: one.fly() for name, one in found.items()}
+        return {name: RealFlights(one, self.unseen.judge(one)) for name, one in flown.items()}
+
+    def _results(
+        self,
+        gap: float,
+        flights: dict[Role, Trajectory],
+        judged: dict[str, Judged],
+        real: dict[str, RealFlights],
+    ) -> dict[str, Any]:
         starts = self.config.untrained
         untrained = untrained_costs(self.unseen, self.make_policy, starts=starts) if starts else None
         parts = self.initial_policies, self.initial_closure, self.episodes, untrained
         summary = results.summarise(self.algorithm, self.unseen, flights, judged, *parts)
+        if real:
+            summary["real_unseen"] = self._real_results(real)
+        summary["cost_of_learning"] = results.cost_of_learning(self.episodes, [*self._paid, *real_flights.paid(real)])
         better = self.algorithm.policies[summary["better"]]
         summary |= reference.found(self.config, self.unseen, self.make_policy, better)
         summary |= {"engine_gap": gap, "ended": self.ended}
@@ -289,6 +326,14 @@ class Run:
         save_tensors(self.folder / "weights.pt", weights | self.algorithm.twin.state_dict())
         write_json(self.folder / "metrics.json", metrics)
         return metrics
+
+    def _real_results(self, real: dict[str, RealFlights]) -> dict[str, Any]:
+        flown, J_p = real.get(self.algorithm.referee.live), {}
+        if flown is not None and self._real is not None:
+            on_it = RealEpisodes(self._real, len(flown.flown.states), device=self._device)
+            costs = results.twin_costs(on_it, self.algorithm, self.initial_closure, flown.flown)
+            J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
+        return real_flights.entries(real, J_p)
 
     def _snapshot(self) -> Snapshot:
         return Snapshot.take(self.algorithm, self.initial_closure, self.episodes)

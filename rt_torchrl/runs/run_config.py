@@ -74,7 +74,12 @@ class RunConfig:
         checkpoints: number of latest checkpoints that are kept; if one is damaged, the run goes on from the one before.
         quick: whether to make a small run with all its parts: at most 3 episodes, 200 critic and actor iterations, 5
             unseen episodes.
-        unseen: number of unseen episodes that twin and policies are judged on at the end.
+        unseen: number of unseen episodes that twin and policies are judged on at the end, in simulation. Those of a
+            real system whose closure is not known are flown on the twin alone.
+        real_unseen: number of episodes that each controller flies at the end on a real system that is not simulated
+            here: the live policy, if it was trained, and the controller of start. The run says how many flights of whom
+            before the first one, and counts them as paid; after Ctrl-C nothing flies. Baselines that nothing but the
+            real system can fly do so as many times, and with 0 as many as unseen.
         untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
             compared with; 0 leaves this comparison out.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
@@ -118,6 +123,7 @@ class RunConfig:
     checkpoints: int = 3
     quick: bool = False
     unseen: int = 20
+    real_unseen: int = 0
     untrained: int = 20
     reference: bool = False
     limit_episodes: int = 8
@@ -153,6 +159,7 @@ class RunConfig:
             ("threads", 0),
             ("checkpoints", 1),
             ("unseen", 2),
+            ("real_unseen", 0),
             ("untrained", 0),
             ("figures_every", 0),
             ("limit_episodes", 0),
@@ -171,8 +178,9 @@ class RunConfig:
                 f"reference computes the limit on the CPU alone, and device={self.device!r}; give limit_episodes=0 to "
                 "leave it out."
             )
-        if self.limit_episodes == 1:
-            raise ValueError("limit_episodes=1 must be 0, or at least 2.")
+        if 1 in (self.limit_episodes, self.real_unseen):  # no mean of one episode has a confidence interval
+            argument = "limit_episodes" if self.limit_episodes == 1 else "real_unseen"
+            raise ValueError(f"{argument}=1 must be 0, or at least 2.")
         if self.log != LogConfig() and self.start in STARTS:
             raise ValueError(f"log.* says how a log is read, and start={self.start!r} names none; give its file.")
         if self.resume and self.log_dir is None:
@@ -292,6 +300,7 @@ class RunConfig:
             quick=False,
             episodes=min(self.episodes, QUICK_EPISODES),
             unseen=QUICK_UNSEEN,
+            real_unseen=min(self.real_unseen, QUICK_UNSEEN),
             figures_every=0,
             twinning=twinning,
         )

@@ -18,7 +18,7 @@ from rt_torchrl.runs.settings import BESIDE, FILE, RAN, read_settings, settings_
 VERSIONS_OF = ("rt_torchrl", "torch", "torchrl", "tensordict")
 HARMLESS = {
     *("episodes", "patience", "figures", "figures_every", "unseen_every", "untrained", "reference", "limit_episodes"),
-    *("checkpoints", "loggers"),
+    *("real_unseen", "checkpoints", "loggers"),
     # These change a result by rounding alone.
     *("threads", "compiled"),
     *("config", "log_dir", "resume", "overwrite"),

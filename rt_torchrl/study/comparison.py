@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE_LINE, ROLES, caption, legend_below, panels
 from rt_torchrl.runs.settings import BESIDE, read_settings
-from rt_torchrl.runs.summary import preferred_role
+from rt_torchrl.runs.summary import judged_on_the_system, on_the_twin
 from rt_torchrl.study.results import Entry, merit_means, numbers
 
 APART = (*BESIDE, "seed", "log_dir", "resume", "overwrite", "threads", "config", "loggers")
@@ -42,7 +42,8 @@ def entries_of(folders: Sequence[Path]) -> tuple[list[Entry], list[Entry]]:
     found = [_metrics(folder) for folder in folders]
     for name, values in (
         ("plant", [one["plant"] for one in settings]),
-        ("number of unseen episodes", [one["summary"]["unseen"]["episodes"] for one in found]),
+        ("number of unseen episodes", [judged_on_the_system(one["summary"])[0]["episodes"] for one in found]),
+        ("place of the unseen episodes", [_place(one["summary"]) for one in found]),
     ):
         if len(set(values)) > 1:
             raise ValueError(f"the runs differ in their {name} ({', '.join(map(str, values))}); compare runs of one.")
@@ -50,7 +51,7 @@ def entries_of(folders: Sequence[Path]) -> tuple[list[Entry], list[Entry]]:
     grouped = {kind: [one for one, its in zip(found, kinds, strict=True) if its == kind] for kind in kinds}
     controllers: dict[str, dict[str, Any]] = {}
     for one in found:
-        unseen = one["summary"]["unseen"]
+        unseen, _ = judged_on_the_system(one["summary"])
         for name, result in unseen["baselines"].items():
             controllers.setdefault(name, {"costs": unseen["costs"][name], "merit": result["merit"]})
     runs = [_entry(kind, group) for kind, group in grouped.items()]
@@ -132,8 +133,12 @@ def _shown(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value).replace("_", "-")
 
 
+def _place(summary: dict[str, Any]) -> str:
+    return "real system" if on_the_twin(summary["unseen"]) else "simulation"
+
+
 def _entry(kind: str, found: list[dict[str, Any]]) -> Entry:
-    unseen = [(one["summary"]["unseen"], preferred_role(one["summary"])) for one in found]
+    unseen = [judged_on_the_system(one["summary"]) for one in found]
     merits = [merit_means(one["merit"][live]) for one, live in unseen]
     return Entry(
         name=kind,

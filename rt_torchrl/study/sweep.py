@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.settings import read_settings
-from rt_torchrl.runs.summary import preferred_role
+from rt_torchrl.runs.summary import judged_on_the_system
 from rt_torchrl.study.scheduling import side_by_side
 from rt_torchrl.study.training import options_of, require_options, written_in
 
@@ -80,9 +80,16 @@ class SeededRun:
             raise KeyboardInterrupt  # the recipe has taken the signal, and wrote what it had done
 
     def cost(self) -> float:
-        """Mean J_a of the policy that the referee prefers, on the unseen episodes; infinite if it diverges there."""
+        """Mean J_a of the policy that the referee prefers, on the unseen episodes; infinite if it diverges there.
+
+        On a real system of unknown closure it is that of the live policy on its flights after the training.
+
+        Raises:
+            ValueError: if the training was judged on its own twin alone.
+        """
         summary = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))["summary"]
-        found = summary["unseen"][f"J_a_{preferred_role(summary)}"]["mean"]
+        judged, role = judged_on_the_system(summary)
+        found = judged[f"J_a_{role}"]["mean"]
         return float("inf") if found is None else float(found)
 
 
