@@ -79,3 +79,28 @@ def test_runs_that_cannot_be_compared_are_refused(tmp_path):
     (first / "metrics.json").unlink()
     with pytest.raises(ValueError, match="has no metrics.json: it is not finished"):
         entries_of([first])
+
+
+def on_the_twin(folder, **real):
+    """Make a finished run one that was judged on its own twin."""
+    file = folder / "metrics.json"
+    metrics = json.loads(file.read_text())
+    metrics["summary"]["unseen"]["judged_on"] = "twin"
+    metrics["summary"] |= real
+    file.write_text(json.dumps(metrics))
+    return folder
+
+
+def test_costs_on_different_twins_are_not_compared(tmp_path):
+    folders = [leave(tmp_path / f"{seed}", arm="model_based", seed=seed, costs=[1.0, 2.0]) for seed in (0, 1)]
+    for folder in folders:
+        on_the_twin(folder)
+    with pytest.raises(ValueError, match="judged on its own twin alone.*--real-unseen"):
+        entries_of(folders)
+    found = {"episodes": 2, "J_a": {"mean": 5.0}, "merit": {"power [W]": {"mean": 8.0}}}
+    real = {"controllers": {"model_based": found, "PI": found}, "costs": {"model_based": [4.0, 6.0], "PI": [7.0, 9.0]}}
+    runs, controllers = entries_of([on_the_twin(folder, real_unseen=real) for folder in folders])
+    assert [(entry.name, entry.mean) for entry in (*runs, *controllers)] == [(runs[0].name, 5.0), ("PI", 8.0)]
+    simulated = leave(tmp_path / "2", arm="model_based", seed=2, costs=[1.0, 2.0])
+    with pytest.raises(ValueError, match="differ in their place of the unseen episodes"):
+        entries_of([*folders, simulated])

@@ -48,12 +48,14 @@ class Machine(Rig):
         return told
 
 
-def run_on(machine, folder, *, baselines=None, first=None, callbacks=(), twinning=SMALL, untrained=2, **options):
+def run_on(
+    machine, folder, *, closure=None, baselines=None, first=None, callbacks=(), twinning=SMALL, untrained=2, **options
+):
     own = {"compiled": False, "episodes": 2, "unseen": 3, "figures": False, "untrained": untrained}
     config = RunConfig(log_dir=folder, twinning=twinning, **own, **options)
     plant = machine.inner.plant
     given = {"baselines": baselines, "first": first, "callbacks": callbacks}
-    return Run(config, plant, env=connected(plant, rig=machine), **given)
+    return Run(config, plant, env=connected(plant, rig=machine, closure=closure), **given)
 
 
 def machine():
@@ -160,3 +162,12 @@ def test_after_an_interrupt_nothing_flies(tmp_path):
     pressed = [lambda episodes: signal.raise_signal(signal.SIGINT)]
     metrics = run_on(rig, tmp_path, real_unseen=2, baselines={"cascade": Asked}, callbacks=pressed).train()
     assert len(metrics["episodes"]) == 1 == len(rig.flights) and "real_unseen" not in metrics["summary"]
+
+
+def test_a_system_with_a_known_closure_is_simulated_and_the_table_says_so(tmp_path, capsys):
+    """As the served turbine: a real system, of which the recipe knows the true closure."""
+    rig = machine()
+    unseen = run_on(rig, tmp_path, closure=rig.inner.plant.closure).train()["summary"]["unseen"]
+    assert len(rig.flights) == 2 and unseen["judged_on"] == "simulation of the real system"
+    assert unseen["J_p"]["mean"] is not None
+    assert "in simulation, with the closure that the real system was given" in capsys.readouterr().out
