@@ -34,7 +34,7 @@ from .systems.operating_limits import OperatingLimits
 from .systems.operating_limits_config import OperatingLimitsConfig
 from .systems.operation.config import OperationConfig
 from .systems.protocols.connected_plant import ConnectedPlant
-from .systems.protocols.link import Link, LinkLostError
+from .systems.protocols.link import Link, LinkLostError, RefusedRequestError
 from .systems.protocols.modbus import ModbusLink
 from .systems.protocols.opc_ua import OpcUaLink
 from .systems.protocols.relay import Relay
@@ -206,6 +206,7 @@ __all__ = [
     "RecordedFlights",
     "Referee",
     "RefereeConfig",
+    "RefusedRequestError",
     "ReinforcementTwinning",
     "Relay",
     "ResonantActuator",

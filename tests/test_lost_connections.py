@@ -1,5 +1,6 @@
 """Lost connections between a client and a served plant: cut off, and silent as with a cable that was pulled."""
 
+import threading
 import time
 
 import pytest
@@ -8,6 +9,8 @@ from fault_counts import count
 from linear_quadratic import LinearQuadratic
 from served_plants import served
 
+from rt_torchrl.systems.protocols.connected_plant import ConnectedPlant
+from rt_torchrl.systems.protocols.link import LinkLostError
 from rt_torchrl.systems.protocols.relay import Relay
 from rt_torchrl.systems.protocols.served_system import served_system
 
@@ -96,3 +99,50 @@ def test_thirty_lost_connections_bring_the_safe_action_and_the_run_goes_on(proto
         raise
     for _ in moments:
         count(what, "safe action in time, the run went on")
+
+
+class Brittle:
+    """A link on which the first writes after each of some connections fail."""
+
+    def __init__(self, failures):
+        self.failures, self.connections, self.sample = failures, 0, 0.0
+
+    def connect(self):
+        self.connections += 1
+
+    def read(self):
+        self.sample += 1.0
+        return {"speed": 1.0, "sample": self.sample}
+
+    def write(self, values):
+        if self.connections <= self.failures:
+            raise LinkLostError("cut")
+
+    def close(self):
+        pass
+
+
+class Slow(ConnectedPlant):
+    """A client whose mender takes a while from its new connection to its end."""
+
+    @property
+    def _connected(self):
+        return self.__dict__.get("up", False)
+
+    @_connected.setter
+    def _connected(self, value):
+        self.__dict__["up"] = value
+        if value and threading.current_thread() is not threading.main_thread():
+            time.sleep(0.1)
+
+
+def test_a_loss_right_after_a_new_connection_is_mended_too():
+    link = Brittle(failures=2)
+    env = Slow(link, {"state": ("speed",)}, ("force",), PLANT.actions, period=0.01, sample="sample")
+    row = env.reset()
+    for _ in range(100):
+        row = env.step(row.set("action", torch.tensor([ASKED]).double()))["next"]
+        if link.connections > 2 and row["state"].isfinite().all():
+            break
+    assert row["state"].tolist() == [1.0] and (link.connections, env.losses) == (3, 2)
+    env.close()

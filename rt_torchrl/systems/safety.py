@@ -12,7 +12,7 @@ from torchrl.data import Binary, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.systems.action_limits import ActionLimits, components
-from rt_torchrl.systems.around_system import AroundSystem, require_interval
+from rt_torchrl.systems.around_system import AroundSystem, innermost, require_interval
 from rt_torchrl.systems.safety_config import SafetyConfig
 from rt_torchrl.systems.safety_report import SafetyEvent, SafetyReport
 
@@ -221,7 +221,11 @@ class SafetyLayer(AroundSystem):
         missing = [key for key in self._watched if key not in found]
         said = {"missing": f"{', '.join(missing)}, which the system declares to observe"} if missing else {}
         there = {key: found[key] for key in self._watched if key in found}
-        return said | self.watchdog.faults(there, elapsed)
+        faults = said | self.watchdog.faults(there, elapsed)
+        reasons: dict[str, str] = getattr(innermost(self.env), "reasons", {})  # of a machine that says why
+        if reasons and "not finite" in faults:
+            faults["not finite"] += f" ({'; '.join(f'{tag}: {why}' for tag, why in reasons.items())})"
+        return faults
 
     def _not_followed(self, sent: Tensor, applied: Tensor) -> dict[str, str]:
         """Actuators that do not do what was sent; the record holds what they have done instead."""

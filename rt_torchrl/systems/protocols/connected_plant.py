@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.systems.pace import Pace
-from rt_torchrl.systems.protocols.link import LateAnswerError, Link, LinkLostError
+from rt_torchrl.systems.protocols.link import LateAnswerError, Link, LinkLostError, RefusedRequestError
 
 FRESH = 0.5
 """Share of the period for which the client waits for a new sample after it was due."""
@@ -34,14 +34,17 @@ class ConnectedPlant(EnvBase):
     The plant's clock is the master: where a tag counts samples, the client follows it, and a reading that is no newer
     than the last one is not passed on as a new one. Where a reading does not come in time, because the connection is
     lost or the plant has stopped, the entries are NaN until the plant answers again. A safety layer in front of this
-    environment then marks them, and asks for its fallback. The entry ``skipped`` is the number of samples between this
-    reading and the last one that nobody read; where it is not zero, a transition is longer than one interval.
+    environment then marks them, and asks for its fallback. The entries are NaN as well after an interval whose command
+    did not get through, because nobody knows what acted in it; a tag that the plant marks as not good is NaN alone. A
+    request that the plant refuses is an error. The entry ``skipped`` is the number of samples between this reading and
+    the last one that nobody read; where it is not zero, a transition is longer than one interval.
 
     The plant must have a watchdog of its own, which brings its safe action when commands stay out, as
     :class:`ServedPlant` has. A thread connects again, so that the pace is kept.
 
     The attribute ``losses`` counts lost connections, ``late`` the answers that did not come in time, ``stale`` the
-    readings of a plant that answered and had no new sample, and ``skipped`` all samples that nobody read.
+    readings of a plant that answered and had no new sample, and ``skipped`` all samples that nobody read. The attribute
+    ``reasons`` says for the tags of the last reading that are NaN, or for all of them, why they are.
 
     Args:
         link: connection to the plant.
@@ -58,6 +61,7 @@ class ConnectedPlant(EnvBase):
     Raises:
         ValueError: if there are no entries, or not one command for each action, or a time is not positive, or a number
             is to be answered that nobody counts; in a reset, if the plant does not answer.
+        RefusedRequestError: in a reset or a step, if the plant refuses a request.
     """
 
     def __init__(
@@ -91,7 +95,11 @@ class ConnectedPlant(EnvBase):
         self.losses = self.late = self.stale = self.skipped = 0
         self._in_a_row = self._gap = 0
         self._sample, self._connected, self._closing = -math.inf, False, False
+        self.reasons: dict[str, str] = {}
+        self._lost = ""  # why the last request failed
+        self._refused: RefusedRequestError | None = None  # what the plant has refused beside the control loop
         self._mender: threading.Thread | None = None
+        self._lock = threading.Lock()  # connection and mender change together
         double = {"dtype": torch.float64}
         sizes = {key: len(tags) for key, tags in entries.items()} | {"skipped": 1}
         self.observation_spec = Composite({key: Unbounded((n,), **double) for key, n in sizes.items()})
@@ -104,10 +112,13 @@ class ConnectedPlant(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         """Connect, if there is no connection, and wait for a sample."""
-        until, error = self._clock() + self._patience, ""
+        until = self._clock() + self._patience
         while self._clock() < until:
+            self._require_not_refused()
             try:
-                if not self._connected and self._mender is None:
+                with self._lock:
+                    idle = not self._connected and self._mender is None
+                if idle:
                     self.link.connect()
                     self._connected = True
                 self.pace.begin()
@@ -115,23 +126,38 @@ class ConnectedPlant(EnvBase):
                 if found is not None:
                     return self._entries(found)
             except LinkLostError as lost:
-                self._connected, error = False, f": {lost}"
+                self._connected, self._lost = False, str(lost)
             self._sleep(min(AGAIN, self.pace.period))
-        raise ValueError(f"the plant has not answered for patience={self._patience:g} s{error}")
+        said = f": {self._lost}" if self._lost else ""
+        raise ValueError(f"the plant has not answered for patience={self._patience:g} s{said}")
+
+    def _require_not_refused(self) -> None:
+        """Raise in the control loop what the plant has refused beside it."""
+        refused, self._refused = self._refused, None
+        if refused is not None:
+            raise refused
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         values = dict(zip(self._commands, tensordict["action"].reshape(-1).tolist(), strict=True))
         if self._answered is not None:
             values[self._answered] = self._sample
-        if self._connected:
-            try:
-                self.link.write(values)
-            except LinkLostError as error:
-                self._lose(error)
+        self._require_not_refused()
+        through = self._connected and self._written(values)
         self.pace.wait()
         found = self._fresh() if self._connected else None
+        if not through:
+            found, self.reasons = None, {"commands": f"not written: {self._lost}"}
         ends = {"done": torch.zeros(1, dtype=torch.bool), "reward": torch.zeros(1, dtype=torch.float64)}
         return self._entries(found).update(ends)
+
+    def _written(self, values: Mapping[str, float]) -> bool:
+        """Write the commands; whether they got through."""
+        try:
+            self.link.write(values)
+        except LinkLostError as error:
+            self._lose(error)
+            return False
+        return True
 
     def _fresh(self) -> dict[str, float] | None:
         """A reading newer than the last one; None if none comes in time."""
@@ -149,11 +175,19 @@ class ConnectedPlant(EnvBase):
                 looks += 1
                 if self._clock() >= until:
                     self.stale += 1
+                    self.reasons = {"all tags": self._stale_because(sample)}
                     return None
                 self._sleep(self.pace.period / LOOKS)
         except LinkLostError as error:
             self._lose(error)
+            self.reasons = {"all tags": self._lost}
             return None
+
+    def _stale_because(self, sample: float) -> str:
+        if math.isfinite(sample):
+            return f"sample {sample:.0f} was read before"
+        why = getattr(self.link, "quality", {}).get(self._sample_tag, sample)
+        return f"tag {self._sample_tag} counts no samples: {why}"
 
     def _follow(self, sample: float, looks: int) -> None:
         """Keep the phase of the plant's clock: be there when the sample comes, and not long after it."""
@@ -164,6 +198,10 @@ class ConnectedPlant(EnvBase):
 
     def _entries(self, found: dict[str, float] | None) -> TensorDict:
         values: dict[str, Tensor] = {}
+        if found is not None:
+            quality: Mapping[str, str] = getattr(self.link, "quality", {})
+            used = {tag for tags in self._entries_of.values() for tag in tags}
+            self.reasons = {tag: said for tag, said in quality.items() if tag in used}
         for key, tags in self._entries_of.items():
             numbers = [math.nan if found is None else found[tag] for tag in tags]
             values[key] = torch.tensor(numbers, dtype=torch.float64)
@@ -173,26 +211,35 @@ class ConnectedPlant(EnvBase):
 
     def _lose(self, error: LinkLostError) -> None:
         """Note a late answer, or a lost connection, and then connect again beside the control loop."""
+        self._lost = str(error)
         if isinstance(error, LateAnswerError):
             self.late += 1
             self._in_a_row += 1
             if self._in_a_row < TOLERATED:
                 return
-        self._connected, self._in_a_row = False, 0
+        self._in_a_row = 0
         self.losses += 1
-        if self._mender is None:
-            self._mender = threading.Thread(target=self._mend, daemon=True)
-            self._mender.start()
+        with self._lock:
+            self._connected = False
+            if self._mender is None:
+                self._mender = threading.Thread(target=self._mend, daemon=True)
+                self._mender.start()
 
     def _mend(self) -> None:
-        while not self._closing:
+        connected = False
+        while not connected and not self._closing:
             try:
                 self.link.connect()
-                self._connected = True
+                connected = True
+            except RefusedRequestError as error:
+                self._refused = error  # which the control loop raises
                 break
-            except LinkLostError:
+            except LinkLostError as error:
+                self._lost = str(error)
                 time.sleep(AGAIN)
-        self._mender = None
+        # Together: a loss right after a new connection finds no mender, and starts the next one.
+        with self._lock:
+            self._connected, self._mender = connected, None
 
     def close(self, **kwargs: Any) -> None:
         """Close the connection; the plant's own watchdog then brings its safe action."""

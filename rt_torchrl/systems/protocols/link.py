@@ -17,11 +17,20 @@ class LateAnswerError(LinkLostError):
     """An answer did not come in time; the connection may still be there."""
 
 
+class RefusedRequestError(ValueError):
+    """The plant answers, and refuses: a tag is unknown, may not be written, or does not take the value.
+
+    Another attempt would be refused as well; tags, types or rights must be mended.
+    """
+
+
 @runtime_checkable
 class Link(Protocol):
     """A connection to a plant's control system. A tag is a named number there.
 
-    All methods but ``connect`` answer within a fraction of the control period, or raise.
+    All methods but ``connect`` answer within a fraction of the control period, or raise. A tag that the control system
+    marks as not good is NaN; a link may say why in an attribute ``quality``, a text for each tag of the last reading
+    that is not good.
     """
 
     def connect(self) -> None:
@@ -29,6 +38,7 @@ class Link(Protocol):
 
         Raises:
             LinkLostError: if the plant does not answer.
+            RefusedRequestError: if a tag is unknown there, or cannot take a number.
         """
 
     def read(self) -> dict[str, float]:
@@ -36,6 +46,7 @@ class Link(Protocol):
 
         Raises:
             LinkLostError: if the plant does not answer in time.
+            RefusedRequestError: if it refuses.
         """
 
     def write(self, values: Mapping[str, float]) -> None:
@@ -43,6 +54,7 @@ class Link(Protocol):
 
         Raises:
             LinkLostError: if the plant does not answer in time.
+            RefusedRequestError: if it refuses a value.
         """
 
     def close(self) -> None:

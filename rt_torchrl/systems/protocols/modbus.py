@@ -4,12 +4,14 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, require_timeout
+from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, RefusedRequestError, require_timeout
 
 WIDTH = 4
 """Number of registers of a number in double precision."""
 MOST = 120
 """Greatest number of registers in one request."""
+REFUSALS = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure"}
+"""Exceptions by which a server refuses a request; after the others, such as a busy device, it may take the next one."""
 WRITTEN_AT = 1000
 """Address of the first register that a client of a served plant writes."""
 
@@ -95,13 +97,17 @@ class ModbusLink:
     def connect(self) -> None:
         self._client.close()
         self._joined = False
-        if not self._asked(self._client.connect):
+        if not self._asked("to connect", self._client.connect):
             raise LinkLostError(f"{self.address} does not answer.")
         self._joined = True
 
     def read(self) -> dict[str, float]:
         answer = self._asked(
-            self._client.read_holding_registers, self._first, count=self._count, device_id=self._device
+            f"to read {', '.join(self._read)}",
+            self._client.read_holding_registers,
+            self._first,
+            count=self._count,
+            device_id=self._device,
         )
         words = answer.registers
         found = {}
@@ -118,13 +124,21 @@ class ModbusLink:
         words: list[int] = []
         for tag in order:
             words += self._client.convert_to_registers(float(values[tag]), self._kind)
-        self._asked(self._client.write_registers, self._first_written, words, device_id=self._device)
+        what = "to write " + ", ".join(f"{tag} = {values[tag]:g}" for tag in order)
+        self._asked(what, self._client.write_registers, self._first_written, words, device_id=self._device)
 
-    def _asked(self, request: Any, *arguments: Any, **options: Any) -> Any:
+    def _asked(self, what: str, request: Any, *arguments: Any, **options: Any) -> Any:
         """The answer to a request.
 
+        Args:
+            what: the request in words.
+            request: function of the package that makes it.
+            arguments: its arguments, of which the first is the address of the first register.
+            options: more arguments.
+
         Raises:
-            LinkLostError: if it does not come in time, or the server refuses.
+            LinkLostError: if it does not come in time.
+            RefusedRequestError: if the server refuses.
         """
         try:
             if self._joined and not self._client.connected and not self._client.connect():
@@ -136,10 +150,16 @@ class ModbusLink:
         except (OSError, self._package.ModbusException) as error:
             self._client.close()
             raise LinkLostError(f"{self.address}: {type(error).__name__}: {error}") from error
-        if not isinstance(answer, bool) and answer.isError():
-            self._client.close()
-            raise LinkLostError(f"{self.address} refuses: {answer}")
-        return answer
+        if isinstance(answer, bool) or not answer.isError():
+            return answer
+        code = getattr(answer, "exception_code", None)
+        if code in REFUSALS:
+            count = options.get("count") or len(arguments[1])
+            raise RefusedRequestError(
+                f"{self.address} refuses {what}, registers {arguments[0]} to {arguments[0] + count - 1}: exception "
+                f"{code}, {REFUSALS[code]}. Mend the addresses, or what the machine lets a client read and write."
+            )
+        raise LateAnswerError(f"{self.address} does not answer {what} now: {answer}")
 
     def close(self) -> None:
         self._joined = False

@@ -1,0 +1,262 @@
+"""What a machine answers tag by tag: a command that it refuses, a type that is not ours, and a reading of bad quality.
+
+The servers are those of asyncua and pymodbus, with nodes and registers as a control system has them, not as ours does.
+"""
+
+import asyncio
+import contextlib
+import math
+import struct
+import threading
+
+import pytest
+import torch
+from served_plants import free_port
+from test_served import ANSWERED, PLANT, SAMPLE, TAGS, Line, Time
+
+from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, SafetyConfig, SafetyLayer
+from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, RefusedRequestError
+from rt_torchrl.systems.sound_part import sound_part
+
+HELD = {"double": 0.0, "float": 0.0, "whole": 0, "switch": False, "text": "off", "fixed": 0.0}
+"""Nodes of the server with their first values; ``fixed`` takes no value from a client."""
+
+
+class Controls:
+    """An OPC UA server in a thread of the test, whose nodes the test reads and marks."""
+
+    def __init__(self, ua, server, nodes, loop, url):
+        self.ua, self.nodes, self.url, self._server, self._loop = ua, nodes, url, server, loop
+
+    def _now(self, work):
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(10.0)
+
+    def held(self, tag):
+        return self._now(self.nodes[tag].read_value())
+
+    def mark(self, tag, value, status):
+        """Let a sensor report a value with a status."""
+        code = self.ua.StatusCode(getattr(self.ua.StatusCodes, status))
+        kept = self.ua.Variant(value, self.ua.VariantType.Double)
+        self._now(self._server.write_attribute_value(self.nodes[tag].nodeid, self.ua.DataValue(kept, code)))
+
+    def link(self, read=("position", "velocity"), written=("double",), timeout=5.0):
+        names = [{tag: f"ns=2;s={tag}" for tag in tags} for tags in (read, written)]
+        return OpcUaLink(self.url, *names, timeout=timeout)
+
+
+@contextlib.contextmanager
+def controls():
+    asyncua = pytest.importorskip("asyncua")
+    ua, started, found = asyncua.ua, threading.Event(), {}
+    kinds = {"float": ua.VariantType.Float, "whole": ua.VariantType.Int16}
+
+    async def serve():
+        server, ended = asyncua.Server(), asyncio.Event()
+        await server.init()
+        server.set_endpoint(url := f"opc.tcp://127.0.0.1:{free_port()}")
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        await server.register_namespace("urn:test")
+        nodes = {}
+        for tag, value in (HELD | {"position": 0.5, "velocity": -0.25}).items():
+            identifier = ua.NodeId.from_string(f"ns=2;s={tag}")
+            nodes[tag] = await server.nodes.objects.add_variable(identifier, tag, value, kinds.get(tag))
+            if tag in HELD and tag != "fixed":
+                await nodes[tag].set_writable()
+        async with server:
+            found.update(controls=Controls(ua, server, nodes, asyncio.get_running_loop(), url), end=ended)
+            started.set()
+            await ended.wait()
+
+    work = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    work.start()
+    assert started.wait(30.0)
+    try:
+        yield found["controls"]
+    finally:
+        found["controls"]._loop.call_soon_threadsafe(found["end"].set)
+        work.join(30.0)
+
+
+@pytest.fixture(scope="module")
+def server():
+    with controls() as found:
+        yield found
+
+
+def written(server, **values):
+    link = server.link(written=tuple(values))
+    link.connect()
+    try:
+        link.write(values)
+    finally:
+        link.close()
+
+
+def test_a_command_takes_the_type_of_its_node(server):
+    written(server, double=1.5, float=1.1, whole=-7.0)
+    (single,) = struct.unpack("f", struct.pack("f", 1.1))
+    assert (server.held("double"), server.held("float"), server.held("whole")) == (1.5, single, -7)
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "message"),
+    [
+        ("switch", 1.0, "'switch'.* holds Boolean.*a node of a numeric type"),
+        ("text", 1.0, "'text'.* holds String.*a node of a numeric type"),
+        ("whole", 1.5, "'whole' = 1.5 .* Int16.* whole numbers from -32768 to 32767"),
+        ("whole", 4e4, "'whole' = 40000 .* Int16.* whole numbers from -32768 to 32767"),
+        ("float", 1e39, r"'float' = 1e\+39 .* Float"),
+        ("fixed", 1.0, "'fixed' = 1 .*BadUserAccessDenied"),
+        ("unknown", 1.0, "'unknown'.*BadNodeIdUnknown"),
+    ],
+)
+def test_a_command_that_does_not_fit_its_node_is_refused_with_tag_value_and_reason(server, tag, value, message):
+    with pytest.raises(RefusedRequestError, match=message):
+        written(server, **{tag: value})
+    assert [server.held(name) for name in ("switch", "text", "fixed")] == [False, "off", 0.0]
+
+
+def guarded(link, plant=PLANT, command="double"):
+    """A machine that does not report what it has applied."""
+    period = 0.02
+    env = ConnectedPlant(link, {"state": ("position", "velocity")}, (command,), plant.actions, period=period)
+    layer = SafetyLayer(env, SafetyConfig(interval=plant.dt), fallback=(0.0,))
+    applied = Reading(keys=("applied",))
+    return RealSystem(layer, plant, state=Reading(keys=("state",)), exogenous=(0.0,), applied=applied, seed=None)
+
+
+def act(system, row, command=1.0):
+    return system.step(row.set("action", torch.tensor([[command]]).double()))
+
+
+def test_a_machine_that_refuses_a_command_stops_the_first_interval_with_its_reason(server):
+    system = guarded(server.link(written=("fixed",)), command="fixed")
+    row = system.reset()
+    with pytest.raises(ValueError, match="'fixed' = 1 .*BadUserAccessDenied"):
+        act(system, row)
+    assert system.env.env.losses == 0
+    system.close()
+
+
+@pytest.mark.parametrize("status", ["UncertainLastUsableValue", "BadSensorFailure"])
+def test_a_reading_that_is_not_good_is_missing_and_named_and_the_connection_stays(server, status):
+    server.mark("velocity", -0.25, "Good")
+    system = guarded(server.link())
+    row = act(system, system.reset())
+    assert row["next", "state"].tolist() == [[0.5, -0.25]] and not row["next", "refused"]
+    server.mark("velocity", 77.0, status)
+    row = act(system, system.step_mdp(row))
+    assert row["next", "refused"] and row["next", "state"].tolist() == [[0.5, -0.25]]  # the last good ones
+    client = system.env.env
+    assert client.losses == client.late == 0
+    (said,) = [event.reasons["not finite"] for event in system.env.report.events if "not finite" in event.reasons]
+    assert f"velocity: {status}" in said and "position" not in said
+    server.mark("velocity", 0.125, "Good")
+    row = act(system, system.step_mdp(row))
+    assert row["next", "state"].tolist() == [[0.5, 0.125]] and not row["next", "refused"]
+    system.close()
+
+
+def test_a_link_reads_what_is_good_beside_what_is_not(server):
+    server.mark("velocity", 3.0, "BadSensorFailure")
+    link = server.link()
+    link.connect()
+    found = link.read()
+    assert found["position"] == 0.5 and math.isnan(found["velocity"])
+    assert link.quality == {"velocity": "BadSensorFailure"}
+    link.close()
+
+
+class Unreliable(Line):
+    """A line whose requests fail where the test says so, to a plant that does not report what it has applied."""
+
+    def __init__(self, time, period):
+        super().__init__(time, period)
+        self.fails_at, self.error, self.writes = set(), None, 0
+
+    def write(self, values):
+        self.writes += 1
+        if self.writes in self.fails_at:
+            raise self.error
+        super().write(values)
+
+
+@pytest.mark.parametrize("error", [LateAnswerError("busy"), LinkLostError("cut")])
+def test_an_interval_whose_command_did_not_get_through_is_not_learned_from(error):
+    """The machine holds its last command then, or its safe one; the record would say that it had the new one."""
+    line = Unreliable(Time(), 0.1)
+    line.fails_at, line.error = {6}, error
+    tags, actions, answers = TAGS.entries, PLANT.actions, {"sample": SAMPLE, "answered": ANSWERED}
+    client = ConnectedPlant(
+        *(line, {key: tags[key] for key in ("state", "exogenous")}, TAGS.commands, actions),
+        **{"period": 0.1, "clock": line.time, "sleep": line.time.sleep, **answers},
+    )
+    layer = SafetyLayer(client, SafetyConfig(interval=0.1), fallback=(0.0,))
+    places = {key: Reading(keys=(key,)) for key in ("state", "exogenous", "applied")}
+    system = RealSystem(layer, PLANT, **places, seed=None)
+    rows, row = [], system.reset()
+    for _ in range(PLANT.n_steps):
+        row = act(system, row, 0.5)
+        rows.append(row)
+        row = system.step_mdp(row)
+        if client._mender is not None:
+            client._mender.join()
+    found = sound_part(torch.stack(rows, 1)[0], PLANT, layer.report)
+    assert found.parts == [(0, 5), (7, PLANT.n_steps)]
+    (said,) = [event.reasons["not finite"] for event in layer.report.events if event.step == 5]
+    assert str(error) in said
+    system.close()
+
+
+def modbus_server(addresses):
+    """A Modbus server whose holding registers are these; gives its port and the function that ends it."""
+    pytest.importorskip("pymodbus")
+    from pymodbus import simulator
+    from pymodbus.server import ModbusTcpServer
+
+    port, started, loops = free_port(), threading.Event(), []
+
+    async def serve():
+        registers = [
+            simulator.SimData(first, values=[0] * count, datatype=simulator.DataType.REGISTERS)
+            for first, count in addresses
+        ]
+        device = simulator.SimDevice(id=1, simdata=registers)
+        running = ModbusTcpServer(device, address=("127.0.0.1", port))
+        await running.serve_forever(background=True)
+        ended = asyncio.Event()
+        loops.append((asyncio.get_running_loop(), ended))
+        started.set()
+        await ended.wait()
+        await running.shutdown()
+
+    work = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    work.start()
+    assert started.wait(30.0)
+
+    def end():
+        loop, ended = loops[0]
+        loop.call_soon_threadsafe(ended.set)
+        work.join(30.0)
+
+    return port, end
+
+
+def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason():
+    port, end = modbus_server([(0, 8)])
+    link = ModbusLink("127.0.0.1", port, {"position": 0, "velocity": 4}, {"torque": 1000}, timeout=2.0)
+    try:
+        link.connect()
+        assert link.read() == {"position": 0.0, "velocity": 0.0}
+        with pytest.raises(RefusedRequestError, match=r"torque = 1.5.*registers 1000 to 1003.*illegal data address"):
+            link.write({"torque": 1.5})
+        assert link.read() == {"position": 0.0, "velocity": 0.0}  # the connection is still there
+        link.close()
+        beyond = ModbusLink("127.0.0.1", port, {"pressure": 40}, {"torque": 0}, timeout=2.0)
+        beyond.connect()
+        with pytest.raises(RefusedRequestError, match=r"pressure.*registers 40 to 43.*illegal data address"):
+            beyond.read()
+        beyond.close()
+    finally:
+        end()
