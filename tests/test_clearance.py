@@ -8,6 +8,9 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_algorithm import twinning
 
+from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.runs.real_side import Resting, simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_settings import as_written
@@ -143,3 +146,60 @@ def test_limits_that_cannot_be_are_refused(limits, message):
 def test_limits_need_a_safety_layer():
     with pytest.raises(ValueError, match="no safety layer that holds them"):
         twinning(limits=LIMITS)
+
+
+class Lagged(ClassicalController):
+    """a = −2 m, where m follows the velocity."""
+
+    memory_size = 1
+
+    def act(self, state, memory):
+        memory = 0.8 * memory + 0.2 * state[..., 1:]
+        return -2.0 * memory, memory
+
+
+def test_the_memory_of_the_fallback_goes_on_while_the_policy_acts():
+    """At the second trip the former controller knows what it would know had it watched all the time."""
+    limits = OperatingLimitsConfig(states={"velocity": (-0.7, 0.7)})
+    config = RunConfig(twinning=dataclasses.replace(SMALL, limits=limits), seed=3)
+    plant = LinearQuadratic(horizon=4.0)
+    env = simulated(plant, config, Lagged, device=torch.device("cpu"), compiled=False)
+    row, memory, fallback, acted = env.reset(), 0.0, [], {}
+    for k in range(40):
+        memory = 0.8 * memory + 0.2 * row["state"][0, 1].item()
+        tripped, asked = row["tripped"].item(), 1.0 if k < 20 else -1.0
+        if tripped:
+            acted[k] = -2.0 * memory
+        row = env.step(row.set("action", torch.tensor([[asked]]).double()))
+        if tripped:
+            fallback.append((k, row["next", "applied"].item()))
+        row = env.step_mdp(row)
+    steps = [k for k, _ in fallback]
+    assert len(steps) > 4 and any(later > first + 1 for first, later in zip(steps, steps[1:], strict=False))
+    assert dict(fallback) == pytest.approx(acted, rel=1e-12)
+
+
+def test_the_fallback_is_told_the_time_of_the_episode():
+    times = []
+
+    class Clocked(ActingController):
+        def begin(self):
+            times.append("begin")
+            super().begin()
+
+        def act(self, t, state, exogenous):
+            times.append(round(t, 9))
+            return super().act(t, state, exogenous)
+
+    plant = LinearQuadratic(horizon=2.0)
+    controller = Clocked(Lagged(plant))
+    layer = SafetyLayer(
+        PlantEnv(plant, seed=0),
+        SafetyConfig(interval=plant.dt, limits={"state": ((-9.0, -0.7), (9.0, 0.7))}),
+        fallback=Resting(controller, torch.zeros(1, 1).double(), dt=plant.dt),
+    )
+    for _ in range(2):
+        row = layer.reset()
+        for _ in range(3):
+            row = layer.step_mdp(layer.step(row.set("action", torch.ones(1, 1).double())))
+    assert times == ["begin", 0.0, 0.1, 0.2] * 2

@@ -13,6 +13,7 @@ import pytest
 import torch
 from served_plants import free_port
 from test_served import ANSWERED, PLANT, SAMPLE, TAGS, Line, Time
+from test_served import connected as client_of
 
 from rt_torchrl import ConnectedPlant, ModbusLink, OpcUaLink, Reading, RealSystem, SafetyConfig, SafetyLayer
 from rt_torchrl.systems.protocols.link import LateAnswerError, LinkLostError, RefusedRequestError
@@ -260,3 +261,14 @@ def test_a_modbus_exception_is_a_refusal_with_the_tags_and_the_machines_reason()
         beyond.close()
     finally:
         end()
+
+
+def test_the_first_action_after_a_reset_moves_at_the_rate_from_what_the_machine_has_applied():
+    """A machine in operation has an action before the first one of a policy, and says which."""
+    line = Line(Time(), 0.1)
+    line.plant.published = lambda published=line.plant.published: published() | {"applied.force": 1.5}
+    layer = SafetyLayer(client_of(line), SafetyConfig(interval=0.1, rates=(5.0,)), fallback=(0.0,))
+    row = layer.reset()
+    layer.step(row.set("action", torch.tensor([-2.0]).double()))
+    assert line.answer["command.force"] == 1.0
+    layer.close()

@@ -16,6 +16,7 @@ from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
+from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 
@@ -25,20 +26,25 @@ class Resting:
     Args:
         controller: controller that the real system has had so far, which acts instead; None if there is none.
         rest: that action.
+        dt: control interval [s].
     """
 
-    def __init__(self, controller: ActingController | None, rest: Tensor):
+    def __init__(self, controller: StateFeedback | None, rest: Tensor, *, dt: float):
         self.controller, self.rest = controller, rest
+        self._dt, self._intervals = dt, 0
 
     def begin(self) -> None:
         """Begin an episode."""
+        self._intervals = 0
         if self.controller is not None:
             self.controller.begin()
 
     def __call__(self, reported: TensorDictBase) -> Tensor:
+        """The action of the next interval; the controller is asked in each one, so that its memory goes on."""
         if self.controller is None:
             return self.rest
-        return self.controller.act(0.0, reported["state"], reported["exogenous"])
+        t, self._intervals = self._intervals * self._dt, self._intervals + 1
+        return self.controller.act(t, reported["state"], reported["exogenous"])
 
 
 def simulated(
@@ -64,7 +70,7 @@ def simulated(
     low, high = (zero.new_tensor(end) for end in limits.actions)
     rest = torch.minimum(torch.maximum(zero, low), high).clamp(env.action_spec.space.low, env.action_spec.space.high)
     config_of_layer = SafetyConfig(interval=plant.dt, **limits.safety())
-    return SafetyLayer(env, config_of_layer, fallback=Resting(controller, rest))
+    return SafetyLayer(env, config_of_layer, fallback=Resting(controller, rest, dt=plant.dt))
 
 
 def judged_on(

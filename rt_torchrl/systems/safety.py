@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -55,7 +55,8 @@ class SafetyLayer(AroundSystem):
         env: environment of one real system, with batch size () or (1,).
         config: limits on actions and observations.
         fallback: action within the range, or controller that makes an action from the TensorDict of the last
-            observation; if it has a method ``begin``, that is called at every reset.
+            observation. One with a method ``begin`` has a memory: ``begin`` is called at every reset, and the
+            controller in every interval, so that its memory goes on while the policy acts and its action is not used.
         clock: wall clock [s].
 
     Raises:
@@ -148,6 +149,8 @@ class SafetyLayer(AroundSystem):
             read = {key: found[key].flatten().tolist() for key in self._watched if key in found}
             raise ValueError(f"the system begins with a fault, {faults}: it reads {read}; nothing was sent to it.")
         self._step_count, self._passed, self._last, self._good = 0, 0, self._rest, {}
+        if getattr(innermost(self.env), "reads_applied", False):
+            self._last = found["applied"].clone()  # of a machine in operation
         self._remember(found)
         if "applied" not in found:
             found["applied"] = self.action_spec.zero() if self._rest is None else self._rest.clone()
@@ -206,8 +209,12 @@ class SafetyLayer(AroundSystem):
         if not action.isfinite().all():
             reasons["asked"] = "not finite"
             self.watchdog.note(t, True)
-        if self.watchdog.tripped(t):
-            action = self._fallback(tensordict) if callable(self._fallback) else self._fallback
+        tripped = self.watchdog.tripped(t)
+        other = self._fallback
+        if callable(other) and (tripped or hasattr(other, "begin")):
+            other = other(tensordict)
+        if tripped:
+            action = cast(Tensor, other)
             reasons["fallback"] = "watchdog tripped"
             if action.shape != self.action_spec.shape or not action.isfinite().all():
                 raise ValueError(

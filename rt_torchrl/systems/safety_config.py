@@ -20,7 +20,8 @@ class SafetyConfig:
         high: greatest value of each action, where it is to be below the system's own.
         rates: greatest rate of change of each action [unit/s]; infinity does not limit it.
         rest: action, within its range, from which the rate limits the first action of an episode; with None the rate
-            of the first action is free.
+            of the first action is free. A :class:`ConnectedPlant` with an entry ``applied`` says what the machine has
+            applied last, and the rate limits the first action from there.
         ranges: admissible range (low, high) of entries of the observation, by name; each end is one number for all
             components or one number for each component.
         limits: range (low, high) of entries of the observation in which the system is to stay, as ``ranges``. Beyond it

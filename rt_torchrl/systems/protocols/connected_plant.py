@@ -107,6 +107,11 @@ class ConnectedPlant(EnvBase):
         self.action_spec = Bounded(low, high, (len(actions),), **double)
         self.reward_spec = Unbounded((1,), **double)
 
+    @property
+    def reads_applied(self) -> bool:
+        """Whether the entry ``applied`` is what the plant has applied, also at a reset."""
+        return "applied" in self._entries_of
+
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing, because a machine takes no seed."""
 
