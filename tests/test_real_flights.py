@@ -9,7 +9,7 @@ import signal
 
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL, small_run
 from test_classical import PD
 from test_real_system import Rig, connected
@@ -17,8 +17,12 @@ from torch.nn.utils import parameters_to_vector
 
 from rt_torchrl.evaluation.baseline import RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
+from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
+from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 
 STEPS = 20
 
@@ -171,3 +175,29 @@ def test_a_system_with_a_known_closure_is_simulated_and_the_table_says_so(tmp_pa
     assert len(rig.flights) == 2 and unseen["judged_on"] == "simulation of the real system"
     assert unseen["J_p"]["mean"] is not None
     assert "in simulation, with the closure that the real system was given" in capsys.readouterr().out
+
+
+def test_a_flight_in_which_the_twin_diverges_costs_no_number_and_the_others_do():
+    plant = LinearQuadratic(horizon=2.0)
+    episodes = TwinEpisodes(DigitalTwin(plant, LinearClosure(1e6 * torch.eye(2))), plant, 3)
+    episodes.initial_state[1], episodes.exogenous[1] = 0.0, 0.0
+    policy = LinearGain([[0.5, 0.5]])
+    costs = episodes.control_costs(policy)
+    assert costs.isfinite().tolist() == [False, True, False] and costs[1] == 0.0
+    assert torch.equal(episodes.judge(episodes.fly(policy)).control_costs.isfinite(), costs.isfinite())
+
+
+def test_flights_are_those_of_the_hypothesis_that_is_believed():
+    plant, lagged = LinearQuadratic(horizon=2.0), LaggedActuator(LinearQuadratic(horizon=2.0), "force", 0.4)
+    laws = LinearClosure(plant.true_closure), lagged.closure
+    twin = TwinEnsemble(plant, laws[0], {"lag": lagged}, {"lag": laws[1]})
+    policy, episodes = LinearGain([[0.5, 0.5]]), TwinEpisodes(twin, plant, 3)
+    for weights, physics in ({"as the twin": 1.0}, plant), ({"lag": 1.0}, lagged):
+        twin.weights = weights
+        s, expected = physics.at_rest(episodes.initial_state), 0.0
+        for k in range(STEPS):
+            t, z = torch.tensor(k * plant.dt), episodes.exogenous[:, k]
+            command = policy(physics.observe(t, s, z))
+            expected = expected + physics.running_cost(t, s, physics.actuate(s, command), z) / STEPS
+            s = physics.step(t, s, command, z, physics.closure).state
+        torch.testing.assert_close(episodes.control_costs(policy), expected.detach(), rtol=1e-9, atol=0.0)

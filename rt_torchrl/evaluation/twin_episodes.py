@@ -31,6 +31,11 @@ class TwinEpisodes(UnseenEpisodes):
         super().__init__(plant, count, device=device)
         self.closure, self._twin = None, twin
 
+    @property
+    def flying(self) -> Plant:
+        """The plant of the believed twin, which has more states than the real system's where a hypothesis adds some."""
+        return self._twin.believed.plant
+
     @torch.no_grad()
     def fly(self, policy: nn.Module) -> Trajectory:
         """Fly the episodes with a policy on the twin."""
@@ -42,22 +47,21 @@ class TwinEpisodes(UnseenEpisodes):
 
     def _flown(self, policy: nn.Module, some: slice) -> Trajectory:
         believed = self._twin.believed
-        flown = believed.control(policy, believed.plant.at_rest(self.initial_state[some]), self.exogenous[some])
-        return flown._replace(states=flown.states[..., : len(self.plant.states)])
+        return believed.control(policy, believed.plant.at_rest(self.initial_state[some]), self.exogenous[some])
 
     def _alone(self, policy: nn.Module, k: int) -> Trajectory:
         """One episode; not a number from its first interval on where the twin diverges in it."""
         try:
             return self._flown(policy, slice(k, k + 1)).each()[0]
         except DivergenceError:
-            start, exogenous = self.initial_state[k], self.exogenous[k]
+            start, exogenous = self.flying.at_rest(self.initial_state[k]), self.exogenous[k]
             lost = start.new_full((len(exogenous), len(start)), torch.nan)
             actions = start.new_full((len(exogenous), len(self.plant.actions)), torch.nan)
             return Trajectory(torch.cat([start[None], lost]), actions, exogenous)
 
     @torch.no_grad()
     def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
-        return control_cost(self.plant, self.fly(policy))
+        return control_cost(self.flying, self.fly(policy))
 
     def validation(self) -> None:
         """No validation episodes, because the referee has compared the policies on the twin already."""

@@ -63,6 +63,11 @@ class UnseenEpisodes:
         self.initial_state = plant.draw_initial_state(count, generator)
         self.exogenous = plant.draw_exogenous(count, generator)
 
+    @property
+    def flying(self) -> Plant:
+        """The plant that the flights are of."""
+        return self.plant
+
     def first(self, count: int) -> "UnseenEpisodes":
         """The first of these episodes, on the system as it is now.
 
@@ -129,8 +134,9 @@ class UnseenEpisodes:
 
     def judge(self, flown: Trajectory) -> "Judged":
         """J_a and the plant's own quantities in flown episodes."""
-        costs = control_cost(self.plant, flown)
-        found = self.plant.merit(flown.states, flown.actions, flown.exogenous)
+        plant = self.flying
+        costs = control_cost(plant, flown)
+        found = plant.merit(flown.states, flown.actions, flown.exogenous)
         return Judged(costs, found | (self.bounds.merit(flown.states) if self.bounds else {}))
 
     def categories(self) -> dict[str, Bool[Tensor, " count"]]:

@@ -299,7 +299,14 @@ class Run:
             bar.write(real_flights.announcement(found))
             bar.doing("judging on the real system")
         flown = {name: one.fly() for name, one in found.items()}
-        return {name: RealFlights(one, self.unseen.judge(one)) for name, one in flown.items()}
+        return {name: RealFlights(one, self._on_the_real_system(one).judge(one)) for name, one in flown.items()}
+
+    def _on_the_real_system(self, flown: Trajectory) -> RealEpisodes:
+        """What judges flights of the real system."""
+        assert self._real is not None
+        found = RealEpisodes(self._real, len(flown.states), device=self._device)
+        found.bounds = self.unseen.bounds
+        return found
 
     def _results(
         self,
@@ -329,8 +336,8 @@ class Run:
 
     def _real_results(self, real: dict[str, RealFlights]) -> dict[str, Any]:
         flown, J_p = real.get(self.algorithm.referee.live), {}
-        if flown is not None and self._real is not None:
-            on_it = RealEpisodes(self._real, len(flown.flown.states), device=self._device)
+        if flown is not None:
+            on_it = self._on_the_real_system(flown.flown)
             costs = results.twin_costs(on_it, self.algorithm, self.initial_closure, flown.flown)
             J_p = dict(zip(("J_p", "J_p_before"), costs, strict=True))
         return real_flights.entries(real, J_p)
