@@ -118,8 +118,8 @@ class Config(RunConfig):
         unknown: what the real system has beside its twin, one or more of anemometer_low, anemometer_high, torque_loss,
             inflow, pitch and all; docs/unknown_systems.md describes them.
         real: real system: simulation of the plant, or rosco for the simulator of NREL's ROSCO toolbox. With rosco,
-            policies are judged on the twin, and with real_unseen the live one in that simulator, too, where ROSCO's
-            controller flies as many episodes; this needs the extra rosco.
+            policies are judged on the twin, and the live one and ROSCO's controller in that simulator, on real_unseen
+            episodes or, if that is 0, on unseen ones; this needs the extra rosco.
     """
 
     paper: bool = False
@@ -231,6 +231,7 @@ def main(config: Config) -> None:
     plant, system = config.plant(), {"baselines": {"Jonkman": JonkmanController}}
     if config.real == "rosco":
         env = partial(rosco_turbine, plant, seed=config.seed, device=require_device(config.device))
+        config = dataclasses.replace(config, real_unseen=config.real_unseen or config.unseen)  # a simulator may fly
         system = {"env": env, "baselines": {"ROSCO": RoscoController}}
     believed = config.believed()
     drawing = {"plant_figures": plant_figures, "animate": animate}

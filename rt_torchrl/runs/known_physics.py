@@ -57,6 +57,11 @@ def require_simulation(
             f"baselines {real} can only be flown on a real system, and this run judges on the plant in simulation. "
             "Give ClassicalController classes, or a RealSystem without its closure."
         )
+    if real and not config.real_unseen:
+        raise ValueError(
+            f"baselines {real} can only be flown on the real system, which flies nothing after the training with "
+            "real_unseen=0; say how many episodes each may fly, such as real_unseen=5, or leave them out."
+        )
     if env is not None and env.closure is None and (config.reference or on_the_plant):
         raise ValueError(
             f"reference={config.reference} and baselines {on_the_plant} are flown on the plant under the true closure, "

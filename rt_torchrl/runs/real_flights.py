@@ -75,11 +75,9 @@ def contenders(
             controller = ActingController(first(algorithm.twin.plant).to(device))
             name = first.__name__ if first.__name__ not in baselines else f"{first.__name__} (first)"
             found[name] = Contender(name, config.real_unseen, partial(asked.fly, controller))
-    for name, law in baselines.items():
-        if isinstance(law, RealController):
-            count = config.real_unseen or config.unseen
-            episodes = RealEpisodes(system, count, device=device)
-            found[name] = Contender(name, count, partial(episodes.fly_baseline, law))
+        for name, law in baselines.items():
+            if isinstance(law, RealController):
+                found[name] = Contender(name, config.real_unseen, partial(asked.fly_baseline, law))
     return found
 
 

@@ -56,14 +56,12 @@ class Run:
         env: the real system, if it is not a plant in simulation, or a function that makes it, as an asynchronous run on
             the wall clock needs it for the process that acts. Policies are judged on ``plant`` with ``env.closure``, or
             on the twin if that closure is not known. After the training the real system flies only the
-            ``config.real_unseen`` episodes of each controller that are asked for, and those of a
-            :class:`RealController`.
+            ``config.real_unseen`` episodes of each controller that are asked for.
         believed: physics of the twin, for which policies and controllers are made, if it differs from that of the real
             system; None if it does not.
         plant_figures: function that draws the figures that only this plant has.
         baselines: controllers to judge beside the policies, by name: classical controllers or, with an ``env`` of
-            unknown closure, a :class:`RealController`, which flies the real system ``config.real_unseen`` times, or
-            ``config.unseen`` times if that is 0.
+            unknown closure and ``config.real_unseen`` flights, a :class:`RealController`.
         first: class of the controller that the real system has had so far, for ``start="controller"``.
         callbacks: functions that see the entries of all episodes after each one, and may end the training; see
             :data:`Callback`.
