@@ -133,7 +133,7 @@ def test_flights_that_are_asked_for_are_announced_and_paid(tmp_path, capsys):
 
 def test_a_controller_that_only_the_real_system_can_fly_asks_for_flights(tmp_path):
     rig = machine()
-    with pytest.raises(ValueError, match=r"baselines \['cascade'\] can only be flown on the real system, .* real_unseen"):
+    with pytest.raises(ValueError, match=r"baselines \['cascade'\] .* on the real system, .* real_unseen"):
         run_on(rig, tmp_path, baselines={"cascade": Asked})
     assert not rig.flights
 
