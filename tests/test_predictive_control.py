@@ -80,6 +80,28 @@ def test_costs_on_twin_and_unseen_episodes_are_those_of_its_flights():
         twin.control(controller, state, exogenous, start=0.5)
 
 
+class Movable(LinearQuadratic):
+    """A plant that is to be held at a place, which its user may move."""
+
+    def __init__(self):
+        super().__init__(horizon=2.0, noise=0.0)
+        self.register_buffer("target", torch.zeros(1, dtype=torch.float64))
+
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(t, torch.cat([state[..., :1] - self.target, state[..., 1:]], -1), applied, exogenous)
+
+
+def test_it_flies_to_a_target_that_has_moved():
+    plant = Movable()
+    start, inputs = torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, plant.n_steps, 1, dtype=torch.float64)
+    controller = control(plant)
+    still = controller.fly(start, inputs).states[0, -1, 0].item()
+    plant.target.fill_(0.7)
+    moved, anew = (each.fly(start, inputs).states for each in (controller, control(plant)))
+    torch.testing.assert_close(moved, anew, rtol=1e-9, atol=1e-12)
+    assert abs(still) < 1e-6 and moved[0, -1, 0] > 0.2
+
+
 def test_it_plans_on_the_closure_as_it_is_trained():
     """With the true closure it costs less than with a wrong one, and a copy keeps the closure that it has."""
     closure = LinearClosure(torch.tensor([[0.0, 0.0], [6.0, 0.0]]))

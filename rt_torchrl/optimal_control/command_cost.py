@@ -151,8 +151,7 @@ class CommandCost:
         state = torch.nn.functional.pad(initial_state, (0, 1))
         command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
         self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
-        if self._programs is None:
-            self._programs = self._traced()
+        self._programs = self._traced()  # kept programs, unless the plant or the closure is another one by now
         if self._programs is not None:
             self._weights = Weights(self.interval).row()
             self._place(self._programs)
