@@ -69,6 +69,23 @@ def fitted(real, plant, **options):
 PLANT = Suspecting(horizon=10.0)
 
 
+def test_hypotheses_with_a_scheme_of_their_own_have_gradients_beside_the_continuous_adjoint():
+    """The engine odeint_adjoint cannot follow their schemes; that of the twin alone errs by the order of the step."""
+    plant = Suspecting(horizon=10.0)
+    policy, generator = LinearGain([[0.3, 0.4]]), torch.Generator().manual_seed(2)
+    scenario = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, :20]
+    gradients = {}
+    for engine in ("native", "odeint_adjoint"):
+        closure = LinearClosure([[0.0, 0.0], [-0.2, 0.1]])
+        twin = make_twin(plant, closure, HypothesesConfig(), engine=engine)
+        for name in twin.twins:
+            twin.weights = {name: 1.0}
+            gradients[engine, name] = torch.autograd.grad(twin.cost(policy, *scenario), policy.gain)[0]
+    assert len(gradients) == 6
+    for name, tolerance in {ALONE: 1e-3, "late": 1e-12, "lags": 1e-12}.items():
+        torch.testing.assert_close(gradients["odeint_adjoint", name], gradients["native", name], rtol=tolerance, atol=0)
+
+
 def test_hidden_states_follow_from_what_was_read():
     real = LaggedActuator(PLANT, "force", LAG)
     record, states = recorded(real)

@@ -205,6 +205,11 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
     return None
 
 
+def able(engine: Engine, plant: Plant) -> Engine:
+    """The engine, or ``autograd`` for a plant that it cannot roll out, such as an extension with a scheme of its own."""
+    return "autograd" if engine in ENGINES and refusal(engine, plant) else engine
+
+
 def _listed(names: Iterable[str]) -> str:
     *others, last = names
     return f"{', '.join(others)} or {last}"

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.ending import require_end_cost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.fingerprint import fingerprint
-from rt_torchrl.trajectories.rollout import Engine, Rollout, refusal
+from rt_torchrl.trajectories.rollout import Engine, Rollout, able
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
@@ -45,8 +45,7 @@ class DigitalTwin:
 
     def of(self, plant: Plant) -> "DigitalTwin":
         """A twin of another plant under the same closure, by the same engine if it can roll the plant out."""
-        engine: Engine = "autograd" if refusal(self._engine, plant) else self._engine
-        return DigitalTwin(plant, self.closure, engine=engine, compiled=self._compiled)
+        return DigitalTwin(plant, self.closure, engine=able(self._engine, plant), compiled=self._compiled)
 
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)

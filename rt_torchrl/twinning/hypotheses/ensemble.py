@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from rt_torchrl.options import quoted
 from rt_torchrl.plants.extensions.extension import Extension
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.rollout import Engine
+from rt_torchrl.trajectories.rollout import Engine, able
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -32,7 +32,7 @@ class TwinEnsemble(DigitalTwin):
         closure: its closure.
         suspects: plants that extend ``plant``, by name.
         closures: closures of these plants, by name.
-        engine, compiled: see :class:`DigitalTwin`.
+        engine, compiled: see :class:`DigitalTwin`; a hypothesis that the engine cannot roll out has ``autograd``.
 
     Raises:
         ValueError: if a plant has no closure, or does not extend the twin's plant.
@@ -57,7 +57,7 @@ class TwinEnsemble(DigitalTwin):
                     f"hypothesis {name!r} must extend the twin's plant {plant.name!r}: other states are read."
                 )
         self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine, compiled=compiled)} | {
-            name: DigitalTwin(suspect, closures[name], engine=engine, compiled=compiled)
+            name: DigitalTwin(suspect, closures[name], engine=able(engine, suspect), compiled=compiled)
             for name, suspect in suspects.items()
         }
         self.risk = 0.0
