@@ -37,6 +37,24 @@ def plant(kind):
     return shortened(kind, 50)
 
 
+def test_a_plant_that_overrides_its_scheme_says_so():
+    class Own(LinearQuadratic):
+        def advance(self, t, state, applied, exogenous, closure):
+            return state + self.dt * self.vector_field(t, state, applied, exogenous, closure)
+
+    class Back(Own):
+        advance = LinearQuadratic.advance
+
+    class Wrapping(LinearQuadratic):
+        own_scheme = False
+
+        def advance(self, *given):
+            return super().advance(*given)
+
+    found = {kind: kind().own_scheme for kind in (LinearQuadratic, Own, Back, Wrapping)}
+    assert found == {LinearQuadratic: False, Own: True, Back: False, Wrapping: False}
+
+
 def fly(plant, *, batch=1, seed=0):
     """A real episode under the plant's initial policy, with the policy."""
     policy = plant.make_policy(seeded(5))

@@ -12,7 +12,7 @@ The real system and its digital twin have the *same* map: they differ in the clo
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -71,7 +71,8 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
     own_scheme: bool = False
     """Whether :meth:`advance` has a scheme of its own, which a twin must follow to the last digit.
 
-    The engine ``odeint_adjoint`` cannot follow it and is refused.
+    The engine ``odeint_adjoint`` cannot follow it and is refused. A class that overrides :meth:`advance` has one, unless
+    it says False itself.
     """
     controller_states: tuple[str, ...] = ()
     """Names of the states that a controller computes, such as filters, integrals and the actions applied last.
@@ -80,6 +81,11 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
     """
     unread: int = 0
     """Number of states, the last ones, that no sensor reads; twins and policies do not know of them."""
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        if "advance" in vars(cls) and "own_scheme" not in vars(cls):
+            cls.own_scheme = cls.advance is not Plant.advance
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
