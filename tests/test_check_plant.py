@@ -123,4 +123,4 @@ def test_what_is_not_one_graph_is_found():
         assert any(re.match(message, text) for text in found[kind.__name__]), (found, done.stderr[-2000:])
     # A plant that only the engine native cannot take fulfils its contract; the report names the line of its code.
     report = next(line for line in done.stdout.splitlines() if line.startswith("plant"))
-    assert re.search(r"fulfils its contract.*'parallel' takes the place of 'native'.*sort.*broken_plants\.py", report)
+    assert re.search(r"fulfils its contract.*'autograd' takes the place of 'native'.*sort.*broken_plants\.py", report)

@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections import OrderedDict
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -39,7 +40,7 @@ PLANTS = {
 def _no_substitute():
     """No engine takes the place of native unseen."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="engine 'parallel'")
+        warnings.filterwarnings("error", message="engine 'autograd'")
         yield
 
 
@@ -293,6 +294,28 @@ def test_where_the_gradient_is_no_program_torch_computes_it():
     with pytest.warns(UserWarning, match="hardshrink_backward"):
         found = task.gradients(NATIVE)
     assert_equal(found, task.gradients(AUTOGRAD))
+
+
+class Drained(LinearQuadratic):
+    """A plant with a Python branch on its state."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        rates = super().vector_field(t, state, action, exogenous, closure)
+        return 3.0 * rates if state[..., 0].sum() > 0.0 else rates
+
+
+def test_a_python_branch_has_the_gradient_of_the_branch_that_was_taken():
+    """Rows of all times at once, as the engine parallel evaluates them, would take one branch for all of them."""
+    plant, gradients = Drained(horizon=10.0, noise=0.0), []
+    start, inputs = torch.tensor([[1.0, 0.0]]).double(), torch.zeros(1, 100, 1).double()
+    for engine in ("native", "autograd"):
+        closure = plant.make_closure(seeded(0))
+        roll = Rollout(plant, closure, engine=engine)
+        with pytest.warns(UserWarning, match="'autograd' takes the place") if engine == "native" else nullcontext():
+            flown = roll(start, inputs, torch.zeros(1, 100, 1).double())
+        gradients.append(torch.autograd.grad((flown.states**2).mean(), closure.matrix)[0])
+    assert flown.states[..., 0].min() < 0.0 < flown.states[..., 0].max()  # both branches are taken
+    torch.testing.assert_close(*gradients, rtol=1e-12, atol=0.0)
 
 
 def test_states_that_leave_the_numbers_are_kept():

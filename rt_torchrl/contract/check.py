@@ -49,7 +49,7 @@ class ContractReport(NamedTuple):
         episodes: number of flights.
         steps: number of control intervals of each flight.
         dt: control interval [s].
-        untraceable: what keeps the engine ``native`` from the plant, whose place ``parallel`` then takes; None if
+        untraceable: what keeps the engine ``native`` from the plant, whose place ``autograd`` then takes; None if
             nothing does, or if the methods were not traced.
     """
 
@@ -61,7 +61,7 @@ class ContractReport(NamedTuple):
     untraceable: str | None = None
 
     def __str__(self) -> str:
-        engine = f"; engine 'parallel' takes the place of 'native': {self.untraceable}" if self.untraceable else ""
+        engine = f"; engine 'autograd' takes the place of 'native': {self.untraceable}" if self.untraceable else ""
         return (
             f"plant {self.plant!r} fulfils its contract: {', '.join(self.checks)}, on {self.episodes} flights of "
             f"{self.steps} intervals of {self.dt:g} s{engine}"

@@ -4,10 +4,10 @@ r"""Trajectories :math:`s_{k+1} = \Phi(s_k, x_k; w)` and their gradients, by fiv
 engine                gradient                                            for
 ====================  ==================================================  ======================================
 ``native``            exact discrete adjoint, machine code over lanes     training on CPUs
-``parallel``          exact discrete adjoint, parallel over time          training on GPUs; what native cannot trace
+``parallel``          exact discrete adjoint, parallel over time          training on GPUs
 ``parallel_in_time``  the same, and the trajectory by Newton's method     few long episodes on GPUs
 ``odeint_adjoint``    continuous adjoint by torchdiffeq, error O(dt)      reference, the paper's method
-``autograd``          backpropagation through every step, exact           short horizons, double-checking
+``autograd``          backpropagation through every step, exact           what native cannot trace, double-checking
 ====================  ==================================================  ======================================
 """
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from rt_torchrl.trajectories.engines.autograd import Autograd
 from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.groups import Group, for_each_group, signals_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
@@ -39,11 +40,12 @@ Piece = tuple[slice, np.ndarray, np.ndarray]
 class Native(GradientEngine):
     """Computes trajectories and their exact discrete adjoint by machine code; the module describes it.
 
-    Where an interval cannot become a program, or is not on the CPU, the engine ``parallel`` takes its place, with one
-    warning for each kind of interval.
+    Where an interval cannot become a program, the engine ``autograd`` takes its place without compilation, with one
+    warning for each kind of interval: it executes any code as it is written. The engine ``parallel`` evaluates many
+    intervals at once, so that a Python branch could be another one; it serves other devices than the CPU alone.
 
     Args:
-        compiled: whether the engine that takes its place compiles.
+        compiled: whether the engine for other devices compiles.
         memory: bytes that a sweep may hold.
 
     Raises:
@@ -60,13 +62,15 @@ class Native(GradientEngine):
         self._costed: CostInterval | None = None
 
     @cached_property
-    def _substitute(self) -> Parallel:
+    def _elsewhere(self) -> Parallel:
         return Parallel(compiled=self._compiled)
 
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
+        if initial_state.device.type != "cpu":
+            return self._elsewhere.end_states(interval, initial_state, drive)
         found = self.own_end_states(interval, initial_state, drive)
-        return self._substitute.end_states(interval, initial_state, drive) if found is None else found
+        return Autograd(compiled=False).end_states(interval, initial_state, drive) if found is None else found
 
     def own_end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor | None:
         """The same by machine code; None, with a warning that says why, if the interval cannot become a program."""

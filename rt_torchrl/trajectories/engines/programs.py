@@ -54,7 +54,7 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
                 return None  # the next call may have numbers
             except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
                 found = _reason(error)
-                warnings.warn(f"engine 'parallel' takes the place of 'native': {found}.", stacklevel=2)
+                warnings.warn(f"engine 'autograd' takes the place of 'native': {found}.", stacklevel=2)
             _kept[key] = found, alive
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
