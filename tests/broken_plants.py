@@ -3,6 +3,7 @@
 import dataclasses
 
 import torch
+from impure import Bounded, Recurrent, Rows
 from linear_quadratic import LinearClosure, LinearQuadratic
 from torch import nn
 
@@ -78,6 +79,26 @@ class StrongPolicy(LinearQuadratic):
         policy = super().make_policy(generator)
         policy.gain.data *= 1e3
         return policy
+
+
+class RememberingPolicy(LinearQuadratic):
+    def make_policy(self, generator):
+        return Bounded(Recurrent())
+
+
+class NormalisingPolicy(LinearQuadratic):
+    def make_policy(self, generator):
+        return Bounded(Rows(nn.BatchNorm1d(2), nn.Linear(2, 1)))
+
+
+class DroppingPolicy(LinearQuadratic):
+    def make_policy(self, generator):
+        return Bounded(Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)))
+
+
+class RememberingClosure(LinearQuadratic):
+    def make_neural_closure(self, generator, hidden):
+        return Bounded(Recurrent(outputs=2))
 
 
 class FirstDimension(LinearQuadratic):
@@ -245,6 +266,7 @@ class PeriodicForce(LinearQuadratic):
     actions = (dataclasses.replace(LinearQuadratic.actions[0], periodic=True),)
 
 
+AGAIN = "gives something else when it is called again with the same arguments"
 TRACED = {Branching: "vector_field: is not one graph: .*if \\(state", Late: "running_cost: is not one graph: "}
 """Found by tracing alone."""
 BROKEN = {
@@ -262,6 +284,10 @@ BROKEN = {
     SingleClosure: "make_closure: has matrix in torch.float32",
     FrozenClosure: "make_closure: has no trainable weights",
     StrongPolicy: r"make_policy: draws 'force' .*outside \[-2, 2\]",
+    RememberingPolicy: f"make_policy: {AGAIN}.*a state of the plant",
+    NormalisingPolicy: "make_policy: what it makes raises ValueError: Expected more than 1 value per channel.*eval",
+    DroppingPolicy: rf"make_policy: {AGAIN}.*\.eval\(\)",
+    RememberingClosure: f"make_neural_closure: {AGAIN}",
     FirstDimension: "observe: raised IndexError in .*broken_plants.py, line",
     KeptDimension: r"running_cost: cost has shape \(1,\) for t \(\), .*expected .*shape \(\)",
     SingleRates: "vector_field: rate has torch.float32",

@@ -88,7 +88,9 @@ class Movable(LinearQuadratic):
         self.register_buffer("target", torch.zeros(1, dtype=torch.float64))
 
     def running_cost(self, t, state, applied, exogenous):
-        return super().running_cost(t, torch.cat([state[..., :1] - self.target, state[..., 1:]], -1), applied, exogenous)
+        return super().running_cost(
+            t, torch.cat([state[..., :1] - self.target, state[..., 1:]], -1), applied, exogenous
+        )
 
 
 def test_it_flies_to_a_target_that_has_moved():

@@ -95,6 +95,17 @@ class Calls:
         takes = ("t", "state", "applied", "exogenous")
         return Method(name, _under(self.plant.vector_field, closure), takes, {"rate": (len(self.plant.states),)})
 
+    def commanded_by(self, policy: nn.Module) -> Method:
+        """The command of a policy, by the name of what makes it; it never meets an observation without a batch."""
+        plant = self.plant
+
+        def command(t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+            seen = plant.observe(t, state, exogenous)
+            found: Tensor = policy(seen) if seen.ndim > 1 else policy(seen.unsqueeze(0)).squeeze(0)
+            return found
+
+        return Method("make_policy", command, ("t", "state", "exogenous"), {"command": (len(plant.actions),)})
+
     def some(self, count: int) -> Arguments:
         """The arguments at ``count`` times at most, which are spread over the flights, for all episodes."""
         n = len(self.arguments["t"])

@@ -1,4 +1,4 @@
-"""Checks of the methods' shapes, precision and purity, under every leading dimension."""
+"""Checks of the shapes, precision and purity of methods, closures and policy, under every leading dimension."""
 
 from collections.abc import Iterator
 
@@ -7,6 +7,7 @@ from torch import Tensor
 
 from rt_torchrl.contract.calls import Arguments, Calls, Method
 from rt_torchrl.contract.draws import misshapen, neural_closure_of, seeded, wanted_as
+from rt_torchrl.trajectories.engines.purity import REMEDY
 
 TOLERANCE = 1e-10
 """Greatest difference as a share of a value: vector instructions may round powers and exponentials differently."""
@@ -19,9 +20,19 @@ def methods(calls: Calls) -> Iterator[str]:
     for method in calls.methods():
         found = list(_shapes(method, together)) or list(_purity(method, together)) or list(_rows(method, together))
         yield from found
+    made = [calls.commanded_by(calls.plant.make_policy(seeded(calls.seed)))]
     neural = neural_closure_of(calls.plant)
     if neural is not None:
-        yield from _shapes(calls.field_under(neural(seeded(calls.seed)), "make_neural_closure"), together)
+        made.append(calls.field_under(neural(seeded(calls.seed)), "make_neural_closure"))
+    for method in made:
+        try:
+            yield from list(_shapes(method, together)) or [*_purity(method, together), *_rows(method, together)]
+        except Exception as error:  # layers of torch may raise anything for some leading dimension
+            said = str(error).splitlines()[0] if str(error) else ""
+            yield (
+                f"{method.name}: what it makes raises {type(error).__name__}: {said}. It must work for every leading "
+                f"dimension: rows of one, a batch, and times by batches. {REMEDY}."
+            )
     yield from _judgement(calls)
 
 
@@ -63,11 +74,13 @@ def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
         yield f"{method.name}: changes its argument {' and '.join(changed)} in place; make a new tensor instead."
         return
     method.outputs(_row(arguments, 1))
+    method.outputs({name: value[:1].expand_as(value) for name, value in arguments.items()})
     again = _tensors(method, arguments)
     if not all(map(torch.equal, first, again)):
         yield (
             f"{method.name}: gives something else when it is called again with the same arguments; it must be a pure "
-            "function: no random number inside, and nothing kept from call to call (what is remembered is a state)."
+            "function: no random number inside, and nothing kept from call to call (what is remembered is a state). "
+            f"{REMEDY}."
         )
 
 

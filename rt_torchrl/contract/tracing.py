@@ -13,7 +13,7 @@ from rt_torchrl.trajectories.engines.compilation import raised_limits, without_w
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.linearisation import linearise
 from rt_torchrl.trajectories.engines.programs import point_of
-from rt_torchrl.trajectories.engines.traced_interval import Programs
+from rt_torchrl.trajectories.engines.traced_interval import Programs, UncomparedError
 
 REMEDY = (
     "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
@@ -67,7 +67,10 @@ def tracing(calls: Calls) -> Iterator[str]:
 
 
 def untraceable(calls: Calls) -> str | None:
-    """What keeps the engine ``native`` from the plant under its own policy, with the line of code; None if nothing."""
+    """What keeps the engine ``native`` from the plant under its own policy, with the line of code; None if nothing.
+
+    Whatever the code raises for one realisation keeps it from the plant.
+    """
     plant, arguments, lanes = calls.plant, calls.arguments, lanes_of_this_machine()
     policy = plant.make_policy(seeded(calls.seed))
     initial_state = torch.nn.functional.pad(arguments["state"][0], (0, 1))  # the cost is one more state
@@ -76,8 +79,10 @@ def untraceable(calls: Calls) -> str | None:
     try:
         interval = CostInterval(Interval(plant, calls.closure, policy))
         Programs(interval, point, lanes).prepare_sweep(interval, False)
-    except UntraceableError as error:
-        return str(error)
+    except UncomparedError:
+        return None
+    except Exception as error:
+        return str(error) if isinstance(error, UntraceableError) else f"{type(error).__name__}: {_first_line(error)}"
     return None
 
 

@@ -71,8 +71,8 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
     own_scheme: bool = False
     """Whether :meth:`advance` has a scheme of its own, which a twin must follow to the last digit.
 
-    The engine ``odeint_adjoint`` cannot follow it and is refused. A class that overrides :meth:`advance` has one, unless
-    it says False itself.
+    The engine ``odeint_adjoint`` cannot follow it and is refused. A class that overrides :meth:`advance` has one,
+    unless it says False itself.
     """
     controller_states: tuple[str, ...] = ()
     """Names of the states that a controller computes, such as filters, integrals and the actions applied last.

@@ -16,6 +16,7 @@ from rt_torchrl.systems.redrawn_policy import RedrawnPolicy
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.purity import require_pure_policy
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import Remembering, RememberingInterval, StateFeedback
 
@@ -70,7 +71,7 @@ class EpisodeCollector:
     """
 
     def __init__(self, env: EnvBase, actor: LivePolicy, plant: Plant):
-        self.env, self._plant = env, plant
+        self.env, self._plant, self._live = env, plant, actor
         self._actor = TensorDictModule(actor, in_keys=["observation", "state", "exogenous"], out_keys=["action"])
 
     @torch.no_grad()
@@ -81,6 +82,7 @@ class EpisodeCollector:
             EpisodeEndedError: if the system fails in the episode, or ends it before its horizon where the plant does
                 not; it holds the intervals before.
             DivergenceError: if the system is a simulation that diverges.
+            ImpureError: if the policy is no function of the observation.
         """
         flown: list[TensorDictBase] = []
         plant = self._plant
@@ -91,6 +93,8 @@ class EpisodeCollector:
             raise
         except Exception as error:  # whatever a machine, its driver or its connection may raise
             raise EpisodeEndedError(failure(error, plant), None) from error
+        if not isinstance(self._live.policy, StateFeedback):
+            require_pure_policy(self._live.policy, now["observation"])
         for k in range(plant.n_steps):
             asked = self._actor(now)
             try:

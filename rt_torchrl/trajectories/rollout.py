@@ -18,11 +18,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from rt_torchrl.plants.ending import final_cost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel, ParallelInTime
-from rt_torchrl.trajectories.engines.interval import Drive, Interval
+from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
+from rt_torchrl.trajectories.engines.purity import require_pure_once
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 Engine = Literal["native", "parallel", "parallel_in_time", "odeint_adjoint", "autograd"]
@@ -74,6 +76,7 @@ class Rollout:
             require_double(role, module)
         self.plant = plant
         self.interval = Interval(plant, closure, policy)
+        self._costed = CostInterval(self.interval)
         self.engine = engine
         self._engine = ENGINES[engine](compiled=compiled)
         self._driven: tuple[tuple[object, ...], Drive, tuple[Tensor | None, ...]] | None = None
@@ -98,8 +101,10 @@ class Rollout:
             ValueError: if shapes do not fit the plant and each other, commands are given beside a policy, or the engine
                 does not take a start for each realisation.
             DivergenceError: if a state is not finite; the message names plant, realisation, time and state.
+            ImpureError: if policy, closure or plant answer one question in two ways, or mix realisations.
         """
         drive = self._drive(initial_state, exogenous, command, start)
+        self._require_pure(self.interval, initial_state, drive)
         ends = self._engine.end_states(self.interval, initial_state, drive)
         require_finite(self.plant, ends, initial_state, [self.interval.closure, self.interval.policy], start=start)
         states = torch.cat([initial_state.unsqueeze(0), ends])
@@ -118,11 +123,12 @@ class Rollout:
         """J_a of each trajectory of :meth:`__call__`, as :func:`control_cost` gives it; quicker, and in less memory.
 
         Raises:
-            ValueError, DivergenceError: as :meth:`__call__`.
+            ValueError, DivergenceError, ImpureError: as :meth:`__call__`.
         """
         drive = self._drive(initial_state, exogenous, command, start)
         # What is replayed runs on after an end, so that only its trajectory says when it ended.
         summed = self.plant.end_cost is None or self.interval.policy is not None
+        self._require_pure(self._costed, functional.pad(initial_state, (0, 1)), drive)
         found = self._engine.costs(self.interval, initial_state, drive) if summed else None
         if found is not None and all_finite(found):
             charged = getattr(self.plant.terminal_cost, "__func__", None) is not Plant.terminal_cost
@@ -130,6 +136,10 @@ class Rollout:
                 found = found + final_cost(self.plant, initial_state) / (exogenous.shape[1] * self.plant.dt)
             return found
         return control_cost(self.plant, self(initial_state, exogenous, command, start=start))
+
+    def _require_pure(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:
+        if self.engine != "native" or initial_state.device.type != "cpu":  # which asks when it traces
+            require_pure_once(interval, initial_state, drive)
 
     def _drive(self, initial_state: Tensor, exogenous: Tensor, command: Tensor | None, start: float | Tensor) -> Drive:
         """The drive, after a check of everything; that of the last call if the same small tensors come again.
@@ -206,7 +216,7 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
 
 
 def able(engine: Engine, plant: Plant) -> Engine:
-    """The engine, or ``autograd`` for a plant that it cannot roll out, such as an extension with a scheme of its own."""
+    """The engine, or ``autograd`` for a plant that it cannot roll out, such as one with a scheme of its own."""
     return "autograd" if engine in ENGINES and refusal(engine, plant) else engine
 
 

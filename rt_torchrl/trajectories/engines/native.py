@@ -26,6 +26,7 @@ from rt_torchrl.trajectories.engines.groups import Group, for_each_group, signal
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.engines.programs import programs_of
+from rt_torchrl.trajectories.engines.purity import require_pure_once
 from rt_torchrl.trajectories.engines.traced_interval import Programs
 from rt_torchrl.trajectories.engines.weights import Weights
 
@@ -68,6 +69,7 @@ class Native(GradientEngine):
     def end_states(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         if initial_state.device.type != "cpu":
+            require_pure_once(interval, initial_state, drive)
             return self._elsewhere.end_states(interval, initial_state, drive)
         found = self.own_end_states(interval, initial_state, drive)
         return Autograd(compiled=False).end_states(interval, initial_state, drive) if found is None else found

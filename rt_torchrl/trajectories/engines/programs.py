@@ -7,20 +7,17 @@ from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from rt_torchrl.programs.fingerprint import Fingerprint, fingerprint
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.programs.vector_functions import lanes_of_this_machine
+from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
 from rt_torchrl.trajectories.engines.interval import Drive
+from rt_torchrl.trajectories.engines.purity import ImpureError, require_pure, rows_of
 from rt_torchrl.trajectories.engines.traced_interval import Point, Programs, UncomparedError
 from rt_torchrl.trajectories.engines.weights import Weights
 
 KEPT = 256
 """Number of kinds of intervals whose programs are kept."""
-NUDGE = 1e-3
-"""Relative change of the signals at which machine code is compared with torch, so that no two of them are equal."""
-
 
 _known: "WeakKeyDictionary[nn.Module, tuple[Fingerprint, Weights]]" = WeakKeyDictionary()
 """The fingerprint of an interval with its weights, as long as its fingerprint holds."""
@@ -36,6 +33,9 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
     There are none for an interval that is not on the CPU or, with one warning, cannot become a program. Where the
     first states or weights are no numbers, there are none for this call. Where a gradient is wanted, the sweep is
     prepared too: later the interval may be another one.
+
+    Raises:
+        ImpureError: if the interval is no function, or mixes realisations.
     """
     if initial_state.device.type != "cpu":
         return None
@@ -46,12 +46,14 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
         found, alive = _kept.get(key, (None, held.alive))
         if not isinstance(found, UntraceableError):
             try:
-                found = found or Programs(interval, point_of(initial_state, drive, lanes.number, sums), lanes)
+                found = found or _traced(interval, point_of(initial_state, drive, lanes.number, sums), lanes)
                 driven = any(x.requires_grad for x in drive)
                 if torch.is_grad_enabled() and (driven or initial_state.requires_grad or weights.learned):
                     found.prepare_sweep(interval, driven)
             except UncomparedError:
                 return None  # the next call may have numbers
+            except ImpureError:
+                raise
             except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
                 found = _reason(error)
                 warnings.warn(f"engine 'autograd' takes the place of 'native': {found}.", stacklevel=2)
@@ -60,6 +62,11 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
         return (found, weights) if isinstance(found, Programs) else None
+
+
+def _traced(interval: nn.Module, point: Point, lanes: Lanes) -> Programs:
+    require_pure(interval, *point)
+    return Programs(interval, point, lanes)
 
 
 def _known_as(interval: nn.Module) -> tuple[Fingerprint, Weights]:
@@ -76,20 +83,6 @@ def _reason(error: Exception) -> UntraceableError:
     return UntraceableError(f"an interval of one realisation raises {type(error).__name__}: {str(error).rstrip('.')}")
 
 
-@torch.no_grad()
 def point_of(initial_state: Tensor, drive: Drive, lanes: int, sums: int = 0) -> Point:
-    """States and drive of one interval for every lane, near the initial states and at times over the whole drive.
-
-    Behind the states are the sums of the interval, which begin with zero.
-    """
-    n, batch, lane = len(drive.t), len(initial_state), torch.arange(lanes)
-    at = (lane * n) // lanes
-    t = drive.t[at, lane % batch if drive.t.shape[1] > 1 else 0]
-    driving = (_nudged(x[at, lane % batch]) for x in (drive.exogenous, drive.command))
-    return Point(_nudged(functional.pad(initial_state.detach()[lane % batch], (0, sums))), Drive(t, *driving))
-
-
-def _nudged(x: Tensor) -> Tensor:
-    """Rows of which no two are equal."""
-    share = torch.arange(len(x)).unsqueeze(-1) / len(x)
-    return x + NUDGE * share * (x.abs() + (x == 0.0))
+    """States and drive of one interval for every lane; see :func:`rows_of`."""
+    return Point(*rows_of(initial_state, drive, lanes, sums))
