@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.programs.outer_names import DATA, foreign, function_of, read_by
+from rt_torchrl.programs.outer_names import DATA, Name, foreign, function_of, read_by
 from rt_torchrl.programs.watch import Watch
 
 VALUES = frozenset({str, int, float, complex, bool, type(None), bytes, torch.Size, torch.dtype, torch.device})
@@ -54,37 +54,42 @@ def fingerprint(module: nn.Module) -> Fingerprint:
     Constants and buffers become a part of a program, and so do the global variables that the code of the module reads.
     A module with another constant has another fingerprint, so that it is traced anew.
     """
-    reader = _Reader(module)
+    reader = Reader(module)
     text = repr(reader.text()).encode(errors="surrogatepass")
     reader.watch.begin()
     return Fingerprint(hashlib.sha256(text).digest(), tuple(reader.alive), reader.watch)
 
 
-class _Reader:
+class Reader:
     """Reads a module and everything that it holds, as pickle does, and notes it in a watch."""
 
     def __init__(self, root: nn.Module):
         self.watch, self.alive = Watch(root), list[object]()
-        self._root, self._met, self._numbers = root, list[Any]([root]), {id(root): 0}  # an object is read once
+        self.met = list[Any]([root])
+        """The module and all objects that it holds, which are read by their values."""
+        self.names, self.functions = list[Name](), set[types.FunctionType]()
+        """The globals that code of the module may read, and the functions among this code."""
+        self._root, self._numbers = root, {id(root): 0}  # an object is read once
         self._functions: list[object] = []  # of classes and modules, which read globals
 
     def text(self) -> list[list[object]]:
         """What tells the module from others."""
-        found = [self._read(obj) for obj in self._met]  # which grows meanwhile
+        found = [self._read(obj) for obj in self.met]  # which grows meanwhile
         count = len(found)
-        for held, name in read_by(*self._functions):
+        self.names, self.functions = read_by(*self._functions)
+        for held, name in self.names:
             self.watch.note_attributes(held, name)
             x = held.get(name)
             found.append([self._mention(x)] if isinstance(x, DATA) else self._address(x))
-        return [*found, *map(self._read, islice(self._met, count, None))]
+        return [*found, *map(self._read, islice(self.met, count, None))]
 
     def _mention(self, obj: object) -> object:
         """A value by its text, and any other object by its number, under which it is read later."""
         if type(obj) in VALUES:
             return repr(obj)
         if id(obj) not in self._numbers:
-            self._numbers[id(obj)] = len(self._met)
-            self._met.append(obj)
+            self._numbers[id(obj)] = len(self.met)
+            self.met.append(obj)
         return self._numbers[id(obj)]
 
     def _address(self, obj: object) -> list[object]:
@@ -143,22 +148,27 @@ class _Reader:
         return [*self._address(kind), *map(self._address, vars(kind).values()), *mentioned]
 
     def _of_instance(self, obj: Any) -> list[object]:
-        """An object by the parts that pickle takes; by its address if pickle refuses it."""
+        """An object by its attributes and by the parts that pickle takes; by its address if it has neither."""
         kind, held = type(obj), getattr(obj, "__dict__", None)
         if obj is not self._root and held is not None:
             self.watch.note_attributes(obj, "__class__", "__dict__")
         if isinstance(obj, nn.Module):
             return [*map(self._mention, (kind, held))]
+        slots = (
+            [] if foreign(kind.__module__) else [x for base in kind.__mro__ for x in vars(base).get("__slots__", ())]
+        )
+        own = [held, [getattr(obj, x, None) for x in slots]] if not foreign(kind.__module__) else []
         try:
             reduced = copyreg.dispatch_table.get(kind, _reduced)(obj)
         except Exception:  # an object may refuse with any error
-            return self._address(obj)
+            self.watch.complete &= not slots
+            return [*self._address(obj), *map(self._mention, own)]
         if isinstance(reduced, str):  # the name of a global, which may not be there, as in a function
-            return self._address(obj)
+            return [*self._address(obj), *map(self._mention, own)]
         made, given, state, *elements = (*reduced, None, None)[:5]
         plain = made is PLAIN and given == (kind,) and state is (held or None) and elements == [None, None]
         self.watch.complete &= plain or isinstance(obj, CONSTANT)
-        parts = (list(part) if isinstance(part, Iterator) else part for part in reduced)
+        parts = (list(part) if isinstance(part, Iterator) else part for part in (*reduced, *([] if plain else own)))
         return [*map(self._mention, parts)]
 
 

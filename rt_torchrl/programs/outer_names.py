@@ -1,6 +1,5 @@
 """Outer names: the globals that the code of classes and functions reads, which traced programs depend on."""
 
-import inspect
 import sys
 import types
 from functools import lru_cache
@@ -10,29 +9,35 @@ import numpy as np
 from torch import Tensor
 
 DATA = (bool, int, float, complex, str, Tensor, np.ndarray, np.generic)
-FOREIGN = sys.stdlib_module_names | {"torch", "tensordict", "torchrl", "numpy", "scipy", "jaxtyping", "beartype"}
+MADE_BY = {"abc", "types"}
+"""Modules that classes name as theirs which are made by a call, whoever calls."""
+LIBRARIES = {"torch", "tensordict", "torchrl", "numpy", "scipy", "jaxtyping", "beartype"}
+FOREIGN = (sys.stdlib_module_names - MADE_BY) | LIBRARIES
 """Packages whose globals do not change."""
 OWN = __name__.partition(".")[0]
 
 Name = tuple[dict[str, Any], str]
 
 
-def read_by(*functions: object) -> list[Name]:
-    """The globals that functions read, also through the functions and modules among them."""
+def read_by(*functions: object) -> tuple[list[Name], set[types.FunctionType]]:
+    """The globals that functions read, also through the functions and modules among them; and all these functions."""
     found: dict[tuple[int, str], Name] = {}
     stack, seen = [*functions], set[types.FunctionType]()
     while stack:
         f = stack.pop()
-        if not isinstance(f, types.FunctionType) or f in seen or foreign(f.__module__):
+        if not isinstance(f, types.FunctionType) or f in seen:
             continue
         seen.add(f)
+        stack.append(getattr(f, "__wrapped__", None))
+        if foreign(f.__globals__.get("__name__")):
+            continue
         names = _names(f.__code__)
         modules = (x for x in map(f.__globals__.get, names) if isinstance(x, types.ModuleType))
         for held in [f.__globals__, *(vars(module) for module in modules if not foreign(module.__name__))]:
             here = [name for name in names if name in held and not isinstance(held[name], types.ModuleType)]
             found |= {(id(held), name): (held, name) for name in here}
             stack += [function_of(held[name]) for name in here]
-    return list(found.values())
+    return list(found.values()), seen
 
 
 @lru_cache(maxsize=2**14)
@@ -45,7 +50,7 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
 def function_of(attribute: object) -> types.FunctionType | None:
     """The function behind an attribute of a class; None if there is none."""
     attribute = attribute.fget if isinstance(attribute, property) else getattr(attribute, "__func__", attribute)
-    return inspect.unwrap(attribute) if isinstance(attribute, types.FunctionType) else None
+    return attribute if isinstance(attribute, types.FunctionType) else None
 
 
 def foreign(module: str | None) -> bool:

@@ -1,14 +1,38 @@
 """Watches: whether anything that a fingerprint was made of has changed since, told in a fraction of its time."""
 
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor, nn
 
 Reading = tuple[Callable[[Any], object], object]
 """A function with what it reads."""
+
+
+class Guard(NamedTuple):
+    """A constant outside of a module: where it is read, under which name, and what it was."""
+
+    holder: Any
+    name: str
+    value: object
+
+    def now(self) -> object:
+        """What is there now."""
+        if isinstance(self.holder, types.CellType):
+            return self.holder.cell_contents
+        return attributes_of(self.holder).get(self.name)
+
+    def holds(self) -> bool:
+        """Whether it is still the same object."""
+        return self.now() is self.value
+
+
+def attributes_of(holder: Any) -> Mapping[str, Any]:
+    """Attributes by name; those of a dictionary of globals are its entries."""
+    return holder if isinstance(holder, dict) else vars(holder)
 
 
 class Watch:
@@ -29,6 +53,7 @@ class Watch:
         self._filled: list[Any] = []
         self._named: dict[Callable[..., object], dict[tuple[int, str], Any]] = {getattr: {}, dict.get: {}}
         self._values: list[Reading] = []
+        self._guards: list[Sequence[Guard]] = []
 
     def note_collection(self, held: Any) -> None:
         """Note a collection: what it holds must be the same objects; a new one needs a note of its own."""
@@ -64,6 +89,14 @@ class Watch:
         self.note_value(x, now.is_set_to)  # of the same memory, shape and strides
         if constant:
             self.note_numbers(numbers)
+
+    def guard(self, guards: Sequence[Guard]) -> None:
+        """Watch constants outside of the module too, which are as they were noted."""
+        if not any(guards is known for known in self._guards):
+            self._guards.append(guards)
+            for each in guards:
+                self.note_value(each, Guard.holds)
+            self.begin()
 
     def begin(self) -> None:
         """Remember everything as it is now."""

@@ -44,6 +44,8 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (held.digest, lanes, *widths)
         found, alive = _kept.get(key, (None, held.alive))
+        if isinstance(found, Programs) and not all(guard.holds() for guard in found.guards):
+            found, alive = None, held.alive
         if not isinstance(found, UntraceableError):
             try:
                 found = found or _traced(interval, point_of(initial_state, drive, lanes.number, sums), lanes)
@@ -61,6 +63,8 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
+        if isinstance(found, Programs):
+            held.watch.guard(found.guards)
         return (found, weights) if isinstance(found, Programs) else None
 
 

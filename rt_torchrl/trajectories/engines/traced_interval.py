@@ -13,6 +13,7 @@ from rt_torchrl.programs.escapes import Escapes
 from rt_torchrl.programs.machine_code import march_text, sweep_text
 from rt_torchrl.programs.object_code import ObjectCode
 from rt_torchrl.programs.operators import new_tracer
+from rt_torchrl.programs.outside import Executed, guards_of
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.tracer import STRAIGHT, Tracer
 from rt_torchrl.programs.vector_functions import Lanes
@@ -78,8 +79,12 @@ class Programs:
         x, start = point.in_lanes()
         states = np.concatenate([start, start])
         self.march(*x, states, Weights(interval).row(), 1)
-        with torch.no_grad():
-            require_equal("the end state", states[1].T, interval(*point).numpy(), point.state.numpy())
+        executed = Executed()
+        with torch.no_grad(), executed.noted():
+            exact = interval(*point).numpy()
+        self.guards = guards_of(interval, executed)
+        """Constants outside of the interval that its code has read."""
+        require_equal("the end state", states[1].T, exact, point.state.numpy())
 
     def prepare_sweep(self, interval: nn.Module, driven: bool) -> None:
         """Make the reverse sweep of an interval of this kind, unless it is there.
@@ -116,9 +121,11 @@ class Programs:
         by_weights = np.zeros((sum(weights.sizes), self.lanes.number))
         sweep(*x, states, np.zeros_like(states), 0, by_state, weights.row(), by_drive, by_weights, 1)
         leaves = [x.clone().requires_grad_() for x in (self.point.state, *self.point.drive)]
-        with torch.enable_grad():
+        executed = Executed()
+        with torch.enable_grad(), executed.noted():
             end = interval(leaves[0], Drive(*leaves[1:]))
             state, t, *rest = _gradients(end, [*leaves, *weights.learned], torch.from_numpy(costate.T))
+        self.guards = (*self.guards, *guards_of(interval, executed))
         exact = [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
         found = [by_state.T, by_drive[0].T if driven else exact[1], *weights.split(by_weights.sum(-1))]
         largest = [x[x.isfinite()].abs().amax().item() for x in exact if x.isfinite().any()]
