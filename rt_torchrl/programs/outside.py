@@ -17,7 +17,7 @@ import os
 import sys
 import threading
 import types
-from collections.abc import Iterator, Mapping, MutableSequence, MutableSet
+from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
 from functools import lru_cache
 from itertools import chain
@@ -27,7 +27,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from rt_torchrl.programs.fingerprint import Reader
-from rt_torchrl.programs.outer_names import foreign
+from rt_torchrl.programs.outer_names import MADE_BY, foreign
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.watch import Guard, attributes_of
 
@@ -95,8 +95,8 @@ class Executed:
 _READS_ENVIRONMENT = type(os.environ).__getitem__.__code__
 
 
-def guards_of(module: nn.Module, executed: Executed) -> tuple[Guard, ...]:
-    """The constants that executed functions of a module read, apart from those in its fingerprint.
+def guards_of(module: nn.Module, executed: Executed, known: Iterable[Guard] = ()) -> tuple[Guard, ...]:
+    """The constants that executed functions of a module read, apart from those in its fingerprint, beside known ones.
 
     Raises:
         UntraceableError: if a function reads what may change without notice; the message names both.
@@ -106,8 +106,9 @@ def guards_of(module: nn.Module, executed: Executed) -> tuple[Guard, ...]:
     noticed = {(id(held), name) for held, name in reader.names}
     if executed.environment is not None:
         raise _refusal(executed.environment, "the environment (os.environ)", "")
-    found: dict[tuple[int, str], Guard] = {}
+    found = {(id(guard.holder), guard.name): guard for guard in known}
     for (code, _), held in executed.globals.items():
+        _require_imported(code)
         for guard in chain(_outside(code, held, noticed), _variables(code, executed, reader)):
             found[id(guard.holder), guard.name] = guard
     attributes = {name: code for code, _ in executed.globals for name in _read(code)[1]}
@@ -118,13 +119,7 @@ def guards_of(module: nn.Module, executed: Executed) -> tuple[Guard, ...]:
 
 def _outside(code: types.CodeType, held: dict[str, Any], noticed: set[tuple[int, str]]) -> Iterator[Guard]:
     """The globals that code reads, and the attributes of modules, classes and functions among them."""
-    names, attributes, imports = _read(code)
-    for name in imports:
-        if not foreign(name):
-            raise UntraceableError(
-                f"{_where(code)} imports {name!r} inside, whose values may change unnoticed; import it at the top of "
-                "the file"
-            )
+    names, attributes, _ = _read(code)
     holders: list[tuple[Any, tuple[str, ...], str]] = [(held, names, "global ")]
     seen = set[int]()
     while holders:
@@ -139,12 +134,24 @@ def _outside(code: types.CodeType, held: dict[str, Any], noticed: set[tuple[int,
             value = there[name]
             if isinstance(value, (Tensor, np.ndarray)) and (id(there), name) in noticed:
                 continue  # by its numbers
+            if isinstance(value, types.ModuleType) and foreign(value.__name__):
+                continue  # such as torch
             if not _constant(value):
                 raise _refusal(code, f"{prefix}{name}", _kind(value))
             yield Guard(holder, name, value)
             inner = name if prefix == "global " else f"{prefix}{name}"
             for further in _holders(value):
                 holders.append((further, attributes, f"{inner}."))
+
+
+def _require_imported(code: types.CodeType) -> None:
+    """Refuse code that imports a user's module itself: nothing notices what this module holds."""
+    for name in _read(code)[2]:
+        if not foreign(name):
+            raise UntraceableError(
+                f"{_where(code)} imports {name!r} inside, whose values may change unnoticed; import it at the top of "
+                "the file"
+            )
 
 
 def _holders(value: object) -> Iterator[Any]:
@@ -226,7 +233,13 @@ def _read(code: types.CodeType) -> tuple[tuple[str, ...], tuple[str, ...], tuple
 
 
 def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
-    return foreign(held.get("__name__")) or code.co_filename.startswith(GENERATED)
+    name = held.get("__name__") or ""
+    return (
+        foreign(name or None)
+        or name in MADE_BY
+        or name.startswith("namedtuple_")
+        or code.co_filename.startswith(GENERATED)
+    )
 
 
 def _refusal(code: types.CodeType, what: str, kind: str) -> UntraceableError:

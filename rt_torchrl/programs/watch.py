@@ -95,7 +95,10 @@ class Watch:
         if not any(guards is known for known in self._guards):
             self._guards.append(guards)
             for each in guards:
-                self.note_value(each, Guard.holds)
+                if type(each.holder) is dict:
+                    self.note_attributes(each.holder, each.name)
+                else:
+                    self.note_value(each, Guard.holds)
             self.begin()
 
     def begin(self) -> None:

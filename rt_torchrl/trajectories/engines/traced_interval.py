@@ -125,7 +125,7 @@ class Programs:
         with torch.enable_grad(), executed.noted():
             end = interval(leaves[0], Drive(*leaves[1:]))
             state, t, *rest = _gradients(end, [*leaves, *weights.learned], torch.from_numpy(costate.T))
-        self.guards = (*self.guards, *guards_of(interval, executed))
+        self.guards = guards_of(interval, executed, self.guards)
         exact = [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
         found = [by_state.T, by_drive[0].T if driven else exact[1], *weights.split(by_weights.sum(-1))]
         largest = [x[x.isfinite()].abs().amax().item() for x in exact if x.isfinite().any()]
