@@ -322,3 +322,13 @@ class Sorting(LinearQuadratic):
     def vector_field(self, t, state, action, exogenous, closure):
         rates = super().vector_field(t, state, action, exogenous, closure)
         return rates + 0.0 * state.sort(-1).values
+
+
+CONFIG = {"weight": 2.0}
+
+
+class Configured(LinearQuadratic):
+    """A plant that keeps the contract, with a weight that machine code would not see change."""
+
+    def running_cost(self, t, state, applied, exogenous):
+        return CONFIG["weight"] * super().running_cost(t, state, applied, exogenous)

@@ -102,10 +102,11 @@ def test_too_small_a_check_is_refused(argument, value):
 TRACE = """
 import sys
 sys.path.insert(0, "tests")
-from broken_plants import TRACED, Sorting
+from broken_plants import TRACED, Configured, Sorting
 from rt_torchrl import check_plant
 
 print(check_plant(Sorting(), steps=5))
+print(check_plant(Configured(), steps=5))
 
 for kind in TRACED:
     try:
@@ -122,5 +123,6 @@ def test_what_is_not_one_graph_is_found():
     for kind, message in TRACED.items():
         assert any(re.match(message, text) for text in found[kind.__name__]), (found, done.stderr[-2000:])
     # A plant that only the engine native cannot take fulfils its contract; the report names the line of its code.
-    report = next(line for line in done.stdout.splitlines() if line.startswith("plant"))
+    report, configured = (line for line in done.stdout.splitlines() if line.startswith("plant"))
     assert re.search(r"fulfils its contract.*'autograd' takes the place of 'native'.*sort.*broken_plants\.py", report)
+    assert re.search(r"'autograd' takes the place .*running_cost .*reads the global CONFIG, a dict.*a buffer", configured)

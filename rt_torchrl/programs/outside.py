@@ -120,7 +120,7 @@ def guards_of(module: nn.Module, executed: Executed, known: Iterable[Guard] = ()
 def _outside(code: types.CodeType, held: dict[str, Any], noticed: set[tuple[int, str]]) -> Iterator[Guard]:
     """The globals that code reads, and the attributes of modules, classes and functions among them."""
     names, attributes, _ = _read(code)
-    holders: list[tuple[Any, tuple[str, ...], str]] = [(held, names, "global ")]
+    holders: list[tuple[Any, tuple[str, ...], str]] = [(held, names, "the global ")]
     seen = set[int]()
     while holders:
         holder, wanted, prefix = holders.pop()
@@ -139,7 +139,7 @@ def _outside(code: types.CodeType, held: dict[str, Any], noticed: set[tuple[int,
             if not _constant(value):
                 raise _refusal(code, f"{prefix}{name}", _kind(value))
             yield Guard(holder, name, value)
-            inner = name if prefix == "global " else f"{prefix}{name}"
+            inner = name if prefix == "the global " else f"{prefix}{name}"
             for further in _holders(value):
                 holders.append((further, attributes, f"{inner}."))
 
