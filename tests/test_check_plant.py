@@ -125,4 +125,6 @@ def test_what_is_not_one_graph_is_found():
     # A plant that only the engine native cannot take fulfils its contract; the report names the line of its code.
     report, configured = (line for line in done.stdout.splitlines() if line.startswith("plant"))
     assert re.search(r"fulfils its contract.*'autograd' takes the place of 'native'.*sort.*broken_plants\.py", report)
-    assert re.search(r"'autograd' takes the place .*running_cost .*reads the global CONFIG, a dict.*a buffer", configured)
+    assert re.search(
+        r"'autograd' takes the place .*running_cost .*reads the global CONFIG, a dict.*a buffer", configured
+    )

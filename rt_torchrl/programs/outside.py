@@ -233,13 +233,10 @@ def _read(code: types.CodeType) -> tuple[tuple[str, ...], tuple[str, ...], tuple
 
 
 def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
-    name = held.get("__name__") or ""
-    return (
-        foreign(name or None)
-        or name in MADE_BY
-        or name.startswith("namedtuple_")
-        or code.co_filename.startswith(GENERATED)
-    )
+    name = held.get("__name__")
+    if foreign(name) or name in MADE_BY or code.co_filename.startswith(GENERATED):
+        return True
+    return str(name).startswith("namedtuple_")
 
 
 def _refusal(code: types.CodeType, what: str, kind: str) -> UntraceableError:
