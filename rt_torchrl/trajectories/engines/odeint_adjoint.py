@@ -5,7 +5,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.trajectories.engines.compilation import compiled_if
 from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 
@@ -19,20 +18,20 @@ class OdeintAdjoint(GradientEngine):
     the gradient differs from the exact one of the discrete trajectory by the order of that step.
 
     Args:
-        compiled: compile the vector field; the solver's loop stays in Python.
+        compiled: without effect: torchdiffeq goes back several times through one graph, which compiled code refuses.
     """
 
     own_scheme: ClassVar[bool] = False  # it integrates the vector field
     start_per_realisation: ClassVar[bool] = False  # torchdiffeq integrates the whole batch over one span
 
     def __init__(self, *, compiled: bool):
-        self._compiled = compiled
+        pass
 
     def end_states(self, interval: Interval, initial_state: Tensor, drive: Drive) -> Tensor:
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         from torchdiffeq import odeint_adjoint  # here, because it takes a second to load and only this engine needs it
 
-        field = _HeldField(interval, initial_state.shape[-1], compiled=self._compiled)
+        field = _HeldField(interval, initial_state.shape[-1])
         weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
         interval_span = torch.tensor([0.0, interval.plant.dt], dtype=torch.float64, device=drive.t.device)
         state, states = initial_state, []
@@ -51,11 +50,11 @@ class OdeintAdjoint(GradientEngine):
 class _HeldField(nn.Module):
     """The vector field of the held state, d[s, a, z]/dt = [f(t, s, a, z), 0, 0]."""
 
-    def __init__(self, interval: Interval, n_states: int, *, compiled: bool):
+    def __init__(self, interval: Interval, n_states: int):
         super().__init__()
         plant = interval.plant
         self.closure, self.sizes = interval.closure, (n_states, len(plant.actions), len(plant.inputs))
-        self.vector_field = compiled_if(compiled, plant.vector_field)
+        self.vector_field = plant.vector_field
 
     def forward(self, t: Tensor, held: Tensor) -> Tensor:
         state, action, exogenous = held.split(self.sizes, -1)

@@ -56,10 +56,10 @@ class TwinEnsemble(DigitalTwin):
                 raise ValueError(
                     f"hypothesis {name!r} must extend the twin's plant {plant.name!r}: other states are read."
                 )
-        self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine, compiled=compiled)} | {
-            name: DigitalTwin(suspect, closures[name], engine=able(engine, suspect), compiled=compiled)
-            for name, suspect in suspects.items()
-        }
+        self.twins = {ALONE: DigitalTwin(plant, closure, engine=engine, compiled=compiled)}
+        for name, suspect in suspects.items():
+            taken = able(engine, suspect)  # without compilation if it is another one, as everywhere
+            self.twins[name] = DigitalTwin(suspect, closures[name], engine=taken, compiled=compiled and taken == engine)
         self.risk = 0.0
         self.weights = {ALONE: 1.0}
 
