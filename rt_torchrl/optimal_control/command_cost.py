@@ -151,16 +151,16 @@ class CommandCost:
         state = torch.nn.functional.pad(initial_state, (0, 1))
         command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
         self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
-        self._programs = self._traced()  # kept programs, unless the plant or the closure is another one by now
-        if self._programs is not None:
-            self._weights = Weights(self.interval).row()
+        found, self._programs = self._traced(), None
+        if found is not None:  # kept programs, unless the plant or the closure is another one by now
+            self._programs, weights = found
+            self._weights = weights.row()
             self._place(self._programs)
 
-    def _traced(self) -> Programs | None:
+    def _traced(self) -> tuple[Programs, Weights] | None:
         with torch.enable_grad():
             drive = self._drive._replace(command=self._drive.command.clone().requires_grad_())
-            found = programs_of(self.interval, self._state, drive)
-        return None if found is None else found[0]
+            return programs_of(self.interval, self._state, drive)
 
     def _place(self, programs: Programs) -> None:
         """Lay out the arrays of the window, one set for each group of lanes."""
@@ -177,6 +177,10 @@ class CommandCost:
             self._costate, self._nothing = np.empty((n_s, lanes)), np.zeros((1, n_s, lanes))
             self._by_weights = np.zeros((0, lanes))
             self._first_block = np.arange(0, n, self.hold)
+        adjoint = (self._nothing, 0, self._costate, self._weights, self._by_drive, self._by_weights, n)
+        calls = [(*x, s) for x, s in zip(self._driven, self._states, strict=True)]
+        self._march = [programs.march.bound(*call, self._weights, n) for call in calls]
+        self._sweeps = [programs.sweeps[True].bound(*call, *adjoint) for call in calls]
         self._groups, first = groups, 1 + self._drive.exogenous.shape[-1]
         exogenous, state = self._drive.exogenous.numpy(), self._state.numpy()[None]
         for k, group in enumerate(groups):
@@ -192,14 +196,13 @@ class CommandCost:
             return self._by_torch(unit)
         costs, gradient = np.empty(len(unit)), np.empty_like(unit)
         for k, group in enumerate(self._groups):
-            self._sweep(self._programs, k, group, unit, costs, gradient)
+            self._sweep(k, group, unit, costs, gradient)
         costs /= self.n
         gradient /= self.n
         return costs, gradient
 
     def _sweep(
         self,
-        programs: Programs,
         k: int,
         group: Group,
         unit: np.ndarray,
@@ -209,15 +212,13 @@ class CommandCost:
         x, states, n, n_a = self._x[k], self._states[k], self.n, unit.shape[-1]
         lanes = group.gather(unit.transpose(1, 0, 2))
         x[:, -n_a:] = lanes if self.hold == 1 else np.repeat(lanes, self.hold, 0)[:n]
-        driven = self._driven[k]
-        programs.march(*driven, states, self._weights, n)
+        self._march[k]()
         self._costate[:] = 0.0
         self._costate[-1] = 1.0
         costs[group.first : group.last] = states[-1, -1, : group.live]
         if self.terminal is not None:
             costs[group.first : group.last] += self._end(states[-1, :-1], group.live)
-        arrays = (self._costate, self._weights, self._by_drive, self._by_weights)
-        programs.sweeps[True](*driven, states, self._nothing, 0, *arrays, n)
+        self._sweeps[k]()
         by_blocks = self._by_drive[:, -n_a:]
         if self.hold > 1:
             by_blocks = np.add.reduceat(by_blocks, self._first_block, 0)

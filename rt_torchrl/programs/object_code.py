@@ -2,7 +2,8 @@
 
 import ctypes
 import hashlib
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -38,6 +39,10 @@ class ObjectCode:
     def __call__(self, *arguments: np.ndarray | int) -> None:
         """Run the function; of an array, whose numbers lie side by side, it gets the address."""
         self._function(*(x if isinstance(x, int) else _memory_of(x.data) for x in arguments))
+
+    def bound(self, *arguments: np.ndarray | int) -> Callable[[], None]:
+        """The call with these arrays, whose numbers may change between calls; it keeps their memory alive."""
+        return partial(self._function, *(x if isinstance(x, int) else _memory_of(x.data) for x in arguments))
 
 
 def _compiled(text: str) -> bytes:
