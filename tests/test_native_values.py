@@ -58,13 +58,9 @@ def trees():
     leaf = st.sampled_from([lambda x, y: x, lambda x, y: y])
 
     def grown(inner):
-        one = st.builds(lambda f, a: lambda x, y: UNARY[f](a(x, y)).double(), st.sampled_from(sorted(UNARY)), inner)
-        two = st.builds(
-            lambda f, a, b: lambda x, y: BINARY[f](a(x, y), b(x, y)).double(),
-            st.sampled_from(sorted(BINARY)),
-            inner,
-            inner,
-        )
+        unary, binary = (st.sampled_from([held[name] for name in sorted(held)]) for held in (UNARY, BINARY))
+        one = st.builds(lambda f, a: lambda x, y: f(a(x, y)).double(), unary, inner)
+        two = st.builds(lambda f, a, b: lambda x, y: f(a(x, y), b(x, y)).double(), binary, inner, inner)
         return one | two
 
     return st.recursive(leaf, grown, max_leaves=4)
@@ -91,7 +87,8 @@ def assert_same(f, lanes=None):
 
 @pytest.mark.parametrize("name", [*UNARY, *BINARY])
 def test_special_values_of_operators(name):
-    assert_same((lambda x, y: UNARY[name](x).double()) if name in UNARY else (lambda x, y: BINARY[name](x, y).double()))
+    one, two = UNARY.get(name), BINARY.get(name)
+    assert_same((lambda x, y: one(x).double()) if one else (lambda x, y: two(x, y).double()))
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

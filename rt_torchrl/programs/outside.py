@@ -218,7 +218,7 @@ def _constant(value: object) -> bool:
         return False
     if foreign(kind.__module__):
         return True
-    if dataclasses.is_dataclass(kind) and kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+    if dataclasses.is_dataclass(kind) and getattr(getattr(kind, "__dataclass_params__", None), "frozen", False):
         return all(_constant(getattr(value, field.name)) for field in dataclasses.fields(kind))
     return inspect.isdatadescriptor(value) or (inspect.ismethoddescriptor(value) and not hasattr(value, "__dict__"))
 

@@ -92,14 +92,17 @@ class Watch:
 
     def guard(self, guards: Sequence[Guard]) -> None:
         """Watch constants outside of the module too, which are as they were noted."""
-        if not any(guards is known for known in self._guards):
-            self._guards.append(guards)
-            for each in guards:
-                if type(each.holder) is dict:
-                    self.note_attributes(each.holder, each.name)
-                else:
-                    self.note_value(each, Guard.holds)
-            self.begin()
+        self._guards.append(guards)
+        for each in guards:
+            if type(each.holder) is dict:
+                self.note_attributes(each.holder, each.name)
+            else:
+                self.note_value(each, Guard.holds)
+        self.begin()
+
+    def guarded(self, guards: Sequence[Guard]) -> bool:
+        """Whether these constants are watched already."""
+        return any(guards is known for known in self._guards)
 
     def begin(self) -> None:
         """Remember everything as it is now."""

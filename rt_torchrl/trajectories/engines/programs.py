@@ -44,7 +44,7 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (held.digest, lanes, *widths)
         found, alive = _kept.get(key, (None, held.alive))
-        if isinstance(found, Programs) and not all(guard.holds() for guard in found.guards):
+        if isinstance(found, Programs) and not _as_noted(found, held):
             found, alive = None, held.alive
         if not isinstance(found, UntraceableError):
             try:
@@ -63,9 +63,14 @@ def programs_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tup
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
-        if isinstance(found, Programs):
+        if isinstance(found, Programs) and not held.watch.guarded(found.guards):
             held.watch.guard(found.guards)
         return (found, weights) if isinstance(found, Programs) else None
+
+
+def _as_noted(programs: Programs, held: Fingerprint) -> bool:
+    """Whether constants outside of the interval are what they were; those that are watched are."""
+    return held.watch.guarded(programs.guards) or all(guard.holds() for guard in programs.guards)
 
 
 def _traced(interval: nn.Module, point: Point, lanes: Lanes) -> Programs:

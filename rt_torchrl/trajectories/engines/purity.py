@@ -122,7 +122,7 @@ def rows_of(initial_state: Tensor, drive: Drive, count: int, sums: int = 0) -> t
 
     Behind the states are the sums of the interval, which begin with zero.
     """
-    n, batch, row = len(drive.t), len(initial_state), torch.arange(count)
+    n, batch, row = len(drive.t), len(initial_state), torch.arange(count, device=initial_state.device)
     at = (row * n) // count
     t = drive.t[at, row % batch if drive.t.shape[1] > 1 else 0]
     driving = (_nudged(x[at, row % batch]) for x in (drive.exogenous, drive.command))
