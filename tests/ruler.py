@@ -2,7 +2,7 @@
 
 ``uv run --group test python tests/ruler.py --seeds 5 --folder runs/ruler`` trains what is missing in the folder, two
 trainings side by side on one thread each, and prints the table as Markdown. The same command goes on where it was
-interrupted; another folder is another measurement. It takes about 50 minutes on two cores.
+interrupted; another folder is another measurement. It takes about 40 minutes on two cores.
 """
 
 import argparse
@@ -68,7 +68,10 @@ def identified(data: Path, folder: Path) -> float:
 
 
 class Result(NamedTuple):
-    """What a training ended with: cost of the live policy and of the cheaper one on unseen episodes, Σ, seconds."""
+    """What a training ended with: costs of the live and of the cheaper policy on unseen episodes, Σ, seconds.
+
+    Σ is the sum of J_a of its real episodes, without that of the controller that flew before them.
+    """
 
     live: float
     cheaper: float
@@ -77,10 +80,11 @@ class Result(NamedTuple):
 
     @classmethod
     def of(cls, folder: Path) -> "Result":
-        summary = json.loads((folder / "metrics.json").read_text())["summary"]
+        metrics = json.loads((folder / "metrics.json").read_text())
+        summary, paid = metrics["summary"], sum(episode["real_cost"] for episode in metrics["episodes"])
         costs = {role: summary["unseen"][f"J_a_{role}"]["mean"] for role in ("model_based", "model_free")}
         seconds = json.loads((folder / "seconds.json").read_text())
-        return cls(costs[summary["live"]], min(costs.values()), summary["cost_of_learning"]["sum"], seconds)
+        return cls(costs[summary["live"]], min(costs.values()), paid, seconds)
 
 
 def line(name: str, results: list[Result]) -> str:
