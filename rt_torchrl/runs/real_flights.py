@@ -27,7 +27,6 @@ class Contender(NamedTuple):
     """A controller that is to fly the real system, and what it is called before it does."""
 
     called: str
-    flights: int
     fly: Callable[[], Trajectory]
 
 
@@ -63,28 +62,28 @@ def contenders(
         device: device of the twin.
     """
     found: dict[str, Contender] = {}
-    if config.real_unseen:
-        asked = RealEpisodes(system, config.real_unseen, device=device)
-        live = algorithm.referee.live
-        policy = algorithm.policies[live]
-        known = config.start != "random" or isinstance(policy, StateFeedback)
-        if known or not clones(policy, untrained[live]):
-            called = f"the live policy ({live.replace('_', '-')})"
-            found[live] = Contender(called, config.real_unseen, partial(asked.fly, policy))
-        if config.start == "controller" and first is not None:
-            controller = ActingController(first(algorithm.twin.plant).to(device))
-            name = first.__name__ if first.__name__ not in baselines else f"{first.__name__} (first)"
-            found[name] = Contender(name, config.real_unseen, partial(asked.fly, controller))
-        for name, law in baselines.items():
-            if isinstance(law, RealController):
-                found[name] = Contender(name, config.real_unseen, partial(asked.fly_baseline, law))
+    if not config.real_unseen:
+        return found
+    asked = RealEpisodes(system, config.real_unseen, device=device)
+    live = algorithm.referee.live
+    policy = algorithm.policies[live]
+    known = config.start != "random" or isinstance(policy, StateFeedback)
+    if known or not clones(policy, untrained[live]):
+        found[live] = Contender(f"the live policy ({live.replace('_', '-')})", partial(asked.fly, policy))
+    if config.start == "controller" and first is not None:
+        controller = ActingController(first(algorithm.twin.plant).to(device))
+        name = first.__name__ if first.__name__ not in baselines else f"{first.__name__} (first)"
+        found[name] = Contender(name, partial(asked.fly, controller))
+    for name, law in baselines.items():
+        if isinstance(law, RealController):
+            found[name] = Contender(name, partial(asked.fly_baseline, law))
     return found
 
 
-def announcement(found: Mapping[str, Contender]) -> str:
-    """How many flights of whom there will be on the real system."""
-    each = ", ".join(f"{one.flights} of {one.called}" for one in found.values())
-    return f"{sum(one.flights for one in found.values())} flights on the real system: {each}; they count as paid"
+def announcement(found: Mapping[str, Contender], count: int) -> str:
+    """How many flights of whom there will be on the real system, where each controller makes so many."""
+    each = ", ".join(f"{count} of {one.called}" for one in found.values())
+    return f"{count * len(found)} flights on the real system: {each}; they count as paid"
 
 
 def entries(flights: Mapping[str, RealFlights], J_p: Mapping[str, torch.Tensor]) -> dict[str, Any]:

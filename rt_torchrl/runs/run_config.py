@@ -59,7 +59,7 @@ class RunConfig:
             says if it cannot. Without compilation these start at once, but every step is several times slower.
         device: device on which everything runs, such as cpu or cuda.
         threads: number of CPU threads; 0 leaves torch's default or, beside an acting process, takes the cores that it
-            leaves.
+            leaves. Updates of step 2 run on one.
         start: what the training begins with, so that the real system never flies a random policy. controller: the
             controller that the real system has had so far flies one episode before all others, and twin and policies
             learn from it. mpc: model predictive control on the first twin flies that episode. The folder of a finished
@@ -79,7 +79,7 @@ class RunConfig:
         real_unseen: number of episodes that each controller flies at the end on a real system that is not simulated
             here: the live policy, if it was trained, and the controller of start. The run says how many flights of whom
             before the first one, and counts them as paid; after Ctrl-C nothing flies. Baselines that nothing but the
-            real system can fly do so as many times, and with 0 as many as unseen.
+            real system can fly do so as many times, and are refused with 0.
         untrained: number of random initial policies whose mean cost on the unseen episodes the results are also
             compared with; 0 leaves this comparison out.
         reference: whether to compute also the cost that exact gradients on the true plant reach with this policy on the
