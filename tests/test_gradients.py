@@ -139,7 +139,7 @@ LONE = [("own", "commands", 1), ("own", "policy", 1)]
 def test_exact_engines_equal_autograd_and_differences(plant, closure, driver, batch):
     case = Case(PLANTS[plant](), closure, driver, batch)
     exact = case.gradients("autograd")
-    others = [case.gradients(engine) for engine in ("parallel", "parallel_in_time", "native")]
+    others = [case.gradients(engine) for engine in ("parallel", "native")]
     generator, value = seeded(9), case.cost().item()
     walk = case.plant.n_steps**0.5 * (exact["initial_state"] * case.initial_state).abs().sum().item()
     for name, gradient in exact.items():
@@ -224,7 +224,7 @@ for driver, batch in (("commands", 1), ("policy", 4)):
     # Like the start of a record: a slice, whose strides are not those of a fresh tensor.
     case.initial_state = case.initial_state.unsqueeze(1).repeat(1, 5, 1)[:, 0]
     exact = case.gradients("autograd")
-    for engine in ("parallel", "parallel_in_time", "autograd", "odeint_adjoint"):
+    for engine in ("parallel", "autograd", "odeint_adjoint"):
         eager, compiled = (case.gradients(engine, compiled=flag) for flag in (False, True))
         for name in exact:
             gap = relative_gap(compiled[name], eager[name])

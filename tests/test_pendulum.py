@@ -161,7 +161,7 @@ def test_another_time_step_than_gymnasiums_is_refused():
 
 def test_the_engine_that_knows_no_own_step_is_refused():
     plant = Pendulum()
-    with pytest.raises(ValueError, match="odeint_adjoint.*own; use native, parallel, parallel_in_time or autograd"):
+    with pytest.raises(ValueError, match="odeint_adjoint.*own; use native, parallel or autograd"):
         Rollout(plant, plant.closure, plant.make_policy(seeded()), engine="odeint_adjoint")
 
 
@@ -169,7 +169,7 @@ def test_engines_agree_without_inputs():
     """The exact gradients of three engines on a plant that has no exogenous input."""
     plant, gradients = Pendulum(horizon=1.0), []
     state, nothing = plant.draw_initial_state(3, seeded()), plant.draw_exogenous(3, seeded())
-    for engine in ("parallel", "parallel_in_time", "autograd"):
+    for engine in ("parallel", "autograd"):
         policy, closure = plant.make_policy(seeded(1)), plant.make_closure(seeded())
         flown = Rollout(plant, closure, policy, engine=engine)(state, nothing)
         weights = [*closure.parameters(), *policy.parameters()]

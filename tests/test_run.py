@@ -318,7 +318,7 @@ def test_a_checkpoint_of_another_architecture_is_refused(finished):
         ({"closure": "cubic"}, "closure='cubic' does not exist; choose plant or mlp"),
         (
             {"engine": "fast"},
-            "engine='fast' does not exist; choose native, parallel, parallel_in_time, odeint_adjoint or autograd",
+            "engine='fast' does not exist; choose native, parallel, odeint_adjoint or autograd",
         ),
         ({"noise": -0.1}, "noise=-0.1 must not be negative"),
         ({"noise": math.inf}, "noise=inf must be a finite number"),

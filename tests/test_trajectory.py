@@ -15,7 +15,7 @@ from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
-ENGINES = ("parallel", "parallel_in_time", "odeint_adjoint", "autograd")
+ENGINES = ("parallel", "odeint_adjoint", "autograd")
 A, B = np.array(LinearQuadratic.A) + np.array(LinearQuadratic.true_closure), np.array(LinearQuadratic.B)
 
 
@@ -170,7 +170,7 @@ def call(plant=None, policy=None, *, state=(2, 2), exogenous=(2, 50, 1), command
         (lambda: call(spoil="command"), "command holds NaN"),
         (
             lambda: call(engine="magic"),
-            "engine='magic' does not exist; choose one of native, parallel, parallel_in_time, odeint_adjoint",
+            "engine='magic' does not exist; choose one of native, parallel, odeint_adjoint",
         ),
         (
             lambda: call(policy=nn.Linear(2, 1), command=None),

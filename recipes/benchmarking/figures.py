@@ -13,7 +13,6 @@ from rt_torchrl.figures.style import caption, legend_below, panels
 COLOURS = {
     "native": "#D55E00",
     "parallel": "#0072B2",
-    "parallel_in_time": "#56B4E9",
     "odeint_adjoint": "#009E73",
     "autograd": "#222222",
     "jax_scan": "#E69F00",

@@ -52,8 +52,7 @@ class RunConfig:
             training ends early; with 0 it never does.
         seed: seed of weights, disturbances, exploration and sampling; the same seed gives the same run.
         engine: gradient engine of steps 4 and 5: native (exact, machine code, for CPUs), parallel (exact, PyTorch, for
-            GPUs), parallel_in_time (exact, PyTorch, for few long episodes on GPUs, untested there), odeint_adjoint (the
-            paper's continuous adjoint, slow) or autograd (exact, slow).
+            GPUs), odeint_adjoint (the paper's continuous adjoint, slow) or autograd (exact, slow).
         compiled: whether to compile with torch.compile what PyTorch computes. By default the engine native compiles
             nothing, because it computes itself; other engines and devices compile if this machine can, and a notice
             says if it cannot. Without compilation these start at once, but every step is several times slower.

@@ -1,11 +1,10 @@
-r"""Trajectories :math:`s_{k+1} = \Phi(s_k, x_k; w)` and their gradients, by five engines behind one call.
+r"""Trajectories :math:`s_{k+1} = \Phi(s_k, x_k; w)` and their gradients, by four engines behind one call.
 
 ====================  ==================================================  ======================================
 engine                gradient                                            for
 ====================  ==================================================  ======================================
 ``native``            exact discrete adjoint, machine code over lanes     training on CPUs
 ``parallel``          exact discrete adjoint, parallel over time          training on GPUs
-``parallel_in_time``  the same, and the trajectory by Newton's method     few long episodes on GPUs
 ``odeint_adjoint``    continuous adjoint by torchdiffeq, error O(dt)      reference, the paper's method
 ``autograd``          backpropagation through every step, exact           what native cannot trace, double-checking
 ====================  ==================================================  ======================================
@@ -22,16 +21,15 @@ from torch.nn import functional
 
 from rt_torchrl.plants.ending import final_cost
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel, ParallelInTime
+from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.purity import require_pure_once
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
-Engine = Literal["native", "parallel", "parallel_in_time", "odeint_adjoint", "autograd"]
+Engine = Literal["native", "parallel", "odeint_adjoint", "autograd"]
 ENGINES: dict[Engine, type[GradientEngine]] = {
     "native": Native,
     "parallel": Parallel,
-    "parallel_in_time": ParallelInTime,
     "odeint_adjoint": OdeintAdjoint,
     "autograd": Autograd,
 }
