@@ -94,7 +94,7 @@ from .twinning.planners import (
     ShortHorizonConfig,
     WholeEpisodes,
 )
-from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio, WeightOfEvidence
+from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, WeightOfEvidence
 from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
@@ -238,7 +238,6 @@ __all__ = [
     "TD3Config",
     "Trajectory",
     "Transition",
-    "TrustRatio",
     "TwinEnsemble",
     "TwinningConfig",
     "Uncertainty",

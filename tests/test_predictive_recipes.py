@@ -40,7 +40,7 @@ def records(tmp_path, name, *options):
     "options",
     [
         pytest.param("--observe measured+wind --policy mlp --model-error", marks=pytest.mark.nightly),
-        pytest.param("--observe preview --noise 0.01 --twinning.referee.rule trust_ratio", marks=pytest.mark.nightly),
+        pytest.param("--observe preview --noise 0.01 --twinning.referee.rule decision_tree", marks=pytest.mark.nightly),
         pytest.param(
             "--policy scheduled --twinning.learner.algorithm td3 --twinning.arm model_based", marks=pytest.mark.slow
         ),

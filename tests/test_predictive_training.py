@@ -53,7 +53,7 @@ def referee(**options):
 
 
 @pytest.mark.parametrize("name", ["ddpg", "td3"])
-@pytest.mark.parametrize("rule", ["decision_tree", "trust_ratio"])
+@pytest.mark.parametrize("rule", ["decision_tree", "weight_of_evidence"])
 def test_it_acts_the_twin_is_fitted_and_the_other_half_learns(tmp_path, rule, name):
     run = training(tmp_path, 4, twinning=learner(name) | referee(rule=rule))
     records = run.train()["episodes"]
@@ -85,7 +85,7 @@ def test_what_it_plans_on_is_the_twins_closure():
     run._held.release()
 
 
-@pytest.mark.parametrize("rule", ["decision_tree", "trust_ratio"])
+@pytest.mark.parametrize("rule", ["decision_tree", "weight_of_evidence"])
 def test_an_interrupted_training_goes_on_to_the_bit(tmp_path, rule):
     whole = training(tmp_path / "whole", 4, twinning=referee(rule=rule))
     whole.train()

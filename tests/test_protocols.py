@@ -22,7 +22,7 @@ from rt_torchrl.twinning.planners import (
     ShortHorizonConfig,
     WholeEpisodes,
 )
-from rt_torchrl.twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, TrustRatio
+from rt_torchrl.twinning.referees import DecisionTree, Referee, RefereeConfig, WeightOfEvidence
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLANT = LinearQuadratic(horizon=2.0)
@@ -59,7 +59,7 @@ PLANNERS = {
 }
 REFEREES = {
     "decision tree": lambda: DecisionTree(RefereeConfig(patience=0)),
-    "trust ratio": lambda: TrustRatio(RefereeConfig()),
+    "weight of evidence": lambda: WeightOfEvidence(RefereeConfig()),
     "documented": lambda: documented("referee.md", "ModelFirst")(),
 }
 
@@ -143,11 +143,11 @@ def test_a_learner_of_another_policy_is_refused():
 
 
 def test_configuration_names_the_parts():
-    parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="trust_ratio")}
+    parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="weight_of_evidence")}
     short = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10))
     found = twinning(PLANT, **parts, planner=short)
     kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
-    assert kinds == ["TD3", "ShortHorizon", "TrustRatio"]
+    assert kinds == ["TD3", "ShortHorizon", "WeightOfEvidence"]
     report = found.episode()
     assert {"critic_loss", "value", "J_a_plan", "J_a_model_free", "event"} <= set(report.keys())
 
@@ -169,9 +169,3 @@ def test_evidence_predicts_the_cost_of_the_flight_itself():
     real, predicted = found.track_record.real_costs, found.track_record.predicted_costs(found.virtual)
     assert len(real) == 2 and real[0] != real[1]
     assert predicted == pytest.approx(real, rel=1e-12)
-    evidence = Evidence(
-        live_cost=1.0, idle_cost=2.0, idle_weight_change=1.0, real_costs=real, predicted_costs=lambda: predicted
-    )
-    referee = TrustRatio(RefereeConfig())
-    referee.doubt_count = 5
-    assert referee.decide(evidence) == "keep" and referee.doubt_count == 0

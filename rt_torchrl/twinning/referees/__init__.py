@@ -2,12 +2,10 @@
 
 from rt_torchrl.twinning.referees.decision_tree import DecisionTree
 from rt_torchrl.twinning.referees.referee import ROLES, Event, Evidence, Referee, RefereeConfig, RefereeName, Role
-from rt_torchrl.twinning.referees.trust_ratio import TrustRatio
 from rt_torchrl.twinning.referees.weight_of_evidence import WeightOfEvidence
 
-REFEREES: dict[RefereeName, type[DecisionTree] | type[TrustRatio] | type[WeightOfEvidence]] = {
+REFEREES: dict[RefereeName, type[DecisionTree] | type[WeightOfEvidence]] = {
     "decision_tree": DecisionTree,
-    "trust_ratio": TrustRatio,
     "weight_of_evidence": WeightOfEvidence,
 }
 
@@ -25,7 +23,6 @@ __all__ = [
     "Referee",
     "RefereeConfig",
     "Role",
-    "TrustRatio",
     "WeightOfEvidence",
     "make_referee",
 ]

@@ -10,7 +10,7 @@ from rt_torchrl.twinning.evidence.paired_differences import LOCAL, Belief
 
 Role = Literal["model_free", "model_based"]
 Event = Literal["keep", "swap", "clone"]
-RefereeName = Literal["decision_tree", "trust_ratio", "weight_of_evidence"]
+RefereeName = Literal["decision_tree", "weight_of_evidence"]
 UNKNOWN = Belief(0.0, math.sqrt(2.0) * LOCAL)
 """Belief about the difference of two policies of which nothing is known; the error that all policies share cancels."""
 ROLES: tuple[Role, Role] = ("model_based", "model_free")
@@ -21,16 +21,14 @@ class RefereeConfig:
     """Parameters of step 6.
 
     Args:
-        rule: rule of the referee: ``decision_tree``, as in the paper, ``trust_ratio``, which believes the twin only
-            while the real cost follows the twin's predictions, or ``weight_of_evidence``, which weighs what a change
-            may gain against what it may cost.
+        rule: rule of the referee: ``decision_tree``, as in the paper, or ``weight_of_evidence``, which believes the
+            twin as long as real episodes do, and else weighs what a change may gain against what it may cost.
         patience: number P_π of episodes in a row that a reason to swap must outlast.
         clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
             a clone.
         tolerance: ratio T_J of the live policy's mean cost to the idle policy's above which the live policy is worse.
         stall: relative weight change T_w below which the idle policy has stalled.
         trial_horizon: number of episodes over which a better policy pays for the trial in which it may be a worse one.
-        band: least and greatest ratio of the real cost's change to the predicted change at which the twin is trusted.
     """
 
     rule: RefereeName = "decision_tree"
@@ -38,7 +36,6 @@ class RefereeConfig:
     clone_patience: int = 3
     tolerance: float = 1.0
     stall: float = 0.5
-    band: tuple[float, float] = (0.0, 40.0)
     trial_horizon: float = 5.0
 
     def __post_init__(self) -> None:
@@ -51,8 +48,6 @@ class RefereeConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
         if not self.trial_horizon > 0:
             raise ValueError(f"trial_horizon={self.trial_horizon} must be positive.")
-        if not self.band[0] < self.band[1]:
-            raise ValueError(f"band={self.band} of the trust ratio must have its least value first.")
 
 
 @dataclass(frozen=True, kw_only=True)
