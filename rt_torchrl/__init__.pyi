@@ -48,7 +48,6 @@ from .evaluation.baseline import RealController
 
 # Trajectories and the twin
 from .trajectories.rollout import DivergenceError, Engine, Rollout
-from .trajectories.simulated_twin import SimulatedTwin
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
@@ -229,7 +228,6 @@ __all__ = [
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
-    "SimulatedTwin",
     "SlowActuator",
     "SmoothClip",
     "Snapshot",

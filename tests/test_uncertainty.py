@@ -16,7 +16,6 @@ from rt_torchrl.identification.design import next_manoeuvres, weight_information
 from rt_torchrl.identification.estimation import Estimation, EstimationConfig
 from rt_torchrl.identification.output_error import InitialStates, OutputError
 from rt_torchrl.identification.prediction import predict
-from rt_torchrl.identification.profile import profile
 from rt_torchrl.identification.sensor_record import sensor_record
 from rt_torchrl.identification.sensors import Sensor, sensors_of
 from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
@@ -70,24 +69,6 @@ def test_robust_errors_see_that_neighbours_are_alike():
     config = EstimationConfig(errors="robust")
     robust = line_estimate(smooth=True, config=config).uncertainty.weights_covariance[0, 0].sqrt().item()
     assert robust == pytest.approx(math.sqrt(exact_covariance()[0, 0]), rel=0.5)
-
-
-def test_the_profile_of_a_linear_weight_is_its_parabola():
-    found = line_estimate()
-    error = found.uncertainty.standard_errors()["w[0]"]
-    before = found.likelihood.twin.closure.w.detach().clone()
-    shown = profile(found.likelihood, 0, error)
-    # The estimate is within 1e-5 standard errors or so of the minimum, and the profile goes out to two of them.
-    np.testing.assert_allclose(shown.rise.numpy(), 0.5 * ((shown.values - before[0]) / error).numpy() ** 2, atol=1e-4)
-    assert shown.interval == pytest.approx(found.uncertainty.intervals()["w[0]"], rel=1e-4)
-    assert torch.equal(found.likelihood.twin.closure.w, before)
-
-
-def test_the_profile_of_an_unknown_weight_is_open():
-    found = line_estimate(winds=(0.0,))
-    assert found.uncertainty.warnings() == ["the data say nothing of w[1]; it keeps its first value"]
-    shown = profile(found.likelihood, 1, math.inf, reach=3)
-    assert shown.interval == (-math.inf, math.inf) and shown.rise.abs().max() < 1e-9
 
 
 class InUnits(Slope):
@@ -249,8 +230,6 @@ def test_what_makes_no_region_is_refused():
     for wrong, message in (
         (lambda: found.uncertainty.ellipse("w[0]", "x"), r"ellipse of \['x'\]"),
         (lambda: found.uncertainty.intervals(1.0), "level=1.0"),
-        (lambda: profile(found.likelihood, 2, 0.1), "place=2 of the profile"),
-        (lambda: profile(found.likelihood, 0, 0.1, step=0.0), "step=0.0"),
     ):
         with pytest.raises(ValueError, match=message):
             wrong()
