@@ -1,7 +1,7 @@
 """Screenshots of pages in a headless Chromium, at the widths of a desktop and of a phone.
 
 ``python docs/screenshots.py FOLDER PAGE.html ...`` writes FOLDER/PAGE_desktop.png and FOLDER/PAGE_phone.png, and says
-which pages are wider than their window or had errors. It needs the group ``test`` and a Chromium.
+which pages are wider than their window or had errors. It needs the group ``docs`` and a Chromium.
 """
 
 import shutil

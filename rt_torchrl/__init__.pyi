@@ -104,7 +104,6 @@ from .runs.callbacks import EarlyStopping
 from .runs.command_line import main_of
 from .runs.loaded_run import LoadedRun, load_run
 from .runs.machine import require_device
-from .runs.report_page import write_report
 from .runs.run import Run
 from .runs.run_config import RunConfig
 from .runs.shipped_plants import shipped_plants
@@ -268,5 +267,4 @@ __all__ = [
     "sensors_of",
     "served_system",
     "shipped_plants",
-    "write_report",
 ]

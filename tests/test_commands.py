@@ -25,7 +25,7 @@ def whole(name, arguments):
     """The arguments with those that the recipe does nothing without."""
     if name == "unknown":
         return ["flapping_wing", *arguments]
-    if name in ("compare", "export", "in_service", "real_time", "report"):
+    if name in ("compare", "export", "in_service", "real_time"):
         return ["run", *arguments]
     if name not in ("identify", "record_log"):
         return arguments
@@ -171,6 +171,6 @@ def direct_of(extra, extras):
 
 def test_one_word_for_the_folder_of_the_results():
     """Recipes that print, or read a run and write beside it or nowhere, have none."""
-    without = {"benchmark", "compare", "coverage", "export", "record_log", "report"}
+    without = {"benchmark", "compare", "coverage", "export", "record_log"}
     for name in set(RECIPES) - without:
         assert "--log-dir" in help_of(name), name

@@ -14,7 +14,7 @@ from rt_torchrl.runs.settings import FILE
 RESULTS = ("metrics.json", "weights.pt")
 WRITTEN = ("metrics.json", "weights.pt", "checkpoint.pt", "config.json")
 LEFT = (
-    *("events.out.tfevents.*", "csv/scalars/**/*.csv", "csv/texts/*.txt", "report.html"),
+    *("events.out.tfevents.*", "csv/scalars/**/*.csv", "csv/texts/*.txt"),
     *("figures/*.png", "figures/animation.gif"),
     *("checkpoint-*.pt", "checkpoint*.pt.damaged"),
     *WRITTEN,
