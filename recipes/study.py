@@ -4,7 +4,7 @@ import importlib
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from rt_torchrl import begin_loading
 
@@ -61,9 +61,6 @@ class Config:
             out. The results lie in folders of their own.
         variant_seeds: number of trainings of every arm under each sensor noise and model error; 0 leaves them out.
         jobs: number of trainings side by side, one thread each; 0 means one for every core of the machine or cluster.
-        backend: loky trains on this machine; ray trains on a Ray cluster and needs the extra ``ray``.
-        ray_address: address of the Ray cluster, such as 10.0.0.1:6379. By default that of RAY_ADDRESS if it is set, or
-            else a cluster on this machine alone.
         unseen: number of unseen episodes that judge everything.
         limit_episodes: number of unseen episodes, the first ones, on which the limit and model predictive control are
             computed; 0 leaves them out.
@@ -76,8 +73,6 @@ class Config:
     seeds: int = 5
     variant_seeds: int = 1
     jobs: int = 0
-    backend: Literal["loky", "ray"] = "loky"
-    ray_address: str | None = None
     unseen: int = 100
     limit_episodes: int = 8
     folder: Annotated[Path, tyro.conf.arg(name="log-dir", aliases=("--folder",))] = Path("runs/study")
@@ -203,7 +198,7 @@ def recipe_of(plant: str) -> Path:
 def compute(config: Config) -> None:
     """Compute everything that is not done yet, side by side, with one progress bar."""
     batches = short_batches(config) if config.quick else [[task] for task in ordered_tasks(config)]
-    side_by_side(batches, backend=config.backend, jobs=config.jobs, ray_address=config.ray_address)
+    side_by_side(batches, jobs=config.jobs)
 
 
 def ordered_tasks(config: Config) -> list[Task]:

@@ -153,6 +153,4 @@ def test_the_hooks_are_installed(clone):
     "command", [command for command in commands() if re.search(r"recipes/(study|unknown|worth).py", command)]
 )
 def test_a_printed_study_begins(command, clone, tmp_path):
-    if "--extra ray" in command:
-        pytest.importorskip("ray", reason="the study's Ray cluster needs the extra ray")
     require_begun(command, clone, tmp_path, r"study: .*\d+/\d+")

@@ -112,7 +112,7 @@ def test_the_help_of_a_recipe_waits_for_pytorch_alone():
         "    with contextlib.suppress(SystemExit):\n"
         "        runpy.run_path(path, run_name='__main__')\n"
         "late = ('matplotlib', 'scipy', 'sklearn', 'pandas', 'torch._dynamo', 'torch._inductor', 'tensordict',\n"
-        "        'torchrl', 'torchdiffeq', 'ray', 'onnx', 'jax')\n"
+        "        'torchrl', 'torchdiffeq', 'onnx', 'jax')\n"
         "print([name for name in late if name in sys.modules])"
     )
     recipes = [str(path) for path in sorted((ROOT / "recipes").glob("*.py"))]

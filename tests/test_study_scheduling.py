@@ -1,7 +1,6 @@
 """The study's tasks side by side: processes, progress and failures."""
 
 import os
-import sys
 import time
 
 import pytest
@@ -14,7 +13,7 @@ from rt_torchrl.study.scheduling import side_by_side
 def test_trainings_run_side_by_side(tmp_path):
     script = written(tmp_path / "tiny.py", WRITE_RESULTS)
     trainings = [training(tmp_path, seed, recipe=script) for seed in range(2)]
-    side_by_side([[task] for task in trainings], backend="loky", jobs=2)
+    side_by_side([[task] for task in trainings], jobs=2)
     assert os.getpid() not in [t.metrics()["process"] for t in trainings]
 
 
@@ -35,7 +34,7 @@ class Counted:
 def test_a_batch_runs_in_one_process_and_the_bar_counts_tasks(tmp_path, capsys):
     batches = [[Counted(tmp_path / f"{batch}-{task}") for task in range(3)] for batch in range(2)]
     batches[0][0].run()
-    side_by_side(batches, backend="loky", jobs=2)
+    side_by_side(batches, jobs=2)
     workers = [[task.path.read_text().split()[-1] for task in batch] for batch in batches]
     assert all(len(set(found)) == 1 for found in workers)
     shown = capsys.readouterr().err
@@ -52,7 +51,7 @@ class Slow(Counted):
 
 def test_the_bar_moves_inside_a_batch(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(scheduling, "GLANCE", 0.05)
-    side_by_side([[Slow(tmp_path / str(task)) for task in range(3)]], backend="loky", jobs=1)
+    side_by_side([[Slow(tmp_path / str(task)) for task in range(3)]], jobs=1)
     shown = capsys.readouterr().err
     assert all(f"{done}/3" in shown for done in range(4))
 
@@ -61,7 +60,7 @@ def test_a_task_that_fails_stops_no_other(tmp_path):
     failing = training(tmp_path, 7, recipe=written(tmp_path / "fails.py", "raise ValueError('no rotor')"))
     others = [Counted(tmp_path / "first"), Counted(tmp_path / "second")]
     with pytest.raises(RuntimeError, match=r"1 failed, the others are kept:\nRuntimeError: .*fails.py .* no rotor"):
-        side_by_side([[failing, others[0]], [others[1]]], backend="loky", jobs=1)
+        side_by_side([[failing, others[0]], [others[1]]], jobs=1)
     assert all(task.done() for task in others)
 
 
@@ -75,24 +74,5 @@ class Leaving(Counted):
 def test_a_task_that_leaves_stops_no_other(tmp_path):
     other = Counted(tmp_path / "other")
     with pytest.raises(RuntimeError, match=r"1 failed, the others are kept:\nSystemExit: 2"):
-        side_by_side([[Leaving(tmp_path / "leaving"), other]], backend="loky", jobs=1)
+        side_by_side([[Leaving(tmp_path / "leaving"), other]], jobs=1)
     assert other.done()
-
-
-def test_a_backend_that_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match="backend='dask' does not exist; choose loky or ray"):
-        side_by_side([], backend="dask")
-
-
-def test_an_address_needs_the_backend_that_reads_it():
-    with pytest.raises(ValueError, match=r"ray_address='10.0.0.1:6379' needs backend='ray'; the backend is 'loky'"):
-        side_by_side([], backend="loky", ray_address="10.0.0.1:6379")
-
-
-def test_without_ray_its_extra_is_named(monkeypatch):
-    monkeypatch.delitem(sys.modules, "rt_torchrl.study.ray_workers", raising=False)
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(
-        ValueError, match=r"backend='ray' needs Ray: install the extra, pip install 'rt_torchrl\[ray\]'"
-    ):
-        side_by_side([], backend="ray")

@@ -14,31 +14,22 @@ GLANCE = 1.0
 """Time between two looks at what is done [s]."""
 
 
-def side_by_side(
-    batches: Sequence[Sequence[Task]], *, backend: str, jobs: int = 0, ray_address: str | None = None
-) -> None:
+def side_by_side(batches: Sequence[Sequence[Task]], *, jobs: int = 0) -> None:
     """Run batches of tasks in several processes. The tasks of a batch run one after another in one process.
 
     A task that fails stops no other task; the results of the others are kept.
 
     Args:
         batches: tasks of each batch.
-        backend: ``loky`` for processes on this machine, ``ray`` for a Ray cluster. On a cluster another process does
-            the task again at which one has died.
-        jobs: number of processes; 0 means one for every core of the machine or of the cluster.
-        ray_address: address of the Ray cluster; see :func:`rt_torchrl.study.ray_workers.connected`.
+        jobs: number of processes; 0 means one for every core.
 
     Raises:
-        ValueError: if the backend is unknown, is Ray and Ray is not installed, or an address is given for another one;
-            if no Ray cluster answers at the address.
-        RuntimeError: after all tasks, if some failed; it repeats their errors. Before all tasks, if no worker can be
-            started on the cluster.
+        RuntimeError: after all tasks, if some failed; it repeats their errors.
     """
-    if backend not in ("loky", "ray"):
-        raise ValueError(f"backend={backend!r} does not exist; choose loky or ray.")
-    if ray_address is not None and backend != "ray":
-        raise ValueError(f"ray_address={ray_address!r} needs backend='ray'; the backend is {backend!r}.")
-    failures = over_ray(batches, jobs, ray_address) if backend == "ray" else over_processes(batches, jobs)
+    with progress([task for batch in batches for task in batch]):
+        workers = Parallel(n_jobs=jobs or os.cpu_count() or 1, backend="loky", batch_size=1)
+        said = workers(delayed(in_a_row)(batch) for batch in batches)
+    failures = [failure for batch in said for failure in batch]
     if failures:
         raise RuntimeError(f"{len(failures)} failed, the others are kept:\n" + "\n".join(failures))
 
@@ -53,30 +44,12 @@ def on_this_machine(tasks: Sequence[Task], jobs: int) -> None:
     Raises:
         RuntimeError: after all tasks, if some failed; it repeats their errors.
     """
-    side_by_side([tasks] if jobs == 1 else [[task] for task in tasks], backend="loky", jobs=jobs)
-
-
-def over_processes(batches: Sequence[Sequence[Task]], jobs: int) -> list[str]:
-    """Run batches in processes on this machine, and return the errors of the tasks that failed."""
-    with progress([task for batch in batches for task in batch]):
-        workers = Parallel(n_jobs=jobs or os.cpu_count() or 1, backend="loky", batch_size=1)
-        said = workers(delayed(in_a_row)(batch) for batch in batches)
-    return [failure for batch in said for failure in batch]
+    side_by_side([tasks] if jobs == 1 else [[task] for task in tasks], jobs=jobs)
 
 
 def in_a_row(tasks: Sequence[Task]) -> list[str]:
     """Run tasks one after another, and return the errors of those that failed."""
     return [failure for task in tasks if (failure := failure_of(task))]
-
-
-def over_ray(batches: Sequence[Sequence[Task]], jobs: int, address: str | None) -> list[str]:
-    """Run batches on a Ray cluster, and return the errors of the tasks that failed."""
-    try:
-        from rt_torchrl.study.ray_workers import RayWorkers, connected
-    except ImportError as error:
-        raise ValueError("backend='ray' needs Ray: install the extra, pip install 'rt_torchrl[ray]'.") from error
-    with connected(address, jobs) as count, progress([task for batch in batches for task in batch]):
-        return RayWorkers(batches, count).run()
 
 
 @contextmanager

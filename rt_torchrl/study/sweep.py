@@ -167,7 +167,7 @@ def train_all(runs: Sequence[SeededRun], jobs: int) -> None:
     Raises:
         RuntimeError: after all runs, if some failed.
     """
-    side_by_side([[run] for run in runs], backend="loky", jobs=jobs)
+    side_by_side([[run] for run in runs], jobs=jobs)
 
 
 def study_in(folder: Path, name: str, *, seed: int) -> "optuna.Study":
