@@ -29,8 +29,8 @@ from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
-from rt_torchrl.identification.cross_validation import Fold, folds, pooled
-from rt_torchrl.identification.prediction import Prediction, predict, residual_tests
+from rt_torchrl.fit.cross_validation import Fold, folds, pooled
+from rt_torchrl.fit.prediction import Prediction, predict, residual_tests
 from rt_torchrl.runs.results_file import write_results
 
 

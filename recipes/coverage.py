@@ -26,7 +26,7 @@ from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.closure_error import visited_features
-from rt_torchrl.identification.coverage import Flights, coverage, curve_coverage, random_flight
+from rt_torchrl.fit.coverage import Flights, coverage, curve_coverage, random_flight
 
 
 class Case(NamedTuple):

@@ -26,14 +26,14 @@ from rt_torchrl import (
     main_of,
     read_log,
 )
-from rt_torchrl.identification.column import Column
-from rt_torchrl.identification.estimate_table import metrics_of_sensors, table_of_sensors, weight_lines
-from rt_torchrl.identification.identification import Identified, held_back, measured_states
-from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
-from rt_torchrl.identification.resampling import ROUNDING, Resampled, hold_out, resample
-from rt_torchrl.identification.sensor_identification import identify
-from rt_torchrl.identification.sensor_log import SensorLog, checked
-from rt_torchrl.identification.sensors import with_biases
+from rt_torchrl.fit.column import Column
+from rt_torchrl.fit.estimate_table import metrics_of_sensors, table_of_sensors, weight_lines
+from rt_torchrl.fit.identification import Identified, held_back, measured_states
+from rt_torchrl.fit.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
+from rt_torchrl.fit.resampling import ROUNDING, Resampled, hold_out, resample
+from rt_torchrl.fit.sensor_identification import identify
+from rt_torchrl.fit.sensor_log import SensorLog, checked
+from rt_torchrl.fit.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.results_file import new_folder, write_results
 from rt_torchrl.runs.shipped_plants import plant_class

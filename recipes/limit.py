@@ -25,6 +25,7 @@ from rt_torchrl import (
     load_run,
     main_of,
 )
+from rt_torchrl.control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
@@ -40,7 +41,6 @@ from rt_torchrl.evaluation.limits import (
     receding,
 )
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
-from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.configured_plant import plant_of
 from rt_torchrl.runs.results_file import make_folder, write_results

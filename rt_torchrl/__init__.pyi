@@ -22,8 +22,8 @@ from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.signal import Signal
 from .contract import ContractReport, PlantContractError, check_plant
-from .baselines.acting import ActingController
-from .baselines.classical import ClassicalController
+from .control.acting import ActingController
+from .control.classical import ClassicalController
 
 # Real systems
 from .systems.calling_simulator import CallingSimulator, EpisodeAbandoned
@@ -51,18 +51,18 @@ from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
-from .optimal_control.clairvoyant import Clairvoyant, clairvoyant
-from .optimal_control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
-from .optimal_control.predictive_control import PredictiveConfig, PredictiveControl
-from .optimal_control.receding_horizon import RecedingHorizon
-from .optimal_control.receding_horizon_config import RecedingHorizonConfig
+from .control.clairvoyant import Clairvoyant, clairvoyant
+from .control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
+from .control.predictive_control import PredictiveConfig, PredictiveControl
+from .control.receding_horizon import RecedingHorizon
+from .control.receding_horizon_config import RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
-from .identification.identification import Identification, IdentificationConfig
-from .identification.estimation import Estimate, Estimation, EstimationConfig
-from .identification.sensor_log import LogConfig, read_log
-from .identification.sensor_record import SensorRecord, sensor_record
-from .identification.sensors import Sensor, sensors_of
-from .identification.uncertainty import Uncertainty
+from .fit.identification import Identification, IdentificationConfig
+from .fit.estimation import Estimate, Estimation, EstimationConfig
+from .fit.sensor_log import LogConfig, read_log
+from .fit.sensor_record import SensorRecord, sensor_record
+from .fit.sensors import Sensor, sensors_of
+from .fit.uncertainty import Uncertainty
 
 # The algorithm and the configurations of its steps
 from .optimisers.descent import Descended, DescentConfig

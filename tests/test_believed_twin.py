@@ -11,7 +11,7 @@ from test_export_recipe import recipe
 from test_hypotheses import PLANT, Suspecting, ensemble
 
 from rt_torchrl import Run, control_cost, export_twin, load_run
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.runs.results_table import hypothesis_lines, results_table

@@ -15,7 +15,7 @@ from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
-from rt_torchrl.identification.cross_validation import folds, pooled
+from rt_torchrl.fit.cross_validation import folds, pooled
 from rt_torchrl.trajectories.rollout import Rollout
 
 RECIPES = Path(__file__).parent.parent / "recipes"

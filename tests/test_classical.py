@@ -6,8 +6,8 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from test_optimal_gain import optimal_gain
 
-from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.baselines.tuning import tune
+from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.control.tuning import tune
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD

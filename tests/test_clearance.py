@@ -8,8 +8,8 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_algorithm import twinning
 
-from rt_torchrl.baselines.acting import ActingController
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.acting import ActingController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.runs.real_side import Resting, simulated
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig

@@ -5,7 +5,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.control.acting import ActingController
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD

@@ -6,9 +6,9 @@ import torch
 from linear_quadratic import LinearQuadratic
 from scipy.optimize import lsq_linear
 
+from rt_torchrl.control.bounded_descent import BoundedDescentConfig, descend, projected_gradient
+from rt_torchrl.control.command_cost import CommandCost
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig, descend, projected_gradient
-from rt_torchrl.optimal_control.command_cost import CommandCost
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import constant

@@ -10,9 +10,9 @@ from straight_line import Line, Slope, flown, line_segment, noise_of
 
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.identification.covariance import covariance, named_values, newey_west, standard_errors
-from rt_torchrl.identification.identification import Identification, IdentificationConfig
-from rt_torchrl.identification.output_error import InitialStates, OutputError, first_states
+from rt_torchrl.fit.covariance import covariance, named_values, newey_west, standard_errors
+from rt_torchrl.fit.identification import Identification, IdentificationConfig
+from rt_torchrl.fit.output_error import InitialStates, OutputError, first_states
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 

@@ -23,11 +23,11 @@ from rt_torchrl import (
     ShortHorizonConfig,
     check_plant,
 )
+from rt_torchrl.control.command_cost import CommandCost
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures import figures_of
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.optimal_control.command_cost import CommandCost
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs.operated import operation_of
 from rt_torchrl.runs.results import episode_record

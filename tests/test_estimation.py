@@ -12,10 +12,10 @@ from straight_line import Line, Slope, flown, line_segment, noise_of
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.identification.estimation import Estimation, EstimationConfig
-from rt_torchrl.identification.first_values import first_noise
-from rt_torchrl.identification.sensor_record import sensor_record, usual_initial_state
-from rt_torchrl.identification.sensors import Sensor, known_sensors, read, read_slopes, sensors_of
+from rt_torchrl.fit.estimation import Estimation, EstimationConfig
+from rt_torchrl.fit.first_values import first_noise
+from rt_torchrl.fit.sensor_record import sensor_record, usual_initial_state
+from rt_torchrl.fit.sensors import Sensor, known_sensors, read, read_slopes, sensors_of
 from rt_torchrl.plants.measurement import Measurement
 from rt_torchrl.trajectories.twin import DigitalTwin
 

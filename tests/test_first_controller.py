@@ -6,7 +6,7 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD, episodes
 
-from rt_torchrl.baselines.acting import ActingController
+from rt_torchrl.control.acting import ActingController
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run

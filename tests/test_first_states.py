@@ -9,7 +9,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
-from rt_torchrl.identification.identification import Identification, IdentificationConfig
+from rt_torchrl.fit.identification import Identification, IdentificationConfig
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.trajectories.twin import DigitalTwin

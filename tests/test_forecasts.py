@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held
+from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held
 
 NOW = torch.tensor([[3.0, -1.0], [5.0, 2.0]], dtype=torch.float64)
 

@@ -12,17 +12,17 @@ from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import identification as charts
-from rt_torchrl.identification.identification import (
+from rt_torchrl.fit.identification import (
     Identification,
     IdentificationConfig,
     held_back,
     lag_one,
     measured_states,
 )
-from rt_torchrl.identification.output_error import InitialStates, OutputError, first_states
-from rt_torchrl.identification.resampling import hold_out, resample
-from rt_torchrl.identification.sensor_log import SensorLog, checked
-from rt_torchrl.identification.simulated_log import policy_law, recorded
+from rt_torchrl.fit.output_error import InitialStates, OutputError, first_states
+from rt_torchrl.fit.resampling import hold_out, resample
+from rt_torchrl.fit.sensor_log import SensorLog, checked
+from rt_torchrl.fit.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -7,7 +7,7 @@ import torch
 from test_export_recipe import recipe
 
 from rt_torchrl.figures import save_figure
-from rt_torchrl.identification.sensors import sensors_of
+from rt_torchrl.fit.sensors import sensors_of
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
-from rt_torchrl.identification.identification import IdentificationConfig
+from rt_torchrl.fit.identification import IdentificationConfig
 
 pd = pytest.importorskip("pandas")
 RECIPES = Path(__file__).parent.parent / "recipes"

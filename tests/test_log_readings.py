@@ -14,11 +14,11 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.identification.estimation import Estimation, EstimationConfig
-from rt_torchrl.identification.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
-from rt_torchrl.identification.resampling import resample
-from rt_torchrl.identification.sensor_identification import autocorrelation
-from rt_torchrl.identification.sensor_log import SensorLog, checked
+from rt_torchrl.fit.estimation import Estimation, EstimationConfig
+from rt_torchrl.fit.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
+from rt_torchrl.fit.resampling import resample
+from rt_torchrl.fit.sensor_identification import autocorrelation
+from rt_torchrl.fit.sensor_log import SensorLog, checked
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 

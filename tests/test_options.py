@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 
-from rt_torchrl.identification.identification import IdentificationConfig
+from rt_torchrl.fit.identification import IdentificationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.systems.exploration import ExplorationConfig

@@ -15,10 +15,10 @@ from tensordict.nn import TensorDictModule
 from rt_torchrl.envs.pendulum.models import UniformRod
 from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
-from rt_torchrl.identification.identification import Identification, IdentificationConfig
-from rt_torchrl.identification.resampling import hold_out, resample
-from rt_torchrl.identification.sensor_log import checked
-from rt_torchrl.identification.simulated_log import recorded
+from rt_torchrl.fit.identification import Identification, IdentificationConfig
+from rt_torchrl.fit.resampling import hold_out, resample
+from rt_torchrl.fit.sensor_log import checked
+from rt_torchrl.fit.simulated_log import recorded
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout

@@ -7,11 +7,11 @@ import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
+from rt_torchrl.control.forecasts import Decaying
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.control.receding_horizon import RecedingHorizon
+from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.optimal_control.forecasts import Decaying
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
-from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy

@@ -10,8 +10,8 @@ from small_runs import SMALL
 from test_export_recipe import recipe
 from torch import nn
 
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.figures.policy import policy_contours
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.loaded_run import load_run

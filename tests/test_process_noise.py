@@ -8,10 +8,10 @@ import torch
 from straight_line import Line, Slope, line_segment, noise_of
 from test_uncertainty import NOISE, position
 
-from rt_torchrl.identification.estimation import Estimation
-from rt_torchrl.identification.sensor_record import chained, sensor_record
-from rt_torchrl.identification.sensors import sensors_of
-from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
+from rt_torchrl.fit.estimation import Estimation
+from rt_torchrl.fit.sensor_record import chained, sensor_record
+from rt_torchrl.fit.sensors import sensors_of
+from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -10,11 +10,11 @@ from straight_line import Line, Slope, line_segment, noise_of
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.identification.estimation import Estimation, EstimationConfig
-from rt_torchrl.identification.first_values import state_sizes
-from rt_torchrl.identification.sensor_record import chained, sensor_record
-from rt_torchrl.identification.sensors import sensors_of
-from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
+from rt_torchrl.fit.estimation import Estimation, EstimationConfig
+from rt_torchrl.fit.first_values import state_sizes
+from rt_torchrl.fit.sensor_record import chained, sensor_record
+from rt_torchrl.fit.sensors import sensors_of
+from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -12,10 +12,10 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.identification.column import Column
-from rt_torchrl.identification.resampling import resample
-from rt_torchrl.identification.sensor_log import SensorLog, checked, logged_signals, read_log
-from rt_torchrl.identification.simulated_log import policy_law, recorded
+from rt_torchrl.fit.column import Column
+from rt_torchrl.fit.resampling import resample
+from rt_torchrl.fit.sensor_log import SensorLog, checked, logged_signals, read_log
+from rt_torchrl.fit.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import Rollout
 
 pytest.importorskip("pandas"), pytest.importorskip("pint")

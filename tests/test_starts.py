@@ -12,9 +12,9 @@ from test_classical import PD
 from test_hypotheses import ASSIMILATION as NEWTON
 from test_hypotheses import LAG, Suspecting
 
-from rt_torchrl.identification.sensor_log import LogConfig
-from rt_torchrl.identification.simulated_log import ClassicalLaw, recorded
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
+from rt_torchrl.control.predictive_control import PredictiveConfig
+from rt_torchrl.fit.sensor_log import LogConfig
+from rt_torchrl.fit.simulated_log import ClassicalLaw, recorded
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
 from rt_torchrl.plants.policies import SaturatedMLP

@@ -10,15 +10,15 @@ from straight_line import Line, Slope, line_segment, noise_of
 from torch import nn
 
 from rt_torchrl.figures import uncertainty as charts
-from rt_torchrl.identification.covariance import standard_errors
-from rt_torchrl.identification.curve import band
-from rt_torchrl.identification.design import next_manoeuvres, weight_information
-from rt_torchrl.identification.estimation import Estimation, EstimationConfig
-from rt_torchrl.identification.output_error import InitialStates, OutputError
-from rt_torchrl.identification.prediction import predict
-from rt_torchrl.identification.sensor_record import sensor_record
-from rt_torchrl.identification.sensors import Sensor, sensors_of
-from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
+from rt_torchrl.fit.covariance import standard_errors
+from rt_torchrl.fit.curve import band
+from rt_torchrl.fit.design import next_manoeuvres, weight_information
+from rt_torchrl.fit.estimation import Estimation, EstimationConfig
+from rt_torchrl.fit.output_error import InitialStates, OutputError
+from rt_torchrl.fit.prediction import predict
+from rt_torchrl.fit.sensor_record import sensor_record
+from rt_torchrl.fit.sensors import Sensor, sensors_of
+from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.cryogenic_tank.commands import GREATEST_DROP
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 
@@ -13,7 +13,7 @@ class OnOffValve(ClassicalController):
     r"""A hysteresis valve that opens to a fixed drop above :math:`\tilde p + h` and shuts below :math:`\tilde p - h`.
 
     The valve starts shut. h = 1 kPa is not tuned: a narrower band always lowers J_a a little, but wears the valve out.
-    The drop is tuned: :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads leaves it where it starts, at the end
+    The drop is tuned: :func:`~rt_torchrl.control.tuning.tune` on twenty loads leaves it where it starts, at the end
     of the range.
     """
 
@@ -66,7 +66,7 @@ class PIValve(ClassicalController):
 
     The ``placed_gains`` give a time constant of τ = 12 h and K_I = K_P/(4τ): an open valve takes up 1.3 W per kPa of
     drop, and 1 W raises the pressure of the tank at the start by 8.3 Pa/h. From there
-    :func:`~rt_torchrl.baselines.tuning.tune` on twenty loads finds a tenfold gain and almost no integral. A load of
+    :func:`~rt_torchrl.control.tuning.tune` on twenty loads finds a tenfold gain and almost no integral. A load of
     129 W is then held 1 kPa above the target, and an integral would only overshoot after starts that are 25 kPa off.
     """
 

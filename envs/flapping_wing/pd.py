@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 
 
@@ -19,7 +19,7 @@ class TrimmedPD(ClassicalController):
     wind. On a drone that observes its position alone, the speeds are those of the filters of the position.
 
     The ``placed_gains`` give a point mass two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and g of
-    thrust per radian of β_w. From there :func:`~rt_torchrl.baselines.tuning.tune` on twenty gusts finds steeper gains,
+    thrust per radian of β_w. From there :func:`~rt_torchrl.control.tuning.tune` on twenty gusts finds steeper gains,
     with full stroke until the target is near.
     """
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
 CONSTANTS = Path(__file__).parent / "data" / "nrel5mw_constants.json"

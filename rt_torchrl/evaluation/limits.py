@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.bounded_descent import BoundedDescentConfig
+from rt_torchrl.control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
+from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
+from rt_torchrl.control.predictive_control import PredictiveConfig
+from rt_torchrl.control.receding_horizon import RecedingHorizon
+from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
-from rt_torchrl.optimal_control.bounded_descent import BoundedDescentConfig
-from rt_torchrl.optimal_control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
-from rt_torchrl.optimal_control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
-from rt_torchrl.optimal_control.receding_horizon import RecedingHorizon
-from rt_torchrl.optimal_control.receding_horizon_config import RecedingHorizonConfig
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
 from rt_torchrl.plants.plant import Plant

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rt_torchrl.figures.style import LIMITS, REAL, TWIN, array, caption, legend_below, panels, time_unit, with_unit
-from rt_torchrl.identification.identification import Identified, Judgement
+from rt_torchrl.fit.identification import Identified, Judgement
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory
 

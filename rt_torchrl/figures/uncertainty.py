@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rt_torchrl.figures.style import REAL, SAMPLES, TWIN, array, caption, legend_below, panels, time_unit, with_unit
-from rt_torchrl.identification.curve import Band
-from rt_torchrl.identification.sensor_identification import SensorIdentified, SensorJudgement
-from rt_torchrl.identification.sensor_record import SensorRecord
-from rt_torchrl.identification.sensors import Sensor
-from rt_torchrl.identification.uncertainty import Uncertainty
+from rt_torchrl.fit.curve import Band
+from rt_torchrl.fit.sensor_identification import SensorIdentified, SensorJudgement
+from rt_torchrl.fit.sensor_record import SensorRecord
+from rt_torchrl.fit.sensors import Sensor
+from rt_torchrl.fit.uncertainty import Uncertainty
 
 
 def twin_and_sensors(

@@ -1,8 +1,8 @@
 """The physics that the twin of a run knows, once plants, controllers and options are found to go together."""
 
-from rt_torchrl.baselines.check import require_controller
-from rt_torchrl.baselines.classical import ClassicalController
 from rt_torchrl.contract.check import check_plant
+from rt_torchrl.control.check import require_controller
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.configured_plant import require_plant

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from rt_torchrl.baselines.acting import ActingController
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.acting import ActingController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import Judged, mean_with_confidence

@@ -5,8 +5,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from rt_torchrl.baselines.acting import ActingController
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.acting import ActingController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.loaded_run import LoadedRun
 from rt_torchrl.systems.collectors import EpisodeCollector

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.gradient_check import engine_gap, require_agreement
 from rt_torchrl.evaluation.real_episodes import RealEpisodes

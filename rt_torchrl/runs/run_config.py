@@ -10,9 +10,9 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.evaluation.limits import LimitConfig
-from rt_torchrl.identification.sensor_log import LogConfig
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.fit.sensor_log import LogConfig
 from rt_torchrl.options import check_options, choices, require_widths, with_paths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP

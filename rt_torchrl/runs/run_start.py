@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import nn
 
-from rt_torchrl.baselines.acting import ActingController
-from rt_torchrl.baselines.classical import ClassicalController
-from rt_torchrl.identification.column import Column
-from rt_torchrl.identification.resampling import resample
-from rt_torchrl.identification.sensor_log import READERS, checked, read_log
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.control.acting import ActingController
+from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.fit.column import Column
+from rt_torchrl.fit.resampling import resample
+from rt_torchrl.fit.sensor_log import READERS, checked, read_log
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import checkpoint

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from rt_torchrl import figures
-from rt_torchrl.baselines.classical import ClassicalController
+from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.configured_plant import physics_of, plant_of

@@ -10,15 +10,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rt_torchrl.identification.first_values import move
-from rt_torchrl.identification.output_error import (
+from rt_torchrl.fit.first_values import move
+from rt_torchrl.fit.output_error import (
     NOISE_TOLERANCE,
     InitialStates,
     OutputError,
     compared,
     discrepancy_derivatives,
 )
-from rt_torchrl.identification.weight_prior import WeightPrior
+from rt_torchrl.fit.weight_prior import WeightPrior
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options

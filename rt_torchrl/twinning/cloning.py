@@ -10,7 +10,7 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
 from rt_torchrl.twinning.architecture import same_architecture

@@ -2,7 +2,7 @@
 
 from torch import nn
 
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.control.predictive_control import PredictiveControl
 
 
 def share_critic(learner: object, policy: nn.Module) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rt_torchrl.identification.design import LEAST_INFORMATION, volume
+from rt_torchrl.fit.design import LEAST_INFORMATION, volume
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.twinning.assimilation import Assimilation

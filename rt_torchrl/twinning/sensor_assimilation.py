@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.identification.estimation import Estimate, Estimation, EstimationConfig
-from rt_torchrl.identification.first_values import state_sizes
-from rt_torchrl.identification.sensor_record import SensorRecord, chained, sensor_record
-from rt_torchrl.identification.sensors import Sensor, sensors_of, with_biases
-from rt_torchrl.identification.weight_prior import Belief, BeliefPrior
+from rt_torchrl.fit.estimation import Estimate, Estimation, EstimationConfig
+from rt_torchrl.fit.first_values import state_sizes
+from rt_torchrl.fit.sensor_record import SensorRecord, chained, sensor_record
+from rt_torchrl.fit.sensors import Sensor, sensors_of, with_biases
+from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.measurement import Component

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints import Constraints
 from rt_torchrl.twinning.planners.constraints_config import ConstraintsConfig

@@ -5,7 +5,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from torch import nn
 
-from rt_torchrl.optimal_control.predictive_control import PredictiveConfig
+from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.optimisers.descent import Descended, DescentConfig
 from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.trajectories.trajectory import Scenario

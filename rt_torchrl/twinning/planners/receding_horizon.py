@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import nn
 
-from rt_torchrl.optimal_control.predictive_control import PredictiveControl
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin

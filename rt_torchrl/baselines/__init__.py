@@ -1,1 +1,0 @@
-"""Classical controllers that policies are compared with."""

@@ -1,0 +1,217 @@
+"""The clairvoyant optimum: the best commands of a whole episode whose disturbance is known, on the exact model.
+
+No controller costs less: it is the limit that all others are compared with.
+"""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.control.bounded_descent import BoundedDescentConfig, descend, projected_gradient
+from rt_torchrl.control.command_cost import PENALTY, CommandCost
+from rt_torchrl.control.relaxed_cost import FIRST_WEIGHT, RelaxedCost, held_back
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
+from rt_torchrl.trajectories.twin import constant
+
+DESCENTS = 20
+"""Greatest number of descents that follow each other where actuators hold commands back."""
+FOLLOWED = 1e-6
+"""Distance of a command from the action that is applied, in units of its range, below which it is followed."""
+DRAWN_IN = 0.25
+"""Share of the way to their mean over the episode that commands go before they descend again."""
+
+
+class Clairvoyant(NamedTuple):
+    """The best commands that were found, and the evidence that they are an optimum.
+
+    Args:
+        costs: J_a of each episode under its best commands, without the penalty.
+        flown: the episodes.
+        gradient: norm of the projected gradient of J_a of each episode, by commands in units of their ranges; where
+            actuators hold commands back, of the Lagrangian of that limit.
+        excess: greatest distance of a command from the action that was applied, in units of its range.
+        start_costs: J_a of each episode at the end of the descents from each start, by name.
+        first_costs: the same at the end of the first descent.
+        gradients: number of gradients of all episodes together.
+    """
+
+    costs: Float[Tensor, " batch"]
+    flown: Trajectory
+    gradient: Float[Tensor, " batch"]
+    excess: float
+    start_costs: dict[str, Float[Tensor, " batch"]]
+    first_costs: dict[str, Float[Tensor, " batch"]]
+    gradients: int
+
+    def spread(self, *, first: bool = False) -> dict[str, float]:
+        """Mean J_a of each start over that of the best commands of each episode, minus one.
+
+        Args:
+            first: whether that of the first descent is taken.
+        """
+        best, found = self.costs.mean(), self.first_costs if first else self.start_costs
+        return {name: (costs.mean() / best - 1.0).item() for name, costs in found.items()}
+
+
+class _End(NamedTuple):
+    """Where a descent ended: commands in [0, 1], J_a, norms of the projected gradients, and the number of gradients."""
+
+    point: np.ndarray
+    costs: Tensor
+    slope: np.ndarray
+    evaluations: int
+
+
+_Descent = Callable[[np.ndarray, BoundedDescentConfig], _End]
+
+
+def clairvoyant(
+    plant: Plant,
+    initial_state: Float[Tensor, "batch n_s"],
+    exogenous: Float[Tensor, "batch n n_z"],
+    starts: Mapping[str, Float[Tensor, "batch n n_a"]],
+    *,
+    closure: nn.Module | None = None,
+    hold: int = 1,
+    penalty: float = PENALTY,
+    config: BoundedDescentConfig | None = None,
+) -> Clairvoyant:
+    """Descend the costs of episodes by all their commands, from several starts.
+
+    The episodes are one problem of L-BFGS-B, because the lanes of the machine code then carry one episode each. Where
+    actuators hold commands back and each interval has a command, up to twenty descents follow each other: their model
+    follows every command, for a charge that becomes greater until the real actuators follow, too; see
+    :class:`RelaxedCost`. No episode ends above the start.
+
+    The optimal commands of a nonlinear plant are one of many local minima, which differ by which of two ways they take
+    in some short parts of an episode. Each start therefore descends twice: from where the first descent ends, all
+    commands are drawn in to their mean over the episode by a quarter and descend again, with half the iterations. The
+    better commands of each episode stay.
+
+    Args:
+        plant: the plant.
+        initial_state: initial states of the episodes.
+        exogenous: exogenous inputs of the episodes, all known.
+        starts: commands from which a descent starts, by name; see :func:`constant_starts` and :func:`random_starts`.
+        closure: closure of the system; None for the plant's own.
+        hold: number of control intervals for which a command is held.
+        penalty: weight of (command − applied)² over the squared range, in units of L_a, for commands that are held.
+        config: parameters of the descents; the twenty that follow each other share the iterations.
+
+    Raises:
+        ValueError: if there is no start.
+        DivergenceError: if the plant diverges from every start.
+    """
+    if not starts:
+        raise ValueError("starts is empty; name at least one, such as the commands of a classical controller.")
+    closure, config = constant(plant.closure if closure is None else closure), config or BoundedDescentConfig()
+    cost = CommandCost(plant, closure, hold=hold, penalty=penalty, terminal=plant.terminal_cost)
+    cost.begin(initial_state, exogenous)
+    episodes = Scenario(initial_state, exogenous)
+    descent: _Descent = partial(_ended, cost, episodes)
+    if hold == 1 and cost.traced and held_back(plant, initial_state):
+        descent = partial(_tightened, RelaxedCost(plant, closure, terminal=plant.terminal_cost), episodes)
+    nowhere = torch.full((len(initial_state),), torch.inf, dtype=torch.float64)
+    costs, first, ends = dict.fromkeys(starts, nowhere), dict.fromkeys(starts, nowhere), dict[str, _End]()
+    for name, commands in starts.items():
+        # A start from which the plant diverges keeps its infinite cost.
+        with contextlib.suppress(FloatingPointError):
+            ended = descent(cost.units(commands), config)
+            ends[name] = _again(descent, config, ended)
+            costs[name], first[name] = ends[name].costs, ended.costs
+    if not ends:
+        raise DivergenceError(f"plant {plant.name!r} diverges from every start: {', '.join(starts)}.")
+    best, slope = _best_of_each(costs, ends)
+    commands, (low, high) = cost.commands(best, exogenous.shape[1]), bounds(plant.actions)
+    flown = Rollout(plant, closure)(initial_state, exogenous, commands)
+    excess = ((commands - flown.actions) / (high - low)).abs().max().item()
+    gradients = sum(end.evaluations for end in ends.values())
+    return Clairvoyant(control_cost(plant, flown), flown, torch.from_numpy(slope), excess, costs, first, gradients)
+
+
+def constant_starts(plant: Plant, batch: int, n: int) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:
+    """Constant commands at a quarter, the middle and three quarters of all ranges."""
+    low, high = bounds(plant.actions)
+    return {f"constant {share:g}": (low + share * (high - low)).expand(batch, n, -1) for share in (0.25, 0.5, 0.75)}
+
+
+def random_starts(
+    plant: Plant, batch: int, n: int, *, generator: torch.Generator, count: int = 1
+) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:
+    """Commands that are uniform on the ranges, drawn for every interval."""
+    low, high = bounds(plant.actions)
+    draws = (torch.rand(batch, n, len(plant.actions), generator=generator, dtype=torch.float64) for _ in range(count))
+    return {f"random {k}": low + (high - low) * draw for k, draw in enumerate(draws)}
+
+
+def _together(cost: CommandCost, point: np.ndarray) -> tuple[float, np.ndarray]:
+    costs, gradient = cost(point)
+    return float(costs.mean()), gradient / len(costs)
+
+
+def _costs(cost: CommandCost, episodes: Scenario, point: np.ndarray) -> Float[Tensor, " batch"]:
+    """J_a of each episode, without penalty or charge."""
+    commands = cost.commands(point, episodes.exogenous.shape[1])
+    return Rollout(cost.plant, cost.interval.closure).costs(*episodes, commands)
+
+
+def _ended(cost: CommandCost, episodes: Scenario, start: np.ndarray, config: BoundedDescentConfig) -> _End:
+    """The end of one descent."""
+    found = descend(partial(_together, cost), start, config)
+    slope = projected_gradient(found.point, cost(found.point)[1])
+    return _End(found.point, _costs(cost, episodes, found.point), slope, found.evaluations)
+
+
+def _tightened(cost: RelaxedCost, episodes: Scenario, start: np.ndarray, config: BoundedDescentConfig) -> _End:
+    """The end of descents under growing charges; an episode that costs more than at the start goes back to it."""
+    share = dataclasses.replace(config, iterations=max(1, config.iterations // DESCENTS))
+    cost.begin(*episodes)
+    point, evaluations, weight, last = start, 0, FIRST_WEIGHT, math.inf
+    for _ in range(DESCENTS):
+        cost.charge(point, weight)
+        found = descend(partial(_together, cost), point, share)
+        point, evaluations = found.point, evaluations + found.evaluations
+        excess = cost.excess(point)
+        if excess <= FOLLOWED:
+            break
+        if excess > 0.5 * last:  # the multipliers alone are too slow
+            weight *= math.sqrt(10.0)
+        last = excess
+    before, after = (_costs(cost, episodes, each) for each in (start, point))
+    point = np.where((before < after).numpy()[:, None, None], start, point)
+    return _End(point, torch.minimum(before, after), projected_gradient(point, cost(point)[1]), evaluations)
+
+
+def _again(descent: _Descent, config: BoundedDescentConfig, first: _End) -> _End:
+    """The better of the end of a descent and that of another from there, episode by episode."""
+    start = first.point + DRAWN_IN * (first.point.mean(1, keepdims=True) - first.point)
+    try:
+        second = descent(start, dataclasses.replace(config, iterations=max(1, config.iterations // 2)))
+    except FloatingPointError:
+        return first
+    better = (second.costs < first.costs).numpy()
+    return _End(
+        np.where(better[:, None, None], second.point, first.point),
+        torch.minimum(first.costs, second.costs),
+        np.where(better, second.slope, first.slope),
+        first.evaluations + second.evaluations,
+    )
+
+
+def _best_of_each(costs: Mapping[str, Tensor], ends: Mapping[str, _End]) -> tuple[np.ndarray, np.ndarray]:
+    """The best commands of each episode, and the norms of their gradients."""
+    names = list(ends)
+    chosen = [ends[names[k]] for k in torch.stack([costs[name] for name in names]).argmin(0).tolist()]
+    best = np.stack([end.point[episode] for episode, end in enumerate(chosen)])
+    return best, np.stack([end.slope[episode] for episode, end in enumerate(chosen)])

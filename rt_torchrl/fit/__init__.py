@@ -1,0 +1,1 @@
+"""Fits of a twin to records: by step 4, from sensor logs, with standard errors."""

@@ -1,0 +1,170 @@
+r"""Resampling of a log with irregular instants to segments at a plant's control intervals.
+
+A plant is a sampled-data system. Its states are instantaneous, so they are interpolated linearly at :math:`t_k`. Its
+actions and exogenous inputs are held over an interval, so the value over :math:`[t_k, t_{k+1}]` is the mean of the
+log's held values over that interval. The mean keeps the impulse of a force and the energy of a load, however irregular
+the instants are. A periodic state is interpolated the short way round: between two rows it turns by less than half a
+turn.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from rt_torchrl.fit.sensor_log import SensorLog, logged_states
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+GAP_INTERVALS = 3.0
+"""Number of sampling intervals after which a pause counts as a gap, unless a limit is given."""
+INTERVALS_PER_ROW = 50
+"""Greatest number of control intervals for each row of a log; with more, its time probably has another unit."""
+ROUNDING = 1e-6
+"""Share of an interval by which an instant may miss the grid."""
+
+
+class Resampled(NamedTuple):
+    """Segments of a log, in order, and the parts that were left out; times are in s."""
+
+    segments: list[Trajectory]
+    interval: float  # median sampling interval
+    jitter: float  # standard deviation of the intervals within the segments, over their median
+    gap: float  # longest time between two rows that was bridged
+    gaps: list[tuple[float, float]]  # last time before and first time after each gap
+    too_short: list[tuple[float, float]]  # first and last time of each part that was left out
+
+
+def resample(log: SensorLog, plant: Plant, *, gap: float | None = None, shortest: int = 10) -> Resampled:
+    """Cut a log at its gaps and where rows were left out, and bring each part to the plant's control intervals.
+
+    Args:
+        log: log that :func:`rt_torchrl.fit.sensor_log.checked` has returned.
+        plant: plant that gives the control interval dt and :meth:`Plant.complete_states`.
+        gap: longest time between two rows that is bridged [s]; None for three median sampling intervals, but not less
+            than dt.
+        shortest: number of control intervals below which a part is left out.
+
+    Raises:
+        ValueError: if an argument is out of its range, no part is long enough, there are far more control intervals
+            than rows, or a state is missing that the plant cannot complete.
+    """
+    intervals, left_out = np.diff(log.times), np.array(log.cuts, dtype=int) - 1
+    sampled = np.delete(intervals, left_out)
+    interval = float(np.median(sampled if len(sampled) else intervals))
+    if gap is not None and not gap > 0.0:
+        raise ValueError(f"gap={gap} s must be positive; it is the longest time between two rows that is bridged.")
+    if shortest < 2:
+        raise ValueError(f"shortest={shortest} control intervals must be at least 2.")
+    limit = max(GAP_INTERVALS * interval, plant.dt) if gap is None else gap
+    cuts = np.union1d(np.flatnonzero(intervals > limit * (1.0 + ROUNDING)), left_out)
+    ends = np.stack([np.append(0, cuts + 1), np.append(cuts, len(intervals))], -1)
+    parts = [(first, last, _steps(log.times[first], log.times[last], plant.dt)) for first, last in ends]
+    too_short = [(float(log.times[first]), float(log.times[last])) for first, last, steps in parts if steps < shortest]
+    enough = [part for part in parts if part[2] >= shortest]
+    _require_rows(log, sum(steps for *_, steps in enough), interval, plant)
+    segments = [_segment(log, slice(first, last + 1), steps, plant) for first, last, steps in enough]
+    if not segments:
+        raise ValueError(
+            f"log of {len(log.times)} rows has no part of {shortest} control intervals of {plant.dt:g} s without a gap "
+            f"longer than {limit:g} s or a row that was left out ({len(left_out)} such places); raise --gap above "
+            f"{interval:g} s, its median sampling interval, or log longer."
+        )
+    within = np.delete(intervals, cuts)
+    gaps = [(float(log.times[k]), float(log.times[k + 1])) for k in cuts]
+    return Resampled(segments, interval, float(within.std() / interval), float(limit), gaps, too_short)
+
+
+def hold_out(
+    segments: Sequence[Trajectory], dt: float, share: float, *, shortest: int = 10
+) -> tuple[list[Trajectory], list[Trajectory]]:
+    """Split segments into those to train on and later ones to judge by; the segment at the cut is divided.
+
+    Args:
+        segments: segments of the log, in order.
+        dt: control interval [s].
+        share: share of all control intervals that is held out to judge by.
+        shortest: number of control intervals that a part of the divided segment needs; a segment with a shorter part
+            stays whole.
+
+    Raises:
+        ValueError: if the share is not between 0 and 1, or one side is left empty.
+    """
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"held_out={share} must lie between 0 and 1, a share of the log.")
+    total = sum(len(segment.actions) for segment in segments)
+    wanted = total - round(share * total)  # intervals to train on
+    training, held_out, seen = [], [], 0
+    for segment in segments:
+        n = len(segment.actions)
+        cut = min(max(wanted - seen, 0), n)
+        cut = 0 if cut < shortest else n if n - cut < shortest else cut
+        if cut:
+            training.append(segment.part(0, cut, dt))
+        if cut < n:
+            held_out.append(segment.part(cut, n, dt))
+        seen += n
+    if not (training and held_out):
+        raise ValueError(
+            f"held_out={share} of {total} control intervals leaves no {shortest} of them to "
+            f"{'train on' if not training else 'judge by'}; choose another share, or log longer."
+        )
+    return training, held_out
+
+
+def hold_means(
+    times: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " intervals"]:
+    """Exact means, over every interval of a grid, of a signal that holds its value from each time to the next."""
+    integral = np.append(0.0, np.cumsum(values[:-1] * np.diff(times)))
+    return np.diff(np.interp(grid, times, integral)) / np.diff(grid)
+
+
+def _require_rows(log: SensorLog, steps: int, interval: float, plant: Plant) -> None:
+    """Refuse a log that would give far more control intervals than it has rows, before it takes memory."""
+    rows = len(log.times)
+    if steps > INTERVALS_PER_ROW * rows:
+        raise ValueError(
+            f"column 'time' of the log has a median step of {interval:g} s, so that {rows} rows would become {steps} "
+            f"control intervals of plant {plant.name!r} (dt={plant.dt:g} s), more than {INTERVALS_PER_ROW} for each "
+            "row. Times are in seconds: say the unit of the column, such as --columns ms=time*1e-3; or give the twin a "
+            "longer dt."
+        )
+
+
+def _steps(first: float, last: float, dt: float) -> int:
+    return int((last - first) / dt + ROUNDING)
+
+
+def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajectory:
+    times = log.times[rows]
+    grid = times[0] + plant.dt * np.arange(steps + 1)
+
+    def held(signals: Sequence[Signal]) -> Float[torch.Tensor, "n n_held"]:
+        values = np.empty((steps, len(signals)))  # a plant may have no inputs
+        for k, signal in enumerate(signals):
+            values[:, k] = hold_means(times, log.columns[signal.name][rows], grid)
+        return torch.from_numpy(values)
+
+    actions, exogenous = held(plant.actions), held(plant.inputs)
+    measured = {
+        state.name: torch.from_numpy(_interpolated(state, times, log.columns[state.name][rows], grid))
+        for state in logged_states(plant)
+        if state.name in log.columns
+    }
+    states = plant.complete_states(measured, exogenous, actions)
+    return Trajectory(states, actions, exogenous, float(times[0]))
+
+
+def _interpolated(
+    state: Signal,
+    times: Float[np.ndarray, " rows"],
+    values: Float[np.ndarray, " rows"],
+    grid: Float[np.ndarray, " samples"],
+) -> Float[np.ndarray, " samples"]:
+    if state.periodic:
+        values = np.unwrap(values, period=state.period)
+    return state.wrapped(np.interp(grid, times, values))

@@ -1,0 +1,356 @@
+"""Recorded logs of a real system's sensors and actuators, in CSV or Parquet files."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rt_torchrl.bounded_file import require_bounded
+from rt_torchrl.fit.column import Column
+from rt_torchrl.fit.sensors import known_sensors
+from rt_torchrl.fit.units import converted
+from rt_torchrl.options import array_of, check_options
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
+
+TIME = "time"
+READERS = (".csv", ".parquet")
+"""Ends of the names of files that are read, in small letters."""
+MOST_ENTRIES = 500_000_000
+"""Greatest number of entries of a log, which take 4 GB."""
+WITH_OFFSET = r"\d[Tt ].*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
+"""A date whose time of day says by how much it is ahead of UTC."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogConfig:
+    """How a log is read.
+
+    Args:
+        columns: columns of the log with another name than their signal or another unit, as HEADER=SIGNAL[UNIT] or
+            HEADER=SIGNAL*FACTOR+OFFSET.
+        drop: whether to leave out rows of the log with a value that is missing or out of range; they become gaps.
+        gap: longest time between two rows of the log that is bridged [s]; by default three sampling intervals.
+    """
+
+    columns: tuple[str, ...] = ()
+    drop: bool = False
+    gap: float | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.gap is not None and not self.gap > 0.0:
+            raise ValueError(f"gap={self.gap} s must be positive: the longest time between two rows that is bridged.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorLog:
+    """Signals of a real system, sampled together at instants that need not be regular.
+
+    A row holds what a controller knows and does at one instant. States are instantaneous; actions and exogenous inputs
+    are held until the next row.
+
+    Args:
+        times: instants of the rows [s], increasing.
+        columns: values of every signal by name, in the signal's unit; NaN where a sensor gave no value.
+        cuts: numbers of the rows before which other rows were left out. What the actions did there is not known, so
+            that no part of the log goes over a cut, however short the time.
+
+    Raises:
+        ValueError: if the times are not finite and increasing, or a column has another length.
+    """
+
+    times: Float[np.ndarray, " rows"]
+    columns: dict[str, Float[np.ndarray, " rows"]]
+    cuts: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        t = array_of("times", self.times)
+        if t.ndim != 1:
+            raise ValueError(f"times has shape {t.shape}; a log has one time in each row.")
+        if not isinstance(self.columns, Mapping):
+            raise ValueError(f"columns={self.columns!r} must map each signal to its values.")
+        if len(t) < 2 or not np.isfinite(t).all():
+            raise ValueError(
+                f"times of the log: {len(t)} rows, {int((~np.isfinite(t)).sum())} of them without a time; it needs at "
+                "least 2, all with a finite time."
+            )
+        wrong = np.flatnonzero(np.diff(t) <= 0.0)
+        if wrong.size:
+            k = wrong[0] + 1
+            kind = "the same time as the one before" if t[k] == t[k - 1] else "an earlier time than the one before"
+            raise ValueError(
+                f"row {k} of the log (counted from 0) has {kind}: {t[k]:.12g} s after {t[k - 1]:.12g} s; {wrong.size} "
+                "such times in all. Sort the log and keep one row of each instant."
+            )
+        for name, values in self.columns.items():
+            if array_of(f"column {name!r}", values).shape != t.shape:
+                raise ValueError(f"column {name!r} has shape {values.shape}; the log has {len(t)} rows.")
+
+    def chosen(self, rows: Bool[np.ndarray, " rows"]) -> "SensorLog":
+        """The log of some of its rows; rows that are left out become a gap."""
+        kept = np.flatnonzero(rows)
+        cuts = {*(np.flatnonzero(np.diff(kept) > 1) + 1).tolist(), *np.searchsorted(kept, self.cuts).tolist()}
+        return SensorLog(
+            times=self.times[rows],
+            columns={name: values[rows] for name, values in self.columns.items()},
+            cuts=tuple(sorted(cuts - {0, len(kept)})),
+        )
+
+    def without(self, names: Sequence[str]) -> "SensorLog":
+        """The log without the columns of these names."""
+        return replace(self, columns={k: v for k, v in self.columns.items() if k not in names})
+
+    def write(self, path: Path) -> None:
+        """Write the log as Parquet if the path ends in ``.parquet``, otherwise as CSV.
+
+        :func:`read_log` reads it without a mapping of columns.
+        """
+        frame = pandas().DataFrame({TIME: self.times, **self.columns})
+        if path.suffix.lower() == ".parquet":
+            frame.to_parquet(path, index=False)
+        else:
+            frame.to_csv(path, index=False)
+
+
+def logged_states(plant: Plant | type[Plant]) -> tuple[Signal, ...]:
+    """States that have a column of their own in a log; a state with the name of an action or input has none."""
+    driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
+    return tuple(state for state in plant.states if state.name not in driven)
+
+
+def logged_signals(plant: Plant) -> tuple[Signal, ...]:
+    """Signals that a log of this plant can hold: its states and measurements, actions and exogenous inputs."""
+    states = logged_states(plant)
+    names = {state.name for state in states}
+    others = tuple(one.measurement.signal for name, one in known_sensors(plant).items() if name not in names)
+    return (*states, *plant.actions, *plant.inputs, *others)
+
+
+def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
+    """Read the columns of a file that hold signals of a plant; other columns are ignored.
+
+    Blanks around a header do not count. Entries behind the last header are empty, as a delimiter at the end of a line
+    leaves them.
+
+    Args:
+        path: file whose name ends in ``.csv`` or ``.parquet``. Its time is a number of seconds on the plant's clock, a
+            duration on that clock (``0:01:30``), or a date and time of day (ISO 8601), which is counted from the first
+            row. Either all dates have an offset from UTC or none has.
+        plant: plant whose signals the file holds.
+        columns: columns whose header is not the name of their signal, or whose unit is not that of their signal.
+
+    Raises:
+        ValueError: if the file cannot be read, a line has more or fewer entries than the header, a column is missing,
+            is there twice, names an unknown signal or is not numeric, the times are not increasing, or the unit of a
+            column measures another quantity than the unit of its signal.
+    """
+    frame = _read(path)
+    headers = list(frame)
+    names = [signal.name for signal in logged_signals(plant)]
+    for column in columns:
+        if column.header.strip() not in headers or column.signal not in (TIME, *names):
+            raise ValueError(
+                f"column {column.header!r} for {column.signal!r}: {path} has the columns {', '.join(headers)}; "
+                f"plant {plant.name!r} has the signals {', '.join((TIME, *names))}."
+            )
+    declared = {column.signal: column for column in columns}
+    if len(declared) < len(columns):
+        raise ValueError(f"columns {[c.header for c in columns]} name a signal twice; give each signal one column.")
+    by_name = {name: Column(header=name, signal=name) for name in (TIME, *names) if name in headers}
+    chosen = by_name | declared
+    if TIME not in chosen:
+        raise ValueError(
+            f"{path} has no column 'time'; it has {', '.join(headers)}. Say which it is, such as --columns t=time. In "
+            "CSV files, commas part the columns."
+        )
+    for column in chosen.values():
+        if headers.count(column.header.strip()) > 1:
+            raise ValueError(
+                f"column {column.header!r} for {column.signal!r} is there {headers.count(column.header.strip())} times "
+                f"in {path}, which has the columns {', '.join(headers)}; give each a header of its own."
+            )
+    units = {TIME: "s"} | {signal.name: signal.unit for signal in logged_signals(plant)}
+    values = {name: _values(frame[column.header.strip()], column, units[name], path) for name, column in chosen.items()}
+    return SensorLog(times=values.pop(TIME), columns=values)
+
+
+def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool = False) -> SensorLog:
+    """The log, once it is certain that it can drive a twin of this plant.
+
+    Args:
+        log: log as it was read.
+        plant: plant that gives the signals that are needed and the range of each signal.
+        drop: whether to leave out rows in which a value is missing or out of range, instead of refusing the log.
+        missing: whether a sensor may lack samples; its row stays, with NaN. An action or input must have every value.
+
+    Raises:
+        ValueError: if an action or input has no column; without ``drop`` also if a value is missing or out of range.
+    """
+    absent = [signal.name for signal in (*plant.actions, *plant.inputs) if signal.name not in log.columns]
+    if absent:
+        raise ValueError(
+            f"log of plant {plant.name!r} has no column {', '.join(absent)}; it has {', '.join(log.columns)}. Actions "
+            "and inputs drive the twin, so each is needed: log it, or name its column, such as --columns "
+            f"HEADER={absent[0]}."
+        )
+    driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
+    good = np.ones(len(log.times), dtype=bool)
+    for signal in logged_signals(plant):
+        if signal.name not in log.columns:
+            continue
+        values = log.columns[signal.name]
+        # A sensor of a periodic state may count its turns.
+        inside = np.isfinite(values) & (signal.periodic | ((values >= signal.low) & (values <= signal.high)))
+        inside |= np.isnan(values) & (missing and signal.name not in driven)
+        if not (drop or inside.all()):
+            k = int(np.argmin(inside))
+            raise ValueError(
+                f"{signal.name} is {values[k]:g} {signal.unit} in row {k} of the log (counted from 0, t = "
+                f"{log.times[k]:g} s), {int((~inside).sum())} such rows; it must be a number from {signal.low:g} to "
+                f"{signal.high:g} {signal.unit}. Mend the log or the column's unit, or leave such rows out with "
+                "--drop (of a training: --log.drop). Where a sensor lacks samples, --missing keeps the row."
+            )
+        good &= inside
+    return log if good.all() else log.chosen(good)
+
+
+def _read(path: Path) -> Any:
+    readers = dict(zip(READERS, (_read_csv, _read_parquet), strict=True))
+    kind = path.suffix.lower()
+    if kind not in readers:
+        raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
+    try:
+        require_bounded(path)
+        frame = readers[kind](path)
+    except Exception as error:  # the readers of tables raise errors of many kinds at what is wrong in a file
+        raise ValueError(f"log {path} cannot be read: {type(error).__name__}: {error}") from error
+    frame.columns = [str(header).strip() for header in frame]
+    return frame
+
+
+def _read_csv(path: Path) -> Any:
+    """The table with the columns as the header says; pandas alone would shift or fill the entries of ragged lines."""
+    headers = _headers(path)
+    frame = pandas().read_csv(path, index_col=False, usecols=range(len(headers)))
+    # pandas gives a name to a column without one, and another name to a header that is there twice.
+    frame.columns = [header or given for header, given in zip(headers, frame, strict=True)]
+    return frame
+
+
+def _headers(path: Path) -> list[str]:
+    """The headers of a CSV file, after a look at every line.
+
+    Raises:
+        ValueError: if there is no header, or a line lacks entries or has some behind the last header.
+    """
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        lines = csv.reader(file)
+        rows = (row for row in lines if row and not (len(row) == 1 and not row[0].strip()))  # blank lines do not count
+        headers = [header.strip() for header in next(rows, [])]
+        n = len(headers)
+        least = max((k for k, header in enumerate(headers, 1) if header), default=0)
+        if not least:
+            raise ValueError("it has no header")
+        for row in rows:
+            if len(row) != n and (len(row) < least or any(entry.strip() for entry in row[n:])):
+                raise ValueError(
+                    f"line {lines.line_num} has {len(row)} entries; the header has {n}: {', '.join(headers)}. Mend the "
+                    "line or the header"
+                )
+    return headers
+
+
+def _read_parquet(path: Path) -> Any:
+    _require_entries(path)
+    frame = pandas().read_parquet(path)
+    # An index with a name is a column of the file.
+    return frame.reset_index() if any(name is not None for name in frame.index.names) else frame
+
+
+def _require_entries(path: Path) -> None:
+    """Refuse a Parquet file that would become far larger in memory, because its columns are compressed."""
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        rows, columns = file.metadata.num_rows, file.metadata.num_columns
+    if rows * columns > MOST_ENTRIES:
+        raise ValueError(f"it has {rows} rows of {columns} columns, more than {MOST_ENTRIES} entries")
+
+
+def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndarray, " rows"]:
+    """Numbers of a column in the signal's unit; a date becomes the seconds since the first date."""
+    pd = pandas()
+    if series.empty:
+        return np.empty(0)
+    of_clock = pd.api.types.is_datetime64_any_dtype(series) or pd.api.types.is_timedelta64_dtype(series)
+    try:
+        numbers = None if of_clock else pd.to_numeric(series)
+    except (ValueError, TypeError):
+        text = series.astype(str).str.strip().str.lower()
+        wrong = pd.to_numeric(series, errors="coerce").isna() & series.notna() & ~text.isin(("", "nan"))
+        if column.signal != TIME or not wrong[series.notna()].all():
+            raise _wrong_entry(series, wrong, column, path, "a number") from None
+        numbers = None
+    if numbers is None:
+        if column.signal != TIME:
+            raise ValueError(f"column {column.header!r} of {path} holds dates; {column.signal} needs numbers.")
+        if column.unit is not None:
+            raise ValueError(f"column {column.header!r} of {path} holds dates; leave its unit {column.unit!r} away.")
+        numbers = _seconds(series, column, path)
+    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
+    if column.unit is None:
+        return column.factor * values + column.offset
+    try:
+        return converted(values, column.unit, unit)
+    except ValueError as error:
+        raise ValueError(f"column {column.header!r} of {path} for signal {column.signal!r}: {error}") from error
+
+
+def _seconds(series: Any, column: Column, path: Path) -> Any:
+    """Durations in seconds, or the seconds of dates since the first one."""
+    pd = pandas()
+    if pd.api.types.is_timedelta64_dtype(series):
+        return series.dt.total_seconds()
+    if pd.api.types.is_datetime64_any_dtype(series):
+        found = pd.to_datetime(series, utc=True)
+    else:
+        text, there = series.astype(str), series.notna()
+        found = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
+        durations = pd.to_timedelta(text, errors="coerce")
+        dates = int(found.notna().sum()) >= int(durations.notna().sum())
+        found = found if dates else durations
+        if (found.isna() & there).any():
+            raise _wrong_entry(series, found.isna() & there, column, path, "a date (ISO 8601) or a duration (0:01:30)")
+        if not dates:
+            return found.dt.total_seconds()
+        offset = text.str.contains(WITH_OFFSET)
+        other = there & (offset != offset[there].iloc[0])
+        if other.any():
+            raise _wrong_entry(series, other, column, path, "like the first one: with an offset from UTC, or without")
+    return (found - found.dropna().iloc[0]).dt.total_seconds()
+
+
+def _wrong_entry(series: Any, wrong: Any, column: Column, path: Path, what: str) -> ValueError:
+    k = int(np.argmax(wrong.to_numpy()))
+    return ValueError(
+        f"column {column.header!r} of {path} holds an entry that is not {what}: {series.iloc[k]!r} in row {k} (counted "
+        f"from 0), {int(wrong.sum())} such rows."
+    )
+
+
+def pandas() -> Any:
+    """The library pandas, which reads and writes tables; only logs need it.
+
+    Raises:
+        ValueError: if it is not installed.
+    """
+    try:
+        import pandas
+    except ImportError as error:
+        raise ValueError("logs need pandas: install the extra, pip install 'rt_torchrl[logs]'.") from error
+    return pandas

@@ -1,0 +1,109 @@
+"""A record of what sensors read, which need not be the whole state, and of which samples may be missing."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rt_torchrl.fit.sensors import Sensor, read
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+DRAWS = 100
+"""Number of initial states of a plant whose mean is the guess of a hidden one."""
+
+
+class SensorRecord(NamedTuple):
+    """Readings and actions of a real system over n control intervals.
+
+    Args:
+        readings: what the sensors read in the samples t_0 ... t_n; NaN where a sample is missing.
+        actions: actions that were applied in the n intervals.
+        exogenous: exogenous inputs z, held over the same intervals.
+        guess: first guess of the state in t_0.
+        start: time t_0 on the plant's clock [s].
+        follows: whether the record begins where the one before it in a list ends, up to process noise.
+    """
+
+    readings: Float[Tensor, "n+1 n_y"]
+    actions: Float[Tensor, "n n_a"]
+    exogenous: Float[Tensor, "n n_z"]
+    guess: Float[Tensor, " n_s"]
+    start: float = 0.0
+    follows: bool = False
+
+    @property
+    def seen(self) -> Bool[Tensor, "samples n_y"]:
+        """Whether there is a sample."""
+        return ~self.readings.isnan()
+
+    def masked(self, first: int, last: int) -> "SensorRecord":
+        """The record with the samples ``first`` to ``last`` − 1 alone; the others count as missing."""
+        kept = torch.full_like(self.readings, torch.nan)
+        kept[first:last] = self.readings[first:last]
+        return self._replace(readings=kept)
+
+    def part(self, first: int, last: int, dt: float, guess: Float[Tensor, " n_s"] | None = None) -> "SensorRecord":
+        """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the samples around them.
+
+        Args:
+            first, last: numbers of intervals.
+            dt: control interval [s].
+            guess: first guess of the state there; by default the record's own.
+        """
+        held = slice(first, last)
+        return SensorRecord(
+            self.readings[first : last + 1],
+            self.actions[held],
+            self.exogenous[held],
+            self.guess if guess is None else guess,
+            self.start + first * dt,
+        )
+
+
+def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -> SensorRecord:
+    """What sensors read along a trajectory; its first state is the guess."""
+    t = float(record.start) + plant.dt * torch.arange(len(record.states), dtype=torch.float64)
+    inputs = held_to_the_end(record.exogenous)
+    with torch.no_grad():
+        readings = read(sensors, plant, t.to(inputs.device), record.states, inputs)
+    return SensorRecord(readings, record.actions, record.exogenous, record.states[0], float(record.start))
+
+
+def chained(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
+    """A record cut into parts, of which each follows the one before.
+
+    An estimation with process noise then finds by how much the states are pushed from part to part. The sample at a cut
+    belongs to the part that ends there.
+
+    Args:
+        record: the record.
+        length: number of control intervals of a part; the last part takes what is left.
+        dt: control interval [s].
+
+    Raises:
+        ValueError: if the length is below 1.
+    """
+    if length < 1:
+        raise ValueError(f"length={length} of the parts of a record must be at least 1 control interval.")
+    n, parts = len(record.actions), []
+    for first in range(0, n, length):
+        part = record.part(first, min(first + length, n), dt)
+        if first:
+            readings = part.readings.clone()
+            readings[0] = torch.nan
+            part = part._replace(readings=readings, follows=True)
+        parts.append(part)
+    return parts
+
+
+def held_to_the_end(exogenous: Float[Tensor, "*batch n n_z"]) -> Float[Tensor, "*batch samples n_z"]:
+    """Inputs of all samples; the last sample, which no interval follows, has those of the last interval."""
+    return torch.cat([exogenous, exogenous[..., -1:, :]], -2)
+
+
+def usual_initial_state(plant: Plant, *, seed: int = 0) -> Float[Tensor, " n_s"]:
+    """Mean of the initial states that a plant draws, the guess of a state that no sensor reads."""
+    return plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(seed)).mean(0)

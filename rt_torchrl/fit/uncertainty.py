@@ -1,0 +1,201 @@
+r"""What an estimate is worth: errors, correlations, confidence regions, and what the data cannot tell.
+
+At the minimum of J (:mod:`likelihood`) the Gauss-Newton matrix H is the Fisher information, and the unknowns scatter by
+
+.. math:: \mathrm{Cov} = H^{-1}\ \text{(fisher)}, \qquad \mathrm{Cov} = H^{-1}MH^{-1}\ \text{(robust)}
+
+where M, the Newey-West sum of the scores, allows residuals that depend on their neighbours. Named values of the closure
+take their errors from those of the weights to first order.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from rt_torchrl.fit.covariance import (
+    inverse_information,
+    named_slopes,
+    named_values,
+    newey_west,
+)
+from rt_torchrl.fit.likelihood import Likelihood
+
+Errors = Literal["fisher", "robust"]
+BAD_SHARE = 0.5
+"""Standard error of a value, as a share of the value, above which the data hardly tell it."""
+HIGH_CORRELATION = 0.99
+"""Correlation of two values above which the data tell only one combination of them."""
+
+
+class Interval(NamedTuple):
+    """Ends of a confidence interval."""
+
+    low: float
+    high: float
+
+
+class Uncertainty:
+    """The scatter of an estimate.
+
+    Args:
+        likelihood: the likelihood at its minimum.
+        errors: formula of the covariance: ``fisher`` for white noise, or ``robust`` for residuals with memory.
+
+    Attributes:
+        covariance: covariance of all unknowns in their order; zero in directions of which nothing is known.
+        null: these directions, in columns, each as long as the information of the single unknowns makes it.
+        names: names of the closure's values.
+        values: these values.
+    """
+
+    @torch.no_grad()
+    def __init__(self, likelihood: Likelihood, *, errors: Errors = "fisher"):
+        self.likelihood, self.errors = likelihood, errors
+        blocks = likelihood.residuals()
+        self.information = likelihood.normal_equations(blocks).matrix
+        self._inverse = inverse_information(self.information)
+        self.covariance, self.null = self._inverse.matrix, self._inverse.null
+        if errors == "robust":
+            M = torch.zeros_like(self.information)
+            for block, record in zip(blocks, likelihood.records, strict=True):
+                scores = torch.einsum("kr,krp->kp", block.values, block.jacobian)[record.seen.any(-1)]
+                M[block.places[:, None], block.places] += newey_west(scores)
+            self.covariance = self.covariance @ M @ self.covariance
+        closure = likelihood.twin.closure
+        self.names, self._slopes = named_slopes(closure)
+        self.values = torch.stack(list(named_values(closure).values())).detach() if self.names else torch.empty(0)
+
+    @property
+    def weights_covariance(self) -> Float[Tensor, "n_w n_w"]:
+        """Covariance of the closure's weights alone."""
+        n = self.likelihood.weight_count
+        return self.covariance[:n, :n]
+
+    @property
+    def named_covariance(self) -> Float[Tensor, "n_named n_named"]:
+        """Covariance of the closure's named values."""
+        return self._slopes @ self.weights_covariance @ self._slopes.T
+
+    @property
+    def _free(self) -> Float[Tensor, "n_named n_null"]:
+        """Changes of the named values in the directions of which nothing is known."""
+        return self._slopes @ self.null[: self.likelihood.weight_count]
+
+    def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
+        """Whether quantities change in a direction of which the data say nothing.
+
+        Args:
+            slopes: derivatives of each quantity by the closure's weights.
+        """
+        return self._inverse.unknown(pad(slopes, (0, len(self.covariance) - slopes.shape[-1])))
+
+    def unknown(self) -> list[str]:
+        """Names of the values that take part in a direction of which the data say nothing."""
+        return [name for name, one in zip(self.names, self.untold(self._slopes).tolist(), strict=True) if one]
+
+    def standard_errors(self) -> dict[str, float]:
+        """Standard error of every named value; infinite for one of which the data say nothing."""
+        errors = self.named_covariance.diagonal().clamp_min(0.0).sqrt().tolist()
+        return dict(zip(self.names, errors, strict=True)) | dict.fromkeys(self.unknown(), math.inf)
+
+    def correlations(self) -> Float[Tensor, "n_named n_named"]:
+        """Correlations of the named values; nan for one of which the data say nothing."""
+        C = self.named_covariance
+        scale = torch.where(self.untold(self._slopes), math.nan, C.diagonal().sqrt())
+        return C / torch.outer(scale, scale)
+
+    def intervals(self, level: float = 0.95) -> dict[str, Interval]:
+        """Confidence interval of every named value.
+
+        Raises:
+            ValueError: if the level does not lie between 0 and 1.
+        """
+        factor = normal_factor(level)
+        found = zip(self.standard_errors().items(), self.values.tolist(), strict=True)
+        return {name: Interval(value - factor * error, value + factor * error) for (name, error), value in found}
+
+    def ellipse(self, first: str, second: str, *, level: float = 0.95, points: int = 100) -> Float[Tensor, "points 2"]:
+        """Boundary of the joint confidence region of two named values.
+
+        Raises:
+            ValueError: if a name does not exist, the data say nothing of a value, or the level does not lie between 0
+                and 1.
+        """
+        unknown = [name for name in (first, second) if name not in self.names]
+        if unknown:
+            raise ValueError(f"ellipse of {unknown}: the closure's values are {', '.join(self.names)}.")
+        if untold := sorted({first, second} & set(self.unknown())):
+            raise ValueError(f"ellipse of {untold}: it has no end, as the data say nothing of them; choose others.")
+        pair = torch.tensor([self.names.index(first), self.names.index(second)])
+        values, vectors = torch.linalg.eigh(self.named_covariance[pair[:, None], pair])
+        radius = math.sqrt(-2.0 * math.log(1.0 - _level(level)))  # the quantile of χ² with two degrees of freedom
+        angle = torch.linspace(0.0, 2.0 * math.pi, points, dtype=torch.float64)
+        circle = torch.stack([angle.cos(), angle.sin()], -1)
+        return self.values[pair] + radius * (circle * values.clamp_min(0.0).sqrt()) @ vectors.T
+
+    def initial_errors(self) -> Float[Tensor, "records n_s"]:
+        """Standard errors of the initial states; zero for those that are known, infinite where nothing is known."""
+        initial, n = self.likelihood.initial, self.likelihood.weight_count
+        shape = initial.offsets.shape
+        held = slice(n, n + shape.numel())
+        variance = self.covariance.diagonal()[held].clone()
+        each = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[held]
+        variance[self._inverse.unknown(each)] = math.inf
+        found = torch.zeros_like(initial.measured)
+        found[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
+        return found
+
+    def warnings(self) -> list[str]:
+        """What the data cannot tell, in plain words; empty if they tell every value."""
+        errors, nothing = self.standard_errors(), self.unknown()
+        found = self._untold(nothing)
+        for (name, error), value in zip(errors.items(), self.values.tolist(), strict=True):
+            if not math.isinf(error) and error > BAD_SHARE * abs(value):
+                found.append(f"the data hardly tell {name}: {value:.3g} with a standard error of {error:.2g}")
+        R = self.correlations()
+        for i, j in (R.abs() > HIGH_CORRELATION).triu(1).nonzero().tolist():
+            if not {self.names[i], self.names[j]} & set(nothing):
+                found.append(self._pair(i, j, R[i, j].item()))
+        return found
+
+    def _untold(self, names: list[str]) -> list[str]:
+        """What to say of values that take part in directions of which the data say nothing."""
+        if not names:
+            return []
+        # The rank must not depend on the units of values and weights.
+        free = self._free[[self.names.index(name) for name in names]]
+        for dim in (1, 0):
+            free = normalize(free, dim=dim, eps=1e-300)
+        rank = int(torch.linalg.matrix_rank(free, rtol=1e-3))
+        if rank == len(names):
+            return [f"the data say nothing of {name}; it keeps its first value" for name in names]
+        return [
+            f"the data cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {rank} combination(s) of them are "
+            f"free. Measure more, or fix {rank} of them"
+        ]
+
+    def _pair(self, i: int, j: int, correlation: float) -> str:
+        kept = "ratio" if correlation > 0.0 else "product"
+        return (
+            f"the data tell a combination of {self.names[i]} and {self.names[j]}, such as their {kept}, better than "
+            f"each of them (correlation {correlation:.4f})"
+        )
+
+
+def normal_factor(level: float) -> float:
+    """Half width of the interval that holds a normal number with a probability, in standard deviations.
+
+    Raises:
+        ValueError: if the probability does not lie between 0 and 1.
+    """
+    return float(torch.special.ndtri(torch.tensor(0.5 + 0.5 * _level(level), dtype=torch.float64)))
+
+
+def _level(level: float) -> float:
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level={level} of a confidence region must lie between 0 and 1.")
+    return level

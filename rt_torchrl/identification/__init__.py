@@ -1,1 +1,0 @@
-"""Identification of a twin from sensor logs, without control of the real system."""
