@@ -1,4 +1,4 @@
-"""Measure time and memory of forward and gradient by each engine and by JAX; all take turns in one process."""
+"""Measure time and memory of forward and gradient by each engine, JAX and CasADi; all take turns in one process."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ if __name__ == "__main__":
 
 from benchmarking import cores, fresh_process
 from benchmarking.case import Case, ClosureKind, PlantName, PolicyKind, system_of
-from benchmarking.contenders import Contenders, Jax
+from benchmarking.contenders import Casadi, Contenders, Jax
 from benchmarking.sizes import Grid
 from benchmarking.summary import Summary
 from benchmarking.tables import start_table, time_table, training_table, update_table
@@ -34,7 +34,7 @@ SHARES = {"times": 0.5, "starts": 0.75, "trainings": 1.0, "updates": 1.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Time J_a and its gradient with respect to the policy by the gradient engines and by JAX.
+    """Time J_a and its gradient with respect to the policy by the gradient engines, by JAX and by CasADi.
 
     Args:
         plants: plants; the first one matters most.
@@ -50,6 +50,8 @@ class Config:
             first one.
         jax: jax_scan for one scan that JAX differentiates, jax_sweep for a reverse sweep by hand; both need the extra
             bench.
+        casadi: casadi_scalar for C code of one realisation after another, casadi_lanes for the same code with vectors
+            over realisations; both are written for the drone with its law, and need the extra mpc and g++.
         compiled: compile the engines.
         eager: engines that are not compiled all the same, such as odeint_adjoint as torchdiffeq ships it.
         repeats: greatest number of turns behind a median, each of calls for a tenth of a second, at least one.
@@ -75,6 +77,7 @@ class Config:
     threads: tuple[int, ...] = (1, 2)
     engines: tuple[Engine, ...] = tuple(ENGINES)
     jax: tuple[Jax, ...] = get_args(Jax)
+    casadi: tuple[Casadi, ...] = get_args(Casadi)
     compiled: bool = True
     eager: tuple[Engine, ...] = ("odeint_adjoint", "autograd")
     repeats: int = 5
@@ -115,7 +118,7 @@ class Config:
         return Grid(cases, self.threads, *lines, all_pairs=self.all_pairs)
 
     def contenders(self) -> Contenders:
-        return Contenders(self.engines, self.jax, self.compiled, self.eager)
+        return Contenders(self.engines, self.jax, self.casadi, self.compiled, self.eager)
 
     def subject(self) -> Engine:
         """The engine that is compared with the others."""

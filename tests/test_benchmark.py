@@ -3,11 +3,14 @@
 import json
 import math
 import runpy
+import shutil
 from pathlib import Path
 
 import fresh_process
+import numpy as np
 import pytest
-from benchmarking.case import Case, system_of
+import torch
+from benchmarking.case import Case, scenario_of, system_of
 from benchmarking.contenders import QUANTITIES, Contenders
 from benchmarking.figures import save_figures
 from benchmarking.sizes import Grid, Size
@@ -16,9 +19,11 @@ from benchmarking.timing import Cell, Stopwatch
 from benchmarking.updates import milliseconds_of_update
 from matplotlib.image import imread
 
+from rt_torchrl import Rollout
+
 RECIPE = Path(__file__).parent.parent / "recipes" / "benchmark.py"
-SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--plants", "wind_turbine", "--jax"]
-NOTHING = Contenders((), (), compiled=False, eager=())
+SMALL = ["--quick", "--no-compiled", "--no-starts", "--threads", "1", "--casadi", "--plants", "wind_turbine", "--jax"]
+NOTHING = Contenders((), (), (), compiled=False, eager=())
 
 
 def compared(folder, *options):
@@ -67,10 +72,43 @@ def test_jax_takes_part(tmp_path):
     assert ("jax_scan", "forward") in found and ("jax_sweep", "forward") not in found
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("policy", "method"),
+    [
+        ("affine", "scalar"),
+        pytest.param("mlp", "scalar", marks=pytest.mark.nightly),  # half a minute of g++
+        pytest.param("affine", "lanes", marks=pytest.mark.nightly),
+    ],
+)
+def test_casadi_and_torch_agree(policy, method):
+    """The equations by hand in CasADi, and its derivative, with a number of realisations that fills no vector."""
+    pytest.importorskip("casadi", reason="the drone in CasADi needs the extra mpc")
+    if shutil.which("g++") is None:
+        pytest.skip("CasADi's code needs g++")
+    from benchmarking.casadi_code import CasadiCode
+
+    system = system_of(Case("flapping_wing", policy=policy))
+    scenario = scenario_of(system.case, 60, 3)
+    cost = Rollout(system.plant, system.closure, system.policy, engine="autograd").costs(*scenario).mean()
+    expected = torch.cat([part.flatten() for part in torch.autograd.grad(cost, system.weights())])
+    code = CasadiCode(system, method)
+    also, gradient = code.gradient(code.inputs(scenario))
+    assert also == pytest.approx(cost.item(), rel=1e-12)
+    assert np.linalg.norm(gradient - expected.numpy()) < 1e-10 * expected.norm().item()
+
+
+def test_casadi_knows_the_drone_with_its_law_alone():
+    pytest.importorskip("casadi", reason="the drone in CasADi needs the extra mpc")
+    for case in (Case("wind_turbine"), Case("flapping_wing", closure="mlp")):
+        assert "only the drone with its law" in NOTHING.refusal("casadi_scalar", system_of(case))
+
+
 def test_jax_that_is_not_installed_is_left_out(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     system = system_of(Case("wind_turbine"))
     assert "install the extra bench" in NOTHING.refusal("jax_scan", system)
+    assert "install the extra mpc" in NOTHING.refusal("casadi_lanes", system)
     assert NOTHING.refusal("parallel", system) is None
 
 
@@ -114,7 +152,7 @@ def test_lines_go_through_the_chosen_sizes_and_the_smaller_work_comes_first():
 
 def test_a_size_that_would_take_too_long_is_left_out():
     case = Case("wind_turbine")
-    watch = Stopwatch(Contenders(("autograd",), (), compiled=False, eager=()), 1, 1.0, lambda doing: None)
+    watch = Stopwatch(Contenders(("autograd",), (), (), compiled=False, eager=()), 1, 1.0, lambda doing: None)
     watch.cells += [
         cell(Size(case, 1, 100, 5), "autograd", wall=0.5),
         cell(Size(case, 1, 200, 1), "autograd", wall=0.4),

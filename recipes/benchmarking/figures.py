@@ -17,6 +17,8 @@ COLOURS = {
     "autograd": "#222222",
     "jax_scan": "#E69F00",
     "jax_sweep": "#CC79A7",
+    "casadi_scalar": "#56B4E9",
+    "casadi_lanes": "#7F7F7F",
 }
 MARKERS = "osv^D*Pdhp"
 AXES = {"steps": "control intervals", "realisations": "realisations"}

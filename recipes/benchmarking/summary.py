@@ -8,7 +8,13 @@ from benchmarking.contenders import QUANTITIES, Quantity, quantities_of
 from benchmarking.sizes import Size
 from benchmarking.timing import Cell
 
-RIVALS = {"jax_scan": "jitted JAX scan", "jax_sweep": "JAX at its best", "odeint_adjoint": "odeint_adjoint"}
+RIVALS = {
+    "jax_scan": "jitted JAX scan",
+    "jax_sweep": "JAX at its best",
+    "casadi_scalar": "CasADi, scalar",
+    "casadi_lanes": "CasADi with vectors",
+    "odeint_adjoint": "odeint_adjoint",
+}
 BATCHES, LONG = (5, 25, 125), 10_000
 DRONE = Case("flapping_wing")
 FLAT = (1_000, 100_000)
