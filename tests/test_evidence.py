@@ -32,8 +32,6 @@ from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration
 from rt_torchrl.twinning.findings import findings, weight_vector
 from rt_torchrl.twinning.judgement import Costs, Judgement
-from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
@@ -287,7 +285,6 @@ def test_a_twin_that_blew_up_makes_no_neighbour_cheaper_than_its_flight():
         assert judge.expected(policy, cost) == pytest.approx(expected, rel=0.04)
     assert judge.belief(policy, 0.3).mean == 0.0 and judge.median(policy, 0.3) == 0.3
     assert judge.expected(policy, math.inf) == math.inf
-    assert judge.trust(policy, 0.1) < 0.01
 
 
 def test_who_costs_more_on_the_twin_is_expected_to_cost_more():
@@ -512,19 +509,3 @@ def test_what_exploration_explains_corrects_no_plan(exploration, corrects):
     paired = Differences([policy], [math.log(1.3)], [exploration], flown)
     found.track_record.differences = lambda virtual: paired
     assert (found.examination.correction(record) is not None) == corrects
-
-
-@pytest.mark.parametrize("factor", [1.0, 10.0])
-def test_the_learner_trusts_the_twin_as_far_as_it_was_right(factor):
-    """The real system costs the factor times what the twin says."""
-    incremental = IncrementalTD3Config(decisions=5, virtual=10)
-    options = {"critic_iterations": 4, "batch_size": 16, "critic_hidden": (8,), "discount": 0.9, "return_steps": 4}
-    learner = LearnerConfig(algorithm="incremental_td3", incremental=incremental, **options)
-    plant = LinearQuadratic(horizon=2.0)
-    found = twinning(
-        plant, closure=copy.deepcopy(plant.closure), learner=learner, exploration=ExplorationConfig(spread=0.0)
-    )
-    report_costs(found, factor)
-    trusts = [found.episode()["trust"].item() for _ in range(3)]
-    assert found.learner.trust == trusts[-1]
-    assert trusts[-1] > 0.8 if factor == 1.0 else trusts[-1] < 0.01

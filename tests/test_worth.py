@@ -107,7 +107,7 @@ def test_every_arm_is_a_training_that_its_recipe_can_make(tmp_path):
     config = worth.Config(systems=("nothing", "pitch", "delay", "bias_5"), seeds=1, folder=tmp_path)
     planned = {row: config.trainings(*row) for row in config.rows()}
     folders = {training.folder for groups in planned.values() for (training,) in groups.values()}
-    assert len(folders) == 2 * 14 + 3 * 2 * 13  # predictive control on the turbine alone
+    assert len(folders) == 2 * 11 + 3 * 2 * 10  # predictive control on the turbine alone
     read = [("wind_turbine", "pitch", name) for name in worth.ARMS]
     read += [(case, system, "twinning") for case, system in (("hop", "delay"), ("cryogenic_tank", "bias_5"))]
     for case, system_name, name in read:
@@ -116,7 +116,7 @@ def test_every_arm_is_a_training_that_its_recipe_can_make(tmp_path):
         assert made.unknown == (system_name,)
         assert made.twinning.arm == ("model_free" if "free" in name else training.arm)
         if name == "twinning":
-            assert made.twinning.corrected_plans and made.twinning.learner.algorithm == "incremental_td3"
+            assert made.twinning.corrected_plans and made.twinning.hypotheses.which == "automatic"
 
 
 def test_the_page_is_written_from_what_is_kept(tmp_path):

@@ -50,7 +50,6 @@ TAGS = {
     "astray": "twin/plans that failed from extreme starts",
     "alarm": "twin/alarm: the twin is wrong where it matters",
     "whiteness": "twin/apart from the alarm: probability that white noise leaves as much over (Ljung-Box)",
-    "trust": "twin/trust of the model-free half: probability that the twin is within 10 %",
     "predicted_violations": "violations/predicted share of intervals (twin, the policy that acts)",
     "weight_change": "switch/relative weight change of the idle policy",
     "distillation_error": "switch/RMS action error of a distilled clone, share of range",

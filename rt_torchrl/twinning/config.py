@@ -108,12 +108,6 @@ class TwinningConfig:
                 "corrected_descents=True needs corrected_plans=True, and plans over whole episodes: leave "
                 "planner.method and short_horizon.window as they are, or leave it out."
             )
-        own = self.learner.incremental
-        if self.arm == "model_free" and self.learner.algorithm == "incremental_td3" and own.trust:
-            raise ValueError(
-                f"learner.incremental.trust={own.trust} needs a twin, which arm='model_free' has not; use 0, or "
-                "arm='twinning'."
-            )
         if self.limits and self.exploration.redrawn:
             raise ValueError(
                 f"exploration.redrawn={self.exploration.redrawn} draws weights that no twin has checked; leave it at 0 "

@@ -12,7 +12,6 @@ from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import as_findings, findings, merged, plain
 from rt_torchrl.twinning.flight import Flight, RealFlights, together
-from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
@@ -30,7 +29,6 @@ class Trainer(Protocol):
     flights: RealFlights
     config: TwinningConfig
     track_record: TrackRecord
-    learning: Learning
     virtual: VirtualEpisodes
 
     @property
@@ -67,10 +65,7 @@ class Operating:
             role: role that is live.
             episode: number of the learner's episode, from 0.
         """
-        self.trainer.learning.adopt(live := self.trainer.policies[role])
         policy, role, report = self.trainer.clearance.choose(role, self.trainer.judged)
-        if policy is not live:
-            self.trainer.learning.grounded(live)
         strength = self._exploration.strength(episode)
         self.operation.hand_over(role, policy, strength=strength, episode=episode, found=plain(report))
 
@@ -115,8 +110,6 @@ class Operating:
         drawn = order.episode < self._exploration.redrawn
         explored = 1.0 if drawn else order.strength * self._exploration.spread
         self.trainer.track_record.append(flight.record, role, cost, explored, order.weights)
-        if order.version == max(self.operation.orders):
-            self.trainer.learning.flown(self.trainer.policies[role], cost)
 
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])

@@ -6,7 +6,6 @@ cancels. What is left is the paired difference :math:`d_i = \log J_i - \log\hat 
 
 import math
 from collections.abc import Sequence
-from statistics import NormalDist
 from typing import NamedTuple
 
 import torch
@@ -38,11 +37,6 @@ class Belief(NamedTuple):
 
     mean: float
     deviation: float
-
-    def within(self, size: float) -> float:
-        """Probability that the difference is no larger than this, either way."""
-        normal = NormalDist(self.mean, self.deviation)
-        return normal.cdf(size) - normal.cdf(-size)
 
 
 class PairedDifferences:

@@ -66,11 +66,6 @@ class RealJudge:
         mean = self.belief(*one).mean - self.belief(*other).mean
         return Belief(mean, self.learned.deviation_between(self.shares(one[0]), self.shares(other[0])))
 
-    @torch.no_grad()
-    def trust(self, policy: nn.Module, size: float) -> float:
-        """Probability that the twin says what a policy costs to within this size of log J, by all episodes."""
-        return self.learned.belief(self.shares(policy)).within(size)
-
     @cached_property
     def limited(self) -> PairedDifferences:
         """The belief that follows from paired differences of at least ``LEAST``, with the likeliest noise."""

@@ -21,13 +21,11 @@ class CriticShape:
         n_o: number of observations.
         n_a: number of actions.
         hidden: widths of the hidden layers.
-        normalised: whether the affine map of every hidden layer is normalised over its units.
     """
 
     n_o: int
     n_a: int
     hidden: tuple[int, ...]
-    normalised: bool = False
 
     @property
     def n_x(self) -> int:
@@ -50,63 +48,26 @@ class CriticShape:
         return [(next(parts).view(n_out, n_in), next(parts)) for n_out, n_in in self.sizes]
 
 
-FLOOR = 1e-5
-"""Number that ``torch.nn.LayerNorm`` adds to a variance."""
-
-
-def normalised(z: Float[Tensor, "n n_z"]) -> tuple[Float[Tensor, "n n_z"], Float[Tensor, "n 1"]]:
-    """Layer normalisation without weights, and 1/σ of each row."""
-    deviation = z - z.mean(-1, keepdim=True)
-    rate = torch.rsqrt((deviation * deviation).mean(-1, keepdim=True) + FLOOR)
-    return deviation * rate, rate
-
-
-def normalised_slope(
-    slope: Float[Tensor, "n n_z"], z: Float[Tensor, "n n_z"], rate: Float[Tensor, "n 1"]
-) -> Float[Tensor, "n n_z"]:
-    """Slopes by what :func:`normalised` takes, from those by its result z and from its rate."""
-    return rate * (slope - slope.mean(-1, keepdim=True) - z * (slope * z).mean(-1, keepdim=True))
-
-
-def symlog(x: Tensor) -> Tensor:
-    r"""The rescaled value :math:`\mathrm{sign}(x)\log(1 + |x|)`.
-
-    Source: Hafner et al., *Mastering diverse domains through world models*, arXiv 2301.04104.
-    """
-    return torch.sign(x) * torch.log1p(x.abs())
-
-
-def symexp(x: Tensor) -> Tensor:
-    """The inverse of :func:`symlog`."""
-    return torch.sign(x) * torch.expm1(x.abs())
-
-
-def value_of(layers: Sequence[Layer], x: Float[Tensor, "n n_x"], *, normal: bool = False) -> Float[Tensor, "n 1"]:
-    """The value q(x); with ``normal`` of normalised hidden layers."""
+def value_of(layers: Sequence[Layer], x: Float[Tensor, "n n_x"]) -> Float[Tensor, "n 1"]:
+    """The value q(x)."""
     for weight, bias in layers[:-1]:
         z = torch.addmm(bias, x, weight.t())
-        z = normalised(z)[0] if normal else z
         x = z * torch.sigmoid(z)
     return torch.addmm(layers[-1][1], x, layers[-1][0].t())
 
 
-def derivatives_of(
-    layers: Sequence[Layer], x: Float[Tensor, "n n_x"], *, normal: bool = False
-) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+def derivatives_of(layers: Sequence[Layer], x: Float[Tensor, "n n_x"]) -> tuple[Tensor, list[Tensor], list[Tensor]]:
     r"""The value, the outputs h_l of all hidden layers, and the slopes dq/dx and dq/dz_l.
 
     .. math::
         z_l = W_l h_{l-1} + b_l, \qquad h_l = z_l\sigma(z_l), \qquad
         \frac{dq}{dz_l} = h_l'(z_l) \odot W_{l+1}^\top\frac{dq}{dz_{l+1}}, \qquad h' = \sigma + h (1 - \sigma)
 
-    SiLU and its derivative share one exponential. With ``normal``, z_l is normalised before h and its slopes follow.
+    SiLU and its derivative share one exponential.
     """
-    hidden, rates, norms = [], [], list[tuple[Tensor, Tensor]]()
+    hidden, rates = [], []
     for weight, bias in layers[:-1]:
         z = torch.addmm(bias, x, weight.t())
-        if normal:
-            norms.append(normalised(z))
-            z = norms[-1][0]
         share = torch.sigmoid(z)
         x = z * share
         hidden.append(x)
@@ -117,14 +78,13 @@ def derivatives_of(
         slope = slopes[0].mm(layers[l][0])
         if l:
             slope = slope * rates[l - 1]
-            slope = normalised_slope(slope, *norms[l - 1]) if normal else slope
         slopes.insert(0, slope)
     return value, hidden, slopes[:-1]
 
 
 @dataclass(frozen=True)
 class TemporalDifferences:
-    r"""The formula of a critic iteration for critics i, of which the targets take the least or the mean.
+    r"""The formula of a critic iteration for critics i, of which the targets take the least.
 
     .. math::
         \delta_i = q_i(x) - r - \gamma\min_j q_j'(x'), \qquad g_i = 2 w\delta_i
@@ -132,19 +92,13 @@ class TemporalDifferences:
     A row holds x, x', r, γ and w; weights are those of all critics and then of their targets. The results of a row are,
     for each critic in turn, δ, g, h_l of all hidden layers, and g dq/dz_l.
 
-    Rescaled critics give :math:`f_i = h(q_i)` with :func:`symlog` for h, and their targets take the mean,
-
-    .. math:: \delta_i = f_i(x) - h\Big(r + \gamma h^{-1}\Big(\frac1M\sum_j f_j'(x')\Big)\Big)
-
     Args:
         shape: numbers of each critic.
         members: number of critics.
-        rescaled: whether the critics give rescaled values.
     """
 
     shape: CriticShape
     members: int
-    rescaled: bool = False
 
     @property
     def n_in(self) -> int:
@@ -160,16 +114,11 @@ class TemporalDifferences:
         n_x = self.shape.n_x
         x, following, reward, discount, share = rows.split([n_x, n_x, 1, 1, 1], -1)
         critics = [self.shape.layers(part) for part in weights.split(self.shape.n_w)]
-        normal = self.shape.normalised
-        values = [value_of(target, following, normal=normal) for target in critics[self.members :]]
-        if self.rescaled:
-            goal = reward + discount * symexp(reduce(torch.add, values) / self.members)
-        else:
-            goal = reward + discount * reduce(torch.minimum, values)
-        goal = symlog(goal) if self.rescaled else goal
+        values = [value_of(target, following) for target in critics[self.members :]]
+        goal = reward + discount * reduce(torch.minimum, values)
         found: list[Tensor] = []
         for critic in critics[: self.members]:
-            value, hidden, slopes = derivatives_of(critic, x, normal=normal)
+            value, hidden, slopes = derivatives_of(critic, x)
             error = value - goal
             scale = 2.0 * share * error
             found += [error, scale, *hidden, *(scale * slope for slope in slopes[1:])]
@@ -202,41 +151,3 @@ class Ascent:
         x, share = rows.split([self.shape.n_x, 1], -1)
         value, _, slopes = derivatives_of(self.shape.layers(weights[: self.shape.n_w]), x)
         return [share * value, -share * slopes[0][:, self.shape.n_o :]]
-
-
-@dataclass(frozen=True)
-class RescaledAscent:
-    r"""The formula of a policy iteration for rescaled critics: w f̄, and −w df̄/da by the scaled actions.
-
-    .. math:: \bar f = \frac1M\sum_i f_i
-
-    The policy climbs the mean of the rescaled values, which weighs relative changes of the cost alike in all states. Of
-    the values themselves a few dear states decide, where the critics err most. A row holds x and w.
-
-    Args:
-        shape: numbers of each critic.
-        members: number M of critics.
-    """
-
-    shape: CriticShape
-    members: int
-
-    @property
-    def n_in(self) -> int:
-        """Length of a row."""
-        return self.shape.n_x + 1
-
-    @property
-    def sizes(self) -> list[int]:
-        """Lengths of the results."""
-        return [1, self.shape.n_a]
-
-    def __call__(self, rows: Float[Tensor, "n n_in"], weights: Float[Tensor, " n_w"]) -> list[Tensor]:
-        x, share = rows.split([self.shape.n_x, 1], -1)
-        values, by_action = [], []
-        for part in weights.split(self.shape.n_w)[: self.members]:
-            value, _, slopes = derivatives_of(self.shape.layers(part), x, normal=self.shape.normalised)
-            values.append(value)
-            by_action.append(slopes[0][:, self.shape.n_o :])
-        share = share / self.members
-        return [share * reduce(torch.add, values), -share * reduce(torch.add, by_action)]

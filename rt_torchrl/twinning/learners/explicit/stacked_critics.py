@@ -17,10 +17,9 @@ class StackedCritics:
         name: name of the critics' weights in the loss.
         n_a: number of actions.
         n: number of transitions in a batch.
-        rescaled: whether the critics normalise their hidden layers and give rescaled values.
     """
 
-    def __init__(self, loss: LossModule, name: str, n_a: int, n: int, *, rescaled: bool = False):
+    def __init__(self, loss: LossModule, name: str, n_a: int, n: int):
         named = {key: weight for key, weight in loss.named_parameters() if key.startswith(f"{name}.")}
         held = dict(loss.named_buffers())
         self.weights = list(named.values())
@@ -31,10 +30,10 @@ class StackedCritics:
         self.gradients = [part.view(weight.shape) for part, weight in zip(parts, self._values, strict=True)]
         members = members_of(self._values)
         widths = [bias.numel() for bias in members[0][1::2]]
-        self.shape = CriticShape(members[0][0].shape[1] - n_a, n_a, tuple(widths[:-1]), rescaled)
+        self.shape = CriticShape(members[0][0].shape[1] - n_a, n_a, tuple(widths[:-1]))
         self._parts = [part.view(-1) for member in members + members_of(self._targets) for part in member]
         self._row, self._old = torch.cat(self._parts), False
-        self._differences = RowFunction(TemporalDifferences(self.shape, len(members), rescaled), n, self._row)
+        self._differences = RowFunction(TemporalDifferences(self.shape, len(members)), n, self._row)
         self.rows = self._differences.rows
         """Rows x, x', r, γ and w of a batch, to be written before :meth:`learn`."""
         self._plan(len(members))
@@ -59,10 +58,6 @@ class StackedCritics:
             torch.cat(self._parts, out=self._row)
             self._old = False
         return self._row
-
-    def expect_change(self) -> None:
-        """Read the weights anew for the next :attr:`row`, because they are about to change."""
-        self._old = True
 
     @property
     def gradient_norm(self) -> Tensor:
