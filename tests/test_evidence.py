@@ -448,7 +448,7 @@ def test_exploration_is_repeated_on_the_twin(wrong):
 def test_the_alarm_needs_no_quiet_episodes(factor):
     """Both episodes explore by a fifth of half the range; the twin is the real system, whose costs are multiplied."""
     plant = LinearQuadratic(horizon=2.0)
-    loud = ExplorationConfig(spread=0.2, least=1.0)
+    loud = ExplorationConfig(spread=0.2, episodes=10**6)
     found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=loud)
     report_costs(found, factor)
     raised = []

@@ -9,7 +9,6 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import root
 
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -80,7 +79,7 @@ def test_ddpg_ruins_a_clone_of_the_optimum(answer):
         DigitalTwin(plant, plant.closure),
         model_free=LinearGain(answer.gain.copy()),
         model_based=LinearGain(answer.gain.copy()),
-        config=TwinningConfig(arm="model_free", learner=LEARNER, exploration=ExplorationConfig(least=0.2)),
+        config=TwinningConfig(arm="model_free", learner=LEARNER),
         generator=torch.Generator().manual_seed(0),
     )
     found.episode()

@@ -168,14 +168,13 @@ class ReinforcementTwinning:
         if self.operating is not None:
             return self.operating.take(self.referee.live, self.episodes_done)
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
-        waiting = self.actor.exploring(self.policies[live], self.episodes_done)
         cleared = self.clearance.choose(live, self.judged)
-        acting, live = (waiting, live) if cleared.policy is self.policies[live] else (cleared.policy, cleared.role)
+        acting, live = cleared.policy, cleared.role
         flight = self.flights.fly(acting, strength=strength, whole=self.virtual.wanting(self.config.arm))
         self.keep(flight)
-        explored = self.actor.strength * self.config.exploration.spread if acting is cleared.policy else 1.0
+        explored = self.actor.strength * self.config.exploration.spread
         if flight.whole:  # costs of parts cannot be compared with those of episodes
-            self.track_record.append(flight.record, live, flight.cost.item(), explored, cleared.policy.state_dict())
+            self.track_record.append(flight.record, live, flight.cost.item(), explored, acting.state_dict())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})

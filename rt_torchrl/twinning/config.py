@@ -108,8 +108,3 @@ class TwinningConfig:
                 "corrected_descents=True needs corrected_plans=True, and plans over whole episodes: leave "
                 "planner.method and short_horizon.window as they are, or leave it out."
             )
-        if self.limits and self.exploration.redrawn:
-            raise ValueError(
-                f"exploration.redrawn={self.exploration.redrawn} draws weights that no twin has checked; leave it at 0 "
-                "where there are limits."
-            )
