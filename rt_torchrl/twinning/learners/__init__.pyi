@@ -1,8 +1,7 @@
 from .actor_critic import ActorCritic
-from .choice import make_learner
 from .config import LearnerConfig, LongTermMemoryConfig, TD3Config
 from .ddpg import DDPG
-from .learner import Learner
+from .learner import Learner, make_learner
 from .td3 import TD3
 
 __all__ = [

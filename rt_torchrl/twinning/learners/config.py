@@ -83,9 +83,9 @@ class LearnerConfig:
         critic_hidden: widths of the critic's hidden layers.
         memory: parameters of the long-term memory D_L.
         td3: parameters of TD3 that DDPG does not have.
-        update: way to compute an update: ``explicit`` for gradients by formula, several times as fast, or ``torchrl``
-            for TorchRL's losses and autograd. Both give the same weights up to rounding. Critics or losses of your own
-            always use TorchRL's way.
+        update: way to compute an update of DDPG: ``explicit`` for gradients by formula, several times as fast, or
+            ``torchrl`` for TorchRL's loss and autograd. Both give the same weights up to rounding. TD3, and critics or
+            losses of your own, always use TorchRL's way.
     """
 
     algorithm: LearnerName = "ddpg"
