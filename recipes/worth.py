@@ -32,56 +32,37 @@ if TYPE_CHECKING:
 FEW = 8
 """Number of unseen episodes that model predictive control flies, which takes long."""
 
-NEW_LEARNER: Options = (
-    *("--twinning.learner.algorithm", "incremental_td3", "--twinning.learner.critic-iterations", "1000"),
-)
-DISCOUNT: dict[str, Options] = {"wind_turbine": ("--twinning.learner.discount", "0.99")}
-"""Discount of the new learner, where it differs from that of the recipe."""
-EXPLORING: Options = ("--twinning.exploration.redrawn", "2", "--twinning.exploration.least", "0.2")
-NOISE: dict[str, Options] = {"wind_turbine": ("--twinning.exploration.correlation-time", "5")}
 HYPOTHESES: Options = ("--twinning.hypotheses.which", "automatic")
 ALONE: Options = ("--twinning.hypotheses.which", "none")
 EVIDENCE: Options = ("--twinning.referee.rule", "weight_of_evidence")
 TREE: Options = ("--twinning.referee.rule", "decision_tree")
 CORRECTED: Options = ("--twinning.corrected-plans",)
 UNCORRECTED: Options = ("--twinning.no-corrected-plans",)
-UNTAUGHT: Options = ("--twinning.learner.incremental.trust", "0", "--twinning.learner.incremental.no-measured")
 RANDOM: Options = ("--start", "random")
-OLD_LEARNER: Options = ("--twinning.learner.algorithm", "ddpg")
 PARTS = {
     "without hypotheses": "hypotheses",
-    "without the new learner": "the new learner",
-    "without lessons of the twin": "slopes and virtual transitions from the twin",
     "without corrected plans": "the correction of plans by paired differences",
     "without the referee": "the referee that weighs evidence",
 }
 """Name of each part, by the arm that lacks it."""
 
 
-def whole(case: str) -> Options:
-    """Options of twinning with all its parts."""
-    return (*NEW_LEARNER, *DISCOUNT.get(case, ()), *HYPOTHESES, *EVIDENCE, *CORRECTED)
-
-
 def arms_of(case: str) -> dict[str, Options]:
     """Options of every arm on a plant, by name."""
-    every, learner = whole(case), (*NEW_LEARNER, *DISCOUNT.get(case, ()))
+    every = (*HYPOTHESES, *EVIDENCE, *CORRECTED)
     planned = ("--twinning.arm", "model_based")
     free = ("--paper", "--twinning.arm", "model_free")
     found: dict[str, Options] = {
         WHOLE: every,
         "twinning of the paper": ("--paper",),
         "model-free, DDPG": free,
-        "model-free, incremental TD3": (*free, *learner, *EXPLORING, *NOISE.get(case, ())),
         "twinning from random weights": (*every, *RANDOM),
-        "the same without the referee": (*learner, *HYPOTHESES, *TREE, *CORRECTED, *RANDOM),
+        "the same without the referee": (*HYPOTHESES, *TREE, *CORRECTED, *RANDOM),
         "model-based": (*planned, *ALONE, *TREE, *UNCORRECTED),
-        "model-based, hypotheses": (*planned, *HYPOTHESES, *EVIDENCE, *CORRECTED),
-        "without hypotheses": (*learner, *ALONE, *EVIDENCE, *CORRECTED),
-        "without the new learner": (*OLD_LEARNER, *HYPOTHESES, *EVIDENCE, *CORRECTED),
-        "without lessons of the twin": (*every, *UNTAUGHT),
-        "without corrected plans": (*learner, *HYPOTHESES, *EVIDENCE, *UNCORRECTED),
-        "without the referee": (*learner, *HYPOTHESES, *TREE, *CORRECTED),
+        "model-based, hypotheses": (*planned, *every),
+        "without hypotheses": (*ALONE, *EVIDENCE, *CORRECTED),
+        "without corrected plans": (*HYPOTHESES, *EVIDENCE, *UNCORRECTED),
+        "without the referee": (*HYPOTHESES, *TREE, *CORRECTED),
     }
     if case == "wind_turbine":  # it plans in real time there; the tank's half-open valve has no plans by gradients
         mpc = ("--twinning.planner.method", "receding_horizon")

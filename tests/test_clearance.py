@@ -90,20 +90,6 @@ def test_a_policy_that_would_leave_them_does_not_act():
     assert torch.equal(found.track_record.policy_flown().gain, last.policy.gain)
 
 
-def test_the_learner_knows_whether_its_policy_has_flown(monkeypatch):
-    found = limited(dataclasses.replace(LIMITS, tolerated=0.2))
-    for policy in found.policies.values():
-        policy.gain.data.fill_(0.05)
-    said = []
-    for name in ("adopt", "flown", "grounded"):
-        monkeypatch.setattr(found.learner, name, lambda *cost, name=name: said.append(name), raising=False)
-    found.interact()
-    found.fit_exogenous()
-    assert found.referee.live == "model_free" and said == ["adopt", "flown"]
-    found.policies["model_free"].load_state_dict(LinearGain([[80.0, -80.0]]).state_dict())
-    assert found.interact()["live"] == "model_based" and said[2:] == ["adopt", "grounded"]
-
-
 def test_without_a_policy_that_may_act_the_training_says_so():
     found = limited(dataclasses.replace(LIMITS, states={"position": (-1e-3, 1e-3)}))
     found.episode()

@@ -125,15 +125,15 @@ def assert_equal(state, other):
 def test_small_operations_run_on_one_thread_of_torch(kind, error, monkeypatch):
     found, before, seen = learner(kind=kind, critic_iterations=2, actor_iterations=2), torch.get_num_threads(), []
     filled(explored(20), found)
-    draw = LongTermMemory.draw
+    refresh = LongTermMemory.refresh
 
     def counted(memory, *arguments):
         seen.append(torch.get_num_threads())
         if error is not None:
             raise error("stop")
-        return draw(memory, *arguments)
+        return refresh(memory, *arguments)
 
-    monkeypatch.setattr(LongTermMemory, "draw", counted)
+    monkeypatch.setattr(LongTermMemory, "refresh", counted)
     torch.set_num_threads(2)
     try:
         with pytest.raises(KeyboardInterrupt) if error is KeyboardInterrupt else contextlib.nullcontext():

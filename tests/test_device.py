@@ -13,12 +13,10 @@ from torch.utils._pytree import tree_leaves
 
 from rt_torchrl.contract.check import check_plant
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.increments import Increments, greatest_increments
 from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.tensor_file import load_tensors, save_tensors
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.learners.config import IncrementalTD3Config
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -36,11 +34,6 @@ ESTIMATED = AssimilationConfig(
 WINDOWS = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=3, critic_iterations=1))
 NEURAL = {"closure": "mlp", "closure_hidden": (4,), "model_free_policy": "mlp", "hidden": (4,)}
 TD3 = dataclasses.replace(SMALL.learner, algorithm="td3", critic_iterations=2, actor_iterations=1)
-
-# The trust from the start lets the twin teach in the first update; then a paired difference measures it.
-INCREMENTAL = dataclasses.replace(
-    TD3, algorithm="incremental_td3", return_steps=6, incremental=IncrementalTD3Config(trust=0.5, virtual=4)
-)
 
 
 @pytest.fixture
@@ -67,22 +60,6 @@ def train(tmp_path, monkeypatch):
 
 def test_real_system_short_horizon_and_td3(train):
     assert not train("pendulum", horizon=0.5, twinning={"planner": WINDOWS, "learner": TD3})
-
-
-def test_increments_are_asked_of_a_plant_elsewhere():
-    with pretend_device() as device:
-        plant = WindTurbine(horizon=5.0)
-        expected = greatest_increments(plant).tolist()
-        found = greatest_increments(plant.to(device))
-        assert found.device == device and found.tolist() == expected
-        assert all(part.device == device for part in Increments(plant, device=device).buffers())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("update", ["explicit", "torchrl"])
-def test_incremental_td3_with_a_twin_that_teaches(train, update):
-    learner = dataclasses.replace(INCREMENTAL, update=update)
-    assert not train("pendulum", horizon=0.5, twinning={"learner": learner})
 
 
 @pytest.mark.slow

@@ -38,8 +38,6 @@ from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, continued, control_cost
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
-from rt_torchrl.twinning.learners.config import IncrementalTD3Config
-from rt_torchrl.twinning.learners.incremental_td3 import IncrementalTD3
 
 WEAK, STRONG = [[0.1, 0.1]], [[4.0, 2.5]]
 
@@ -157,90 +155,6 @@ def test_sums_of_rewards_end_with_the_known_value_of_the_end():
         if ends:  # nothing is bootstrapped
             q = learner.critic(found["observation"][k : k + 1], found["action"][k : k + 1]).item()
             assert learner.td_errors(found[k : k + 1]).item() == pytest.approx(abs(summed - q), rel=1e-6)
-
-
-DISCOUNT, DECISIONS = 0.9, {"decisions": 5, "virtual": 30, "settled": 0.1}
-
-
-def incremental(plant, policy, *, trust=0.0, return_steps=4):
-    own = IncrementalTD3Config(trust=trust, **DECISIONS)
-    few = {"critic_iterations": 6, "critic_hidden": (8,), "batch_size": 8}
-    config = LearnerConfig(
-        algorithm="incremental_td3", return_steps=return_steps, discount=DISCOUNT, incremental=own, **few
-    )
-    learner = make_learner(plant, policy, config, generator=torch.Generator().manual_seed(0))
-    assert isinstance(learner, IncrementalTD3) and learner.memory.intervals == 2
-    return learner
-
-
-def for_ever(first, plant):
-    """The discounted sum of rewards that go on as at the end."""
-    return sum(DISCOUNT**j * reward for j, reward in enumerate([*first, *[-plant.end_cost] * 3000]))
-
-
-def test_decisions_before_an_end_know_what_it_costs():
-    plant, policy = Falling(), LinearGain(WEAK)
-    learner = incremental(plant, policy)
-    episode = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, policy), plant).rollout()[0]
-    learner.store(episode)
-    (found,) = learner.memory.transitions(2, recent=1, reward_scale=0.5)
-    n, rewards = len(episode), episode["next", "reward"].flatten().tolist()
-    assert found["place"].tolist() == list(range(n))  # up to the end, and not only as far as a transition fits
-    action, centre = episode["action"], learner.increments.centre(episode["state"])
-    for k in range(n):
-        ends = k + 4 >= n
-        summed = for_ever(rewards[k:], plant) if ends else sum(DISCOUNT**j * rewards[k + j] for j in range(4))
-        assert found["next", "reward"][k].item() == pytest.approx(0.5 * summed, rel=1e-12)
-        assert found["next", "discount"][k].item() == pytest.approx(0.0 if ends else DISCOUNT**4, rel=1e-12)
-        taken = learner.increments.scaled(centre[k], action[k : k + 2].mean(0)).clamp(-1.0, 1.0)
-        torch.testing.assert_close(found["action"][k], taken, rtol=1e-12, atol=1e-14)
-    whole = (sum(map(abs, rewards)) + (plant.n_steps - n) * plant.end_cost) / plant.n_steps
-    assert learner.memory.cost() == pytest.approx(whole, rel=1e-12)
-
-
-def test_a_twin_that_falls_teaches_what_its_end_costs():
-    plant, policy = Falling(noise=0.0), LinearGain([[-3.0, -2.0]])  # it pushes the rod over
-    learner = incremental(plant, policy, trust=1.0, return_steps=20)
-    learner.take_twin(DigitalTwin(plant, LinearClosure(plant.true_closure)))
-    short = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, policy), plant).rollout()[0]
-    learner.store(short[-15:])
-    given = {"reward_scale": 1.0, "generator": torch.Generator().manual_seed(0)}
-    assert learner.teacher().transitions(30, 10, **given) is None  # no 20 intervals in a row
-    held = EpisodeCollector(PlantEnv(plant, seed=1), actor_of(plant, LinearGain(STRONG)), plant).rollout()[0]
-    learner.store(held)
-    found = learner.teacher().transitions(30, 10, **given)
-    assert len(found) == 30 and len(held) == plant.n_steps
-    for k, total, discount in zip(found["place"], found["next", "reward"], found["next", "discount"], strict=True):
-        state, rewards = held["state"][k], []
-        for j in range(20):
-            t, z = (k + j).double() * plant.dt, held["exogenous"][k + j]
-            action = held["action"][k + j] if j < 2 else policy(state)
-            rewards.append(-plant.running_cost(t, state, action, z).item())
-            state = plant.step(t, state, action, z, plant.closure).state
-            if abs(state[0]) > plant.reach:
-                break
-        over = abs(state[0]) > plant.reach
-        expected = for_ever(rewards, plant) if over else sum(DISCOUNT**j * r for j, r in enumerate(rewards))
-        assert total.item() == pytest.approx(expected, rel=1e-9)
-        assert discount.item() == pytest.approx(0.0 if over else DISCOUNT**20, rel=1e-12)
-    assert 0 < (found["next", "discount"] == 0.0).sum() < 30
-
-
-@pytest.mark.parametrize("update", ["explicit", "torchrl"])
-def test_incremental_td3_learns_from_episodes_that_end(update):
-    plant = Falling(noise=0.01)
-    own = IncrementalTD3Config(trust=0.5, **DECISIONS)
-    learner = LearnerConfig(
-        algorithm="incremental_td3", critic_iterations=20, return_steps=4, discount=DISCOUNT, critic_hidden=(8,),
-        incremental=own, update=update,
-    )  # fmt: skip
-    found = algorithm(PlantEnv(plant, seed=1), plant, dataclasses.replace(SMALL, learner=learner))
-    reports = [found.episode() for _ in range(2)]
-    assert reports[0]["ended_after"] < plant.n_steps
-    assert all(report[key].isfinite() for report in reports for key in ("critic_loss", "td_error", "real_cost"))
-    other = algorithm(PlantEnv(plant, seed=1), plant, dataclasses.replace(SMALL, learner=learner))
-    other.load_state_dict(found.state_dict())
-    assert [other.learner.memory.over(one) for one in other.learner.memory.episodes] == [True, True]
 
 
 def test_windows_count_what_an_end_costs():

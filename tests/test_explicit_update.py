@@ -14,11 +14,11 @@ from torch.utils._pytree import tree_flatten_with_path
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, mlp
 from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
-from rt_torchrl.twinning.learners import DDPG, LearnerConfig, make_learner
-from rt_torchrl.twinning.learners.explicit import choice, row_function
-from rt_torchrl.twinning.learners.explicit.adam import AdamSteps
-from rt_torchrl.twinning.learners.explicit.critic_formulas import Ascent, CriticShape, TemporalDifferences
-from rt_torchrl.twinning.learners.explicit.perceptron import Perceptron
+from rt_torchrl.twinning.learners import DDPG, LearnerConfig, ddpg, make_learner
+from rt_torchrl.twinning.learners.explicit import formulas
+from rt_torchrl.twinning.learners.explicit.formulas import Ascent, CriticShape, RowFunction, TemporalDifferences
+from rt_torchrl.twinning.learners.explicit.iterations import AdamSteps
+from rt_torchrl.twinning.learners.explicit.policies import Perceptron
 from rt_torchrl.twinning.learners.long_term_memory import LongTermMemoryConfig
 
 PLANT = LinearQuadratic()
@@ -56,8 +56,8 @@ OPTIONS = {
 }
 
 
-def learner(update, algorithm="ddpg", policy="affine", **options):
-    config = LearnerConfig(algorithm=algorithm, update=update, **OPTIONS | options)
+def learner(update, policy="affine", **options):
+    config = LearnerConfig(update=update, **OPTIONS | options)
     found = make_learner(PLANT, POLICIES[policy](), config, generator=seeded(3))
     generator = seeded(4)
     for seed in range(2):
@@ -86,11 +86,8 @@ def leaves(state):
 
 @pytest.mark.parametrize("return_steps", [1, 10])
 @pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
-def test_three_updates_give_the_weights_moments_and_priorities_of_torchrl(algorithm, policy, return_steps):
-    expected, found = (
-        learner(update, algorithm, policy, return_steps=return_steps) for update in ("torchrl", "explicit")
-    )
+def test_three_updates_give_the_weights_moments_and_priorities_of_torchrl(policy, return_steps):
+    expected, found = (learner(update, policy, return_steps=return_steps) for update in ("torchrl", "explicit"))
     start = copy.deepcopy(expected.policy.state_dict())
     for _ in range(3):
         reports = [each.update() for each in (expected, found)]
@@ -100,21 +97,19 @@ def test_three_updates_give_the_weights_moments_and_priorities_of_torchrl(algori
 
 
 @pytest.mark.parametrize("options", [{"prioritisation": 0.0}, {"correction": 0.0}, {"capacity": 200}])
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
-def test_every_kind_of_memory_and_an_unlimited_gradient(algorithm, options):
+def test_every_kind_of_memory_and_an_unlimited_gradient(options):
     options = {"memory": LongTermMemoryConfig(**options), "gradient_limit": float("inf")}
-    expected, found = (learner(update, algorithm, **options) for update in ("torchrl", "explicit"))
+    expected, found = (learner(update, **options) for update in ("torchrl", "explicit"))
     for each in (expected, found):
         each.update()
     assert_same(whole(expected), whole(found))
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
-def test_one_way_goes_on_from_the_state_of_the_other(algorithm):
-    found, other = learner("explicit", algorithm), learner("torchrl", algorithm)
+def test_one_way_goes_on_from_the_state_of_the_other():
+    found, other = learner("explicit"), learner("torchrl")
     for each in (found, other):
         each.update()
-    again = learner("explicit", algorithm)
+    again = learner("explicit")
     again.policy.load_state_dict(other.policy.state_dict())
     again.load_state_dict(copy.deepcopy(other.state_dict()))
     for each in (found, again):
@@ -123,10 +118,9 @@ def test_one_way_goes_on_from_the_state_of_the_other(algorithm):
     assert_same(whole(found), whole(again))
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
-def test_torch_takes_the_place_of_machine_code(monkeypatch, algorithm):
-    monkeypatch.setattr(row_function, "LEAST_LANES", 99)
-    expected, found = (learner(update, algorithm, batch_size=27) for update in ("torchrl", "explicit"))
+def test_torch_takes_the_place_of_machine_code(monkeypatch):
+    monkeypatch.setattr(formulas, "LEAST_LANES", 99)
+    expected, found = (learner(update, batch_size=27) for update in ("torchrl", "explicit"))
     for each in (expected, found):
         each.update()
     assert_same(whole(expected), whole(found))
@@ -134,38 +128,30 @@ def test_torch_takes_the_place_of_machine_code(monkeypatch, algorithm):
 
 @pytest.mark.parametrize("lanes", [Lanes(2, "b"), Lanes(4, "d"), Lanes(8, "e")])
 @pytest.mark.parametrize("hidden", [(), (6,), (40, 30)])
-@pytest.mark.parametrize("members", [1, 2])
-def test_machine_code_of_an_iteration_gives_what_autograd_gives(monkeypatch, lanes, hidden, members):
+def test_machine_code_of_an_iteration_gives_what_autograd_gives(monkeypatch, lanes, hidden):
     here = lanes_of_this_machine()
     if lanes.number > here.number or (lanes.number < here.number and here.variant == "n"):
         pytest.skip(f"this processor has {here.number} lanes")
-    monkeypatch.setattr(row_function, "lanes_of_this_machine", lambda: lanes)
-    monkeypatch.setattr(row_function, "LEAST_LANES", 2)
+    monkeypatch.setattr(formulas, "lanes_of_this_machine", lambda: lanes)
+    monkeypatch.setattr(formulas, "LEAST_LANES", 2)
     shape, generator = CriticShape(3, 2, hidden), seeded()
-    networks = [mlp(5, hidden, 1, generator=generator, activation=nn.SiLU) for _ in range(2 * members)]
+    network, target = (mlp(5, hidden, 1, generator=generator, activation=nn.SiLU) for _ in range(2))
     rows = torch.randn(13, 13, generator=generator, dtype=torch.float64)
-    weights = torch.cat([w.detach().flatten() for network in networks for w in network.parameters()])
+    weights = torch.cat([w.detach().flatten() for each in (network, target) for w in each.parameters()])
     x, following, reward, discount, share = rows.split([5, 5, 1, 1, 1], -1)
-    with torch.no_grad():
-        target = reward + discount * torch.cat([network(following) for network in networks[members:]], -1).amin(
-            -1, True
-        )
-    expected = []
-    for network in networks[:members]:
-        outputs = list(itertools.accumulate(network, lambda h, module: module(h), initial=x.clone().requires_grad_()))
-        error = outputs[-1] - target
-        found = torch.autograd.grad((share * error**2).sum(), [error, *outputs[1:-1:2]])
-        expected += [error, found[0], *outputs[2::2], *found[1:]]
-    learning = row_function.RowFunction(TemporalDifferences(shape, members), len(rows), weights)
+    outputs = list(itertools.accumulate(network, lambda h, module: module(h), initial=x.clone().requires_grad_()))
+    error = outputs[-1] - (reward + discount * target(following)).detach()
+    slopes = torch.autograd.grad((share * error**2).sum(), [error, *outputs[1:-1:2]])
+    learning = RowFunction(TemporalDifferences(shape), len(rows), weights)
     learning.rows.copy_(rows.t())
     learning(weights)
-    for one, other in zip(learning.results, expected, strict=True):
+    for one, other in zip(learning.results, [error, slopes[0], *outputs[2::2], *slopes[1:]], strict=True):
         torch.testing.assert_close(one.t(), other)
-    climbing = row_function.RowFunction(Ascent(shape), len(rows), weights)
+    climbing = RowFunction(Ascent(shape), len(rows), weights)
     climbing.rows.copy_(torch.cat([x, share], -1).t())
     climbing(weights)
     x = x.clone().requires_grad_()
-    value = share * networks[0](x)
+    value = share * network(x)
     torch.testing.assert_close(climbing.results[0].t(), value)
     torch.testing.assert_close(-climbing.results[1].t(), torch.autograd.grad(value.sum(), x)[0][:, 3:])
 
@@ -227,7 +213,7 @@ class OwnCritic(DDPG):
     "kind, reason", [(OwnLoss, "OwnLoss has its own critic_loss"), (OwnCritic, "no Critic of SiLU")]
 )
 def test_what_the_formulas_do_not_hold_for_goes_torchrls_way_and_says_so_once(monkeypatch, kind, reason):
-    monkeypatch.setattr(choice, "TOLD", set())
+    monkeypatch.setattr(ddpg, "TOLD", set())
     states = []
     for update in ("explicit", "torchrl"):
         found = kind(PLANT, POLICIES["affine"](), LearnerConfig(update=update, **OPTIONS), generator=seeded(3))
@@ -251,12 +237,11 @@ def cpu_seconds(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
-def test_the_formulas_take_less_than_half_the_time(algorithm):
+def test_the_formulas_take_less_than_half_the_time():
     """Measured on a core without other work: a fifth for DDPG."""
     sizes = {"critic_hidden": (64, 64), "batch_size": 128, "critic_iterations": 200, "actor_iterations": 200}
     torch.set_num_threads(1)
-    both = [learner(update, algorithm, **sizes) for update in ("torchrl", "explicit")]
+    both = [learner(update, **sizes) for update in ("torchrl", "explicit")]
     times = [[cpu_seconds(each) for each in both] for _ in range(4)][1:]
-    print(algorithm, "CPU seconds of an update, TorchRL and formulas:", times)
+    print("CPU seconds of an update, TorchRL and formulas:", times)
     assert sum(one for one, _ in times) > 2.0 * sum(other for _, other in times)

@@ -77,7 +77,7 @@ def test_a_plan_from_other_weights_that_flights_refute_is_refused(approach, evid
 @pytest.mark.parametrize(("evidence", "kept"), [(None, 2.0), (REFUTED, 3.0)])
 def test_an_update_that_flights_refute_is_taken_back(evidence, kept):
     learner = Hasty(LinearGain([[3.0, 0.0]]))
-    learning = Learning(learner, REFUTED.virtual, taught=False)
+    learning = Learning(learner, REFUTED.virtual)
     learning.update()
     report = learning.judge(EPISODES, judgement(evidence))
     assert said(learner.policy) == kept and report["update_accepted"] == float(evidence is None)
@@ -87,7 +87,7 @@ def test_an_update_that_flights_refute_is_taken_back(evidence, kept):
 def test_an_update_that_was_taken_back_is_judged_again_where_the_step_is_repeated(evidence, kept):
     """With another closure, of which the flights may say something else."""
     learner = Hasty(LinearGain([[3.0, 0.0]]))
-    learning = Learning(learner, REFUTED.virtual, taught=False)
+    learning = Learning(learner, REFUTED.virtual)
     learning.update()
     assert learning.judge(EPISODES, judgement(REFUTED))["update_accepted"] == 0.0
     report = learning.judge(EPISODES, judgement(evidence))
@@ -101,7 +101,7 @@ def test_an_unsound_twin_leaves_the_update_to_another_closure(sound, monkeypatch
     monkeypatch.setattr(virtual, "cost", lambda policy, episodes: torch.tensor(math.inf), raising=False)
     given = Judgement(lambda cost, than: not cost < than, TrackRecord({}))
     monkeypatch.setattr(given.track_record, "policy_flown", lambda: LinearGain([[1.0, 0.0]]))
-    learning = Learning(learner, virtual, taught=False)
+    learning = Learning(learner, virtual)
     learning.update()
     if sound:
         monkeypatch.setattr(virtual, "cost", lambda policy, _: torch.tensor(math.inf if said(policy) > 1.0 else 1.0))

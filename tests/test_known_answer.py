@@ -8,9 +8,7 @@ from linear_quadratic import LinearGain
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import root
 
-from rt_torchrl import IncrementalTD3Config
 from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -18,18 +16,8 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import LearnerConfig
 
-SEEDS = 0, 1, 2
-EPISODES = 20
 # All else, prioritised replay among it, is the library's default; so is the recipe of the wind turbine.
 LEARNER = LearnerConfig(return_steps=10)
-# One set of rates for all starts. A decision lasts one control interval, because the policy decides in each.
-INCREMENTAL = LearnerConfig(
-    algorithm="incremental_td3",
-    critic_iterations=1000,
-    critic_rate=3e-3,
-    discount=0.98,
-    incremental=IncrementalTD3Config(decisions=50, delay=6),
-)
 
 
 @pytest.fixture(scope="module")
@@ -83,44 +71,16 @@ def test_the_learners_discount_leaves_room(answer):
     assert found.success and 0.0 < answer.excess(found.x) < 0.02
 
 
-def half_alone(gain, *, seed, learner):
-    """The model-free half of the algorithm with both policies at a gain; its learner is chosen here."""
-    plant = HiddenForce()
-    return ReinforcementTwinning(
-        PlantEnv(plant, seed=1000 + seed),
-        DigitalTwin(plant, plant.closure),
-        model_free=LinearGain(gain),
-        model_based=LinearGain(gain),
-        config=TwinningConfig(arm="model_free", learner=learner, exploration=ExplorationConfig(least=0.2)),
-        generator=torch.Generator().manual_seed(seed),
-    )
-
-
-def excesses(answer, share, seed, episodes=EPISODES, learner=INCREMENTAL):
-    """J/J* − 1 in expectation after each episode of the half alone, started at a share of the optimal gain."""
-    found = half_alone(share * answer.gain, seed=seed, learner=learner)
-    for _ in range(episodes):
-        found.episode()
-        yield answer.excess(found.policies["model_free"].gain.detach().numpy())
-
-
-@pytest.mark.parametrize(
-    "episodes", [pytest.param(5, marks=pytest.mark.slow), pytest.param(EPISODES, marks=pytest.mark.nightly)]
-)
-def test_a_clone_of_the_optimum_stays_within_five_percent(answer, episodes):
-    for seed in SEEDS:
-        for episode, excess in enumerate(excesses(answer, 1.0, seed, episodes), start=1):
-            assert excess < 0.05, f"seed {seed}, episode {episode}"
-
-
 def test_ddpg_ruins_a_clone_of_the_optimum(answer):
-    """The paper's learner, which this is compared with: J/J* = 1.18 after one episode of seed 0."""
-    assert next(excesses(answer, 1.0, 0, learner=LEARNER)) > 0.1
-
-
-@pytest.mark.nightly
-def test_half_the_gain_comes_within_ten_percent(answer):
-    """Measured 8.4, 9.3 and 6.4 %, with the rates that hold a clone."""
-    for seed in SEEDS:
-        *_, excess = excesses(answer, 0.5, seed)
-        assert excess < 0.10, f"seed {seed}"
+    """The paper's learner with both policies at the optimal gain: J/J* = 1.18 in expectation after one episode."""
+    plant = HiddenForce()
+    found = ReinforcementTwinning(
+        PlantEnv(plant, seed=1000),
+        DigitalTwin(plant, plant.closure),
+        model_free=LinearGain(answer.gain.copy()),
+        model_based=LinearGain(answer.gain.copy()),
+        config=TwinningConfig(arm="model_free", learner=LEARNER),
+        generator=torch.Generator().manual_seed(0),
+    )
+    found.episode()
+    assert answer.excess(found.policies["model_free"].gain.detach().numpy()) > 0.1

@@ -127,7 +127,7 @@ def test_a_continuous_operation_begins_a_window_where_the_last_one_ended():
     plant = LinearQuadratic(horizon=1.0)
     policy = plant.make_policy(torch.Generator().manual_seed(0))
     found = operation_of(continuous=True)(plant, {"only": policy}, small(QUIET))
-    found.hand_over("only", policy, strength=0.0, episode=0)
+    found.hand_over("only", policy, strength=0.0)
     first, second = found.rollout(), found.rollout()
     assert torch.equal(first["next", "state"][:, -1], second["state"][:, 0])
 
@@ -147,9 +147,9 @@ def handed_over(plant, before, after, at, *, handover=20):
     """The commands of a window in which one constant policy takes over from another one."""
     policies = {"before": before, "after": after}
     operation = operation_of(learning=at - plant.n_steps, handover=handover)(plant, policies, small(QUIET))
-    operation.hand_over("before", before, strength=0.0, episode=0)
+    operation.hand_over("before", before, strength=0.0)
     operation.rollout()
-    operation.hand_over("after", after, strength=0.0, episode=0)
+    operation.hand_over("after", after, strength=0.0)
     return operation.rollout()[0]
 
 

@@ -132,7 +132,7 @@ def test_a_reset_that_fails_is_tried_again(tmp_path):
     with pytest.raises(EpisodeEndedError, match="failed in its reset: ConnectionError"):
         other = twinning(operation_of(learning=0, kind=Unreachable))
         other.operation = other.env
-        other.env.hand_over("model_free", other.policies["model_free"], strength=0.0, episode=0)
+        other.env.hand_over("model_free", other.policies["model_free"], strength=0.0)
         for _ in range(3):
             other.env.rollout()
 

@@ -66,9 +66,9 @@ def test_the_learner_has_a_thread_for_each_core_that_is_left(options, expected, 
 def test_a_policy_takes_over_in_the_other_process_without_a_bump():
     found, policies = operation(continuous=True)
     try:
-        found.hand_over("one", policies["one"], strength=0.0, episode=0)
+        found.hand_over("one", policies["one"], strength=0.0)
         found.rollout()
-        found.hand_over("two", policies["two"], strength=0.0, episode=0)
+        found.hand_over("two", policies["two"], strength=0.0)
         window = found.rollout()
         while window["version"].max() < 1:
             window = found.rollout()
@@ -86,7 +86,7 @@ def test_a_policy_takes_over_in_the_other_process_without_a_bump():
 def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_on():
     found, policies = operation(breaking)
     try:
-        found.hand_over("one", policies["one"], strength=0.0, episode=0)
+        found.hand_over("one", policies["one"], strength=0.0)
         assert found.rollout()["version"].eq(0).all()
         with pytest.raises(EpisodeEndedError, match="0.4 s: OSError: the sensor.s cable is cut") as raised:
             found.rollout()

@@ -81,7 +81,7 @@ def test_smoothing_is_drawn_from_the_learners_generator():
 
 @pytest.mark.parametrize("delay, policy_steps", [(1, 7), (2, 3), (3, 2)])
 def test_the_policy_and_the_targets_follow_with_their_delay(monkeypatch, delay, policy_steps):
-    options = {"critic_iterations": 7, "actor_iterations": 50, "update": "torchrl"}
+    options = {"critic_iterations": 7, "actor_iterations": 50}
     found, calls = learner(td3=TD3Config(delay=delay), **options), []
     filled(explored(10), found)
     for part, label in ((found.critic_optimiser, "q"), (found.actor_optimiser, "a"), (found.target, "t")):

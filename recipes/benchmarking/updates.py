@@ -1,4 +1,4 @@
-"""CPU time of an iteration of step 2, by formula and by TorchRL's losses, in one process."""
+"""CPU time of an iteration of step 2, by formula and by TorchRL's loss, in one process."""
 
 import dataclasses
 import statistics
@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from benchmarking import cores
 from rt_torchrl import Learner, PlantEnv
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
-from rt_torchrl.twinning.learners.choice import make_learner
+from rt_torchrl.twinning.learners import make_learner
 
 RECIPES = Path(__file__).resolve().parent.parent
 WAYS = ("explicit", "torchrl")

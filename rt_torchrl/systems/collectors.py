@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.environment import PlantEnv, ended_early
 from rt_torchrl.systems.exploration import LivePolicy
-from rt_torchrl.systems.redrawn_policy import RedrawnPolicy
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
@@ -159,8 +158,7 @@ class FlightCollector:
         env = self.env
         policy = self.actor.policy
         law = policy if isinstance(policy, Remembering) else None
-        parts = policy.draw_parts() if isinstance(policy, RedrawnPolicy) else []
-        if isinstance(policy, StateFeedback) and law is None and not parts:
+        if isinstance(policy, StateFeedback) and law is None:
             return self._by_steps.rollout()
         pass_over(env)
         env.reset()
@@ -174,13 +172,9 @@ class FlightCollector:
             felt = (start * factors[:, 0])[..., : len(plant.readings)]
             start = torch.cat([start, law.first_memory(felt)], -1)
         kind = ExploringInterval if law is None else ExploringController
-        carries, commands = [start.unsqueeze(0)], []
-        for part, first, last in parts or [(policy, 0, n)]:
-            held, interval = part_of(drive, first, last), kind(plant, closure, self.actor, part)
-            ends = self._engine.end_states(interval, carries[-1][-1], held)
-            commands.append(interval.command(torch.cat([carries[-1][-1:], ends[:-1]]), held))
-            carries.append(ends)
-        states, command = torch.cat(carries)[..., : len(plant.states)], torch.cat(commands)
+        interval = kind(plant, closure, self.actor, policy)
+        carries = torch.cat([start.unsqueeze(0), self._engine.end_states(interval, start, drive)])
+        states, command = carries[..., : len(plant.states)], interval.command(carries[:-1], drive)
         require_finite(plant, states[1:], initial_state, [closure, policy])
         return flown(plant, states, command, drive, factors.transpose(0, 1)).transpose(0, 1)
 
@@ -213,11 +207,6 @@ def pass_over(env: EnvBase) -> None:
         env.pass_over()
 
 
-def part_of(drive: Drive, first: int, last: int) -> Drive:
-    """The drive of the control intervals ``first`` to ``last`` − 1."""
-    return Drive(*(values[first:last] for values in drive))
-
-
 def flown(
     plant: Plant,
     states: Float[Tensor, "samples batch n_s"],
@@ -231,7 +220,12 @@ def flown(
     """
     ends = plant.ended(states[1:]).any(-1)
     n = int(ends.int().argmax()) + 1 if ends.any() else len(command)
-    states, command, drive, factors = states[: n + 1], command[:n], part_of(drive, 0, n), factors[: n + 1]
+    states, command, drive, factors = (
+        states[: n + 1],
+        command[:n],
+        Drive(*(values[:n] for values in drive)),
+        factors[: n + 1],
+    )
     over = ends[n - 1 : n].unsqueeze(-1)
     applied = plant.actuate(states[:-1], command)
     reward = -plant.running_cost(drive.t, states[:-1], applied, drive.exogenous)

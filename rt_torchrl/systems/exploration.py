@@ -11,7 +11,6 @@ from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.systems.redrawn_policy import RedrawnPolicy
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 
@@ -30,12 +29,6 @@ class ExplorationConfig:
         episodes: number of episodes until ξ is zero; with 0 no episode explores.
         correlation_time: correlation time τ of the noise [s]; 0 makes the noise new at each control interval, as in
             the paper.
-        least: least strength ξ, which stays after ``episodes``.
-        redrawn: number of first episodes in which the weights of the policy are drawn anew several times; they explore
-            states that noise on the actions of one policy does not reach.
-        draws: number of draws of the weights in such an episode.
-        weight_spread: standard deviation of such a draw around the policy's weights, for a matrix divided by the root
-            of its number of inputs.
 
     Raises:
         ValueError: if an option is not a number of its type, is negative or not finite.
@@ -44,22 +37,16 @@ class ExplorationConfig:
     spread: float = 0.2
     episodes: int = 5
     correlation_time: float = 0.0
-    least: float = 0.0
-    redrawn: int = 0
-    draws: int = 15
-    weight_spread: float = 1.0
 
     def __post_init__(self) -> None:
         check_options(self)
-        for argument in ("spread", "episodes", "correlation_time", "least", "redrawn", "weight_spread"):
+        for argument in ("spread", "episodes", "correlation_time"):
             if not getattr(self, argument) >= 0:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the exploration must not be negative.")
-        if self.draws < 1:
-            raise ValueError(f"draws={self.draws} of the weights in an episode must be at least 1.")
 
     def strength(self, episode: int) -> float:
         """ξ of an episode, counted from 0."""
-        return max(self.least, 1.0 - episode / self.episodes) if self.episodes else self.least
+        return max(0.0, 1.0 - episode / self.episodes) if self.episodes else 0.0
 
 
 class LivePolicy(nn.Module):
@@ -87,7 +74,7 @@ class LivePolicy(nn.Module):
         self._noise: Tensor | None = None
         self._scale = 0.5 * config.spread * (high - low)
         self._memory = math.exp(-plant.dt / config.correlation_time) if config.correlation_time else 0.0
-        self._generator, self._plant, self._config = generator, (plant,), config
+        self._generator, self._plant = generator, (plant,)
 
     @property
     def plant(self) -> Plant:
@@ -98,18 +85,6 @@ class LivePolicy(nn.Module):
     def generator(self) -> torch.Generator:
         """Source of the noise."""
         return self._generator
-
-    def exploring(self, policy: nn.Module, episode: int) -> nn.Module:
-        """What acts in an episode: a policy or, in the first ones if so configured, the policy with drawn weights.
-
-        Args:
-            policy: policy that is live; state feedback has no weights that could be drawn.
-            episode: number of the episode, from 0.
-        """
-        if episode >= self._config.redrawn or isinstance(policy, StateFeedback):
-            return policy
-        (plant,), parts, spread = self._plant, self._config.draws, self._config.weight_spread
-        return RedrawnPolicy(plant, policy, parts=parts, spread=spread, generator=self._generator)
 
     def begin(self, policy: nn.Module, *, strength: float) -> None:
         """Start an episode with the policy that is live now and ξ = ``strength``; state feedback gets ready for it."""

@@ -97,8 +97,8 @@ class ReinforcementTwinning:
         self.virtual.judge_by(getattr(self.planner, "constraints", None), config.planner.extremes)
         self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
-        self.learning = Learning(self.learner, self.virtual, taught=config.arm == "twinning")
-        self.planning = Planning(self.planner, self.virtual, config.planner, corrected=config.corrected_descents)
+        self.learning = Learning(self.learner, self.virtual)
+        self.planning = Planning(self.planner, self.virtual, config.planner)
         self.planning.scouts = Scouts(self.virtual, model_based, config.scouts, make_policy)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
@@ -168,16 +168,13 @@ class ReinforcementTwinning:
         if self.operating is not None:
             return self.operating.take(self.referee.live, self.episodes_done)
         live, strength = self.referee.live, self.config.exploration.strength(self.episodes_done)
-        self.learning.adopt(waiting := self.actor.exploring(self.policies[live], self.episodes_done))
         cleared = self.clearance.choose(live, self.judged)
-        acting, live = (waiting, live) if cleared.policy is self.policies[live] else (cleared.policy, cleared.role)
+        acting, live = cleared.policy, cleared.role
         flight = self.flights.fly(acting, strength=strength, whole=self.virtual.wanting(self.config.arm))
         self.keep(flight)
-        explored = self.actor.strength * self.config.exploration.spread if acting is cleared.policy else 1.0
+        explored = self.actor.strength * self.config.exploration.spread
         if flight.whole:  # costs of parts cannot be compared with those of episodes
-            self.track_record.append(flight.record, live, flight.cost.item(), explored, cleared.policy.state_dict())
-        flew = flight.whole and acting is waiting
-        self.learning.flown(acting, flight.cost.item()) if flew else self.learning.grounded(waiting)
+            self.track_record.append(flight.record, live, flight.cost.item(), explored, acting.state_dict())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
@@ -209,8 +206,7 @@ class ReinforcementTwinning:
 
     def examine(self) -> TensorDict:
         """Compare what the latest real episodes cost with what the twin says of them, and seek an explanation."""
-        found = self.examination.explained(self.assimilation, self.generator)
-        return merged(found, self.learning.trust(lambda: self.examination.judge(self.short_term[-1])))
+        return self.examination.explained(self.assimilation, self.generator)
 
     def plan(self) -> TensorDict:
         """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""

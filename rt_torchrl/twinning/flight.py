@@ -59,10 +59,10 @@ class Flight(NamedTuple):
         rewards, (count, each) = self.transitions["next", "reward"], self.after
         return -(rewards.sum() - count * each) / (len(rewards) + count)
 
-    def parts(self, dt: float) -> list[tuple[int, TensorDict]]:
-        """The transitions of all sound parts, in their order, each with the number of its first interval."""
+    def parts(self, dt: float) -> list[TensorDict]:
+        """The transitions of all sound parts, in their order."""
         first = round(float(self.record.start) / dt)
-        return sorted([(first, self.transitions), *self.others], key=lambda part: part[0])
+        return [part for _, part in sorted([(first, self.transitions), *self.others], key=lambda part: part[0])]
 
     @property
     def sound_intervals(self) -> int:

@@ -12,13 +12,9 @@ from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import as_findings, findings, merged, plain
 from rt_torchrl.twinning.flight import Flight, RealFlights, together
-from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
-
-NEVER = 2**31
-"""Number of an episode whose weights are not drawn anew."""
 
 
 @runtime_checkable
@@ -30,7 +26,6 @@ class Trainer(Protocol):
     flights: RealFlights
     config: TwinningConfig
     track_record: TrackRecord
-    learning: Learning
     virtual: VirtualEpisodes
 
     @property
@@ -57,7 +52,7 @@ class Operating:
 
     def fly_first(self, teacher: nn.Module) -> Flight:
         """One window under what the training begins with, which then acts on until the first policy takes over."""
-        self.operation.hand_over(FIRST, teacher, strength=0.0, episode=NEVER)
+        self.operation.hand_over(FIRST, teacher, strength=0.0)
         return self.trainer.flights.fly_first(teacher)
 
     def hand_over(self, role: Role, episode: int) -> None:
@@ -67,12 +62,9 @@ class Operating:
             role: role that is live.
             episode: number of the learner's episode, from 0.
         """
-        self.trainer.learning.adopt(live := self.trainer.policies[role])
         policy, role, report = self.trainer.clearance.choose(role, self.trainer.judged)
-        if policy is not live:
-            self.trainer.learning.grounded(live)
         strength = self._exploration.strength(episode)
-        self.operation.hand_over(role, policy, strength=strength, episode=episode, found=plain(report))
+        self.operation.hand_over(role, policy, strength=strength, found=plain(report))
 
     def take(self, live: Role, episode: int) -> TensorDict:
         """Take every window that has come in; wait until one is of a policy.
@@ -112,11 +104,8 @@ class Operating:
         if not flight.whole:
             return  # costs of parts cannot be compared with those of windows
         role, cost = cast(Role, order.name), flight.cost.item()
-        drawn = order.episode < self._exploration.redrawn
-        explored = 1.0 if drawn else order.strength * self._exploration.spread
+        explored = order.strength * self._exploration.spread
         self.trainer.track_record.append(flight.record, role, cost, explored, order.weights)
-        if order.version == max(self.operation.orders):
-            self.trainer.learning.flown(self.trainer.policies[role], cost)
 
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])

@@ -44,7 +44,6 @@ class Operation(Protocol):
         policy: nn.Module,
         *,
         strength: float,
-        episode: int,
         found: dict[str, float | str] | None = None,
     ) -> None:
         """Hand a policy over, which takes over while the system operates.
@@ -53,7 +52,6 @@ class Operation(Protocol):
             name: name of the policy: its role, or ``first``.
             policy: the policy, as it is now.
             strength: strength ξ of the exploration.
-            episode: number of the learner's episode.
             found: what was found about the policy before, by name.
         """
 

@@ -84,7 +84,7 @@ class Operator:
             order: the order.
             made: its policy, ready to act; None makes it.
         """
-        policy = self.actor.exploring(ready(order, self.policies) if made is None else made, order.episode)
+        policy = ready(order, self.policies) if made is None else made
         if self._order is not None and (self.continuous or self.interval % self.length):
             self.actor.hand_over(policy, strength=order.strength)
         else:

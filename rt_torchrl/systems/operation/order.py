@@ -20,7 +20,6 @@ class Order(NamedTuple):
         name: name of the policy, such as its role.
         weights: its weights.
         strength: strength ξ of the exploration.
-        episode: number of the learner's episode, which says whether weights are drawn anew.
         found: what was found about the policy before, such as ``predicted_violations``, by name.
     """
 
@@ -28,7 +27,6 @@ class Order(NamedTuple):
     name: str
     weights: dict[str, Tensor]
     strength: float
-    episode: int
     found: dict[str, float | str] | None = None
 
     @classmethod

@@ -86,14 +86,11 @@ class ProcessOperation:
         policy: nn.Module,
         *,
         strength: float,
-        episode: int,
         found: dict[str, float | str] | None = None,
     ) -> None:
         self._begin()
         self.version += 1
-        self.orders[self.version] = Order.of(
-            self.version, name, policy, strength=strength, episode=episode, found=found
-        )
+        self.orders[self.version] = Order.of(self.version, name, policy, strength=strength, found=found)
         self._send(self.orders[self.version])
         self.log.note("handed over", version=self.version)
 

@@ -72,16 +72,13 @@ class SimulatedOperation:
         policy: nn.Module,
         *,
         strength: float,
-        episode: int,
         found: dict[str, float | str] | None = None,
     ) -> None:
         if self.begun:
             self._now += self._learning
         self.version += 1
         at = self._now if self._starts is None else self._starts.get(self.version, math.inf)
-        self.orders[self.version] = Order.of(
-            self.version, name, policy, strength=strength, episode=episode, found=found
-        )
+        self.orders[self.version] = Order.of(self.version, name, policy, strength=strength, found=found)
         self._at[self.version] = at
         self.log.note("handed over", version=self.version)
 

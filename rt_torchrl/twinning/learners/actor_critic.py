@@ -3,7 +3,7 @@
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -52,6 +52,23 @@ class Critic(nn.Module):
         self, observation: Float[Tensor, "*batch n_o"], action: Float[Tensor, "*batch n_a"]
     ) -> Float[Tensor, "*batch 1"]:
         return self.network(torch.cat([observation, (action - self.middle) / self.half_range], -1))
+
+
+@runtime_checkable
+class Iterations(Protocol):
+    """The parts of one update: TorchRL's losses, or the formulas of ``learners/explicit``."""
+
+    def critic_step(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Take one iteration of the critics; return loss, mean |δ| and the gradient norm."""
+
+    def move_targets(self) -> None:
+        """Let the targets follow."""
+
+    def batches(self, count: int) -> Iterator[Any]:
+        """Draw batches for :meth:`actor_step`."""
+
+    def actor_step(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Take one iteration of the policy; return the mean value and the gradient norm."""
 
 
 class ActorCritic(ABC):

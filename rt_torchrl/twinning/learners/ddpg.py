@@ -1,14 +1,21 @@
 """Deep deterministic policy gradient, the paper's step 2, from TorchRL's parts."""
 
+import warnings
+
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.twinning.learners.actor_critic import ActorCritic, Critic, means
-from rt_torchrl.twinning.learners.explicit.choice import iterations_of
-from rt_torchrl.twinning.learners.explicit.ddpg import ExplicitDDPG
+from rt_torchrl.twinning.learners.actor_critic import ActorCritic, Critic, Iterations, means
+from rt_torchrl.twinning.learners.explicit.iterations import ExplicitDDPG
+from rt_torchrl.twinning.learners.explicit.policies import activation_of
+
+COVERED = ("make_loss", "critic_loss", "actor_loss", "critic_step", "actor_step", "batches", "move_targets")
+"""The methods whose computations the formulas replace."""
+TOLD: set[str] = set()
+"""The obstacles of which a notice has been given."""
 
 
 class DDPG(ActorCritic):
@@ -61,9 +68,34 @@ class DDPG(ActorCritic):
         return self.sound(self._iterate)
 
     def _iterate(self) -> TensorDict:
-        iterations, critic = iterations_of(self, DDPG, ExplicitDDPG), []
+        iterations, critic = self._iterations(), []
         for _ in range(self.config.critic_iterations):
             critic.append(iterations.critic_step())
             iterations.move_targets()
         actor = [iterations.actor_step(batch) for batch in iterations.batches(self.config.actor_iterations)]
         return means(critic, actor, self.config.reward_scale)
+
+    def _iterations(self) -> Iterations:
+        """The iterations of an update: by formula where the formulas hold, else those of TorchRL's loss."""
+        if self.config.update == "torchrl":
+            return self
+        found = self._obstacle()
+        if found is None:
+            return ExplicitDDPG(self)
+        if found not in TOLD:
+            TOLD.add(found)
+            warnings.warn(f"Step 2 uses TorchRL's losses, which are slower, because {found}.", stacklevel=3)
+        return self
+
+    def _obstacle(self) -> str | None:
+        """Why the formulas do not hold for a learner; None if they do."""
+        own = type(self)
+        changed = [name for name in COVERED if getattr(own, name) is not getattr(DDPG, name)]
+        if changed:
+            return f"{own.__name__} has its own {' and '.join(changed)}"
+        for critic in self.critics:
+            if type(critic) is not Critic or activation_of(critic.network) is not nn.SiLU:
+                return f"the critic {type(critic).__name__} is no Critic of SiLU layers"
+            if not all(weight.requires_grad for weight in critic.parameters()):
+                return f"some weights of the critic {type(critic).__name__} are frozen"
+        return None

@@ -1,10 +1,16 @@
-"""The protocol of a learner, the model-free method of step 2."""
+"""The learners of step 2: their protocol, and those that a configuration can name."""
 
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.twinning.learners.config import LearnerConfig, LearnerName
+from rt_torchrl.twinning.learners.ddpg import DDPG
+from rt_torchrl.twinning.learners.td3 import TD3
 
 
 @runtime_checkable
@@ -42,3 +48,11 @@ class Learner(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of a learner with the same configuration."""
+
+
+LEARNERS: dict[LearnerName, type[DDPG] | type[TD3]] = {"ddpg": DDPG, "td3": TD3}
+
+
+def make_learner(plant: Plant, policy: nn.Module, config: LearnerConfig, *, generator: torch.Generator) -> Learner:
+    """The learner that a configuration names; :class:`ActorCritic` describes the arguments."""
+    return LEARNERS[config.algorithm](plant, policy, config, generator=generator)

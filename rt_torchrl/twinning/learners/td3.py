@@ -9,8 +9,6 @@ from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.twinning.learners.actor_critic import ActorCritic, Critic, means
-from rt_torchrl.twinning.learners.explicit.choice import iterations_of
-from rt_torchrl.twinning.learners.explicit.td3 import ExplicitTD3
 
 CRITICS = 2
 
@@ -77,10 +75,10 @@ class TD3(ActorCritic):
         return self.sound(self._iterate)
 
     def _iterate(self) -> TensorDict:
-        iterations, critic, actor = iterations_of(self, TD3, ExplicitTD3), [], []
+        critic, actor = [], []
         for iteration in range(1, self.config.critic_iterations + 1):
-            critic.append(iterations.critic_step())
+            critic.append(self.critic_step())
             if iteration % self.config.td3.delay == 0:
-                actor += [iterations.actor_step(batch) for batch in iterations.batches(1)]
-                iterations.move_targets()
+                actor += [self.actor_step(batch) for batch in self.batches(1)]
+                self.move_targets()
         return means(critic, actor, self.config.reward_scale)
