@@ -2,7 +2,7 @@
 
 # Plants and their parts
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
-from .plants.disturbance import require_request
+from .plants.sampling import require_request
 from .plants.extensions.actuator_coefficients import ActuatorCoefficients
 from .plants.extensions.biased_sensor import BiasedSensor
 from .plants.extensions.delayed_actuator import DelayedActuator
@@ -15,10 +15,10 @@ from .plants.extensions.scaled_actuator import ScaledActuator
 from .plants.extensions.scaled_coefficients import ScaledCoefficients
 from .plants.extensions.slow_actuator import SlowActuator
 from .plants.extensions.unread_input import UnreadInput
-from .plants.integrators import rk4_step
-from .plants.measurement import Component, Measurement, Phase, Preview
+from .plants.sampling import rk4_step
+from .plants.signal import Component, Measurement, Phase, Preview
 from .plants.plant import Plant, Transition
-from .plants.stability import require_stable_step
+from .plants.sampling import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.signal import Signal
 from .contract import ContractReport, PlantContractError, check_plant

@@ -10,7 +10,7 @@ from rt_torchrl import Rollout, SaturatedAffine, SaturatedMLP, check_plant, cont
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import rosco_turbine
-from rt_torchrl.plants.measurement import Component, Measurement, Preview
+from rt_torchrl.plants.signal import Component, Measurement, Preview
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig

@@ -23,7 +23,7 @@ from rt_torchrl import (
     check_plant,
 )
 from rt_torchrl.control.check import require_controller
-from rt_torchrl.plants.discrepancy import Discrepancy
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.results_table import next_steps
 from rt_torchrl.runs.run import Run
@@ -43,13 +43,14 @@ def test_coefficients_are_the_same_for_all_features_by_default():
     torch.testing.assert_close(found, torch.tensor([40.0, 35.0]).double().expand(3, 4, 2))
 
 
-class Turning(Discrepancy):
+class Turning(LinearQuadratic):
     name = "turning"
     states = (
         Signal(symbol="x", name="position", unit="m"),
         Signal(symbol="a", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
     )
     state_sizes = (2.0, 0.5)
+    discrepancy = Plant.discrepancy
 
 
 def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way():

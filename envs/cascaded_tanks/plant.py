@@ -7,9 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics, ramp
-from rt_torchrl.plants.measurement import Component, Measurement
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Component, Measurement, Signal
 
 STATES = (
     Signal(symbol="h_1", name="upper_level", unit="V"),

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Component, Measurement, Signal
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank

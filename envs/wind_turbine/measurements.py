@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement, Preview
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Component, Measurement, Preview, Signal
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine

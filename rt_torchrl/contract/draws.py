@@ -6,7 +6,6 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.plants.innermost import innermost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -122,7 +121,7 @@ def modules(plant: Plant, seed: int) -> Iterator[str]:
 def neural_closure_of(plant: Plant) -> Callable[[torch.Generator], nn.Module] | None:
     """What makes the neural closure of a plant, a small one; None if the plant defines none."""
     # An extension has the closures of its plant.
-    if type(innermost(plant)).make_neural_closure is Plant.make_neural_closure:
+    if type(plant.innermost).make_neural_closure is Plant.make_neural_closure:
         return None
     return partial(plant.make_neural_closure, hidden=(4,))
 

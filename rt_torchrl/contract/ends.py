@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import torch
 
 from rt_torchrl.contract.calls import Calls
-from rt_torchrl.plants.ending import require_end_cost
+from rt_torchrl.plants.plant import require_end_cost
 
 
 @torch.no_grad()

@@ -8,9 +8,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.fit.sensor_record import SensorRecord
 from rt_torchrl.fit.sensors import Sensor
-from rt_torchrl.plants.measurement import Component
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import differences
+from rt_torchrl.plants.signal import Component, differences
 
 FIRST_NOISE = 0.1
 """First guess of an unknown noise level, as a share of the scatter of the readings."""

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement, Named, Preview
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Component, Measurement, Named, Preview
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.fit.sensor_log import SensorLog, logged_states
-from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sampling import rk4_step
 
 Law = Callable[[Float[Tensor, ""], Float[Tensor, "1 n_s"], Float[Tensor, "1 n_z"]], Float[Tensor, "1 n_a"]]
 """A control law: a function from time [s], state and exogenous input to a command. It may have a memory."""

@@ -10,7 +10,7 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.state_bounds import StateBounds
+from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
@@ -86,5 +86,5 @@ def judged_on(
     else:
         unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
     physics = twin.plant
-    unseen.physics, unseen.bounds = physics, StateBounds(plant, config.twinning.bounded_states)
+    unseen.physics, unseen.bounds = physics, StateBounds(plant.readings, config.twinning.bounded_states)
     return unseen

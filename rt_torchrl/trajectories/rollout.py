@@ -19,8 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.plants.ending import final_cost
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, final_cost
 from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.purity import require_pure_once

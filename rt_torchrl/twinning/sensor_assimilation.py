@@ -13,8 +13,8 @@ from rt_torchrl.fit.sensors import Sensor, sensors_of, with_biases
 from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
-from rt_torchrl.plants.measurement import Component
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Component
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig

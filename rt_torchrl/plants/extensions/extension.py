@@ -96,6 +96,10 @@ class Extension(Plant):
         self.controller_states, self.end_cost = base.controller_states, base.end_cost
         self._fresh = None if own is None else own.fresh
 
+    @property
+    def innermost(self) -> Plant:
+        return self.base.innermost
+
     # The additional dynamics
 
     def respond(

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from rt_torchrl.options import quoted
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.extensions.extension import Extension, OwnParameters
-from rt_torchrl.plants.innermost import innermost
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -147,7 +146,7 @@ class NeuralResidual(Extension):
 
 def _bounds(base: Plant, greatest: Mapping[str, float]) -> list[float]:
     """Greatest residual of each state that has one [state unit / s]."""
-    names, inner = [state.name for state in base.readings], innermost(base)
+    names, inner = [state.name for state in base.readings], base.innermost
     sizes = dict(zip((state.name for state in inner.states), inner.state_sizes, strict=False))
     if not greatest:
         raise ValueError(f"greatest names no state of plant {base.name!r}; choose some of {quoted(names)}.")

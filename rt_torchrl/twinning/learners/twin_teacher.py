@@ -6,7 +6,7 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.plants.ending import flight_costs
+from rt_torchrl.plants.plant import flight_costs
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
