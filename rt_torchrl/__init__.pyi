@@ -1,26 +1,16 @@
 """The public names of the library; ``__init__.py`` imports each at its first use, from the module named here."""
 
 # Plants and their parts
+from .plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
-from .plants.sampling import require_request
-from .plants.extensions.actuator_coefficients import ActuatorCoefficients
-from .plants.extensions.biased_sensor import BiasedSensor
-from .plants.extensions.delayed_actuator import DelayedActuator
-from .plants.extensions.extension import ExtendedClosure, Extension, OwnParameters
-from .plants.extensions.lagged_actuator import LaggedActuator
-from .plants.extensions.lagged_coefficients import LaggedCoefficients
-from .plants.extensions.neural_residual import NeuralResidual
-from .plants.extensions.resonant_actuator import ResonantActuator
-from .plants.extensions.scaled_actuator import ScaledActuator
-from .plants.extensions.scaled_coefficients import ScaledCoefficients
-from .plants.extensions.slow_actuator import SlowActuator
-from .plants.extensions.unread_input import UnreadInput
-from .plants.sampling import rk4_step
-from .plants.signal import Component, Measurement, Phase, Preview
+from .plants.coefficients import LaggedCoefficients, ScaledCoefficients
+from .plants.extension import ExtendedClosure, Extension
+from .plants.neural_residual import NeuralResidual
 from .plants.plant import Plant, Transition
-from .plants.sampling import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
-from .plants.signal import Signal
+from .plants.sampling import require_request, require_stable_step, rk4_step
+from .plants.sensors import BiasedSensor, UnreadInput
+from .plants.signal import Component, Measurement, Phase, Preview, Signal
 from .contract import ContractReport, PlantContractError, check_plant
 from .control.acting import ActingController
 from .control.classical import ClassicalController
@@ -121,7 +111,6 @@ __all__ = [
     "ActingController",
     "ActorCritic",
     "Actuation",
-    "ActuatorCoefficients",
     "AssimilationConfig",
     "BiasedSensor",
     "BoundedPerceptron",
@@ -184,7 +173,6 @@ __all__ = [
     "OperatingLimits",
     "OperatingLimitsConfig",
     "OperationConfig",
-    "OwnParameters",
     "Phase",
     "Planner",
     "PlannerConfig",
@@ -227,7 +215,6 @@ __all__ = [
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
-    "SlowActuator",
     "SmoothClip",
     "Snapshot",
     "Start",

@@ -210,13 +210,6 @@ class Stiff(LinearQuadratic):
     A = ((0.0, 1.0), (-1.0, -40.0))
 
 
-class Undeclared(LinearQuadratic):
-    """A plant that steps by a scheme of its own, and does not say so."""
-
-    def step(self, t, state, command, exogenous, closure):
-        return Transition(state + self.dt * self.vector_field(t, state, command, exogenous, closure), command)
-
-
 class Explosive(LinearQuadratic):
     A = ((5000.0, 1.0), (-1.0, 0.0))
 
@@ -308,7 +301,6 @@ BROKEN = {
     UnusedWeight: "vector_field: closure weight 'forgotten' changes it at none",
     ReverseOnly: "step: torch.func.jvp under vmap fails",
     Stiff: r"dt: 0.1 s is too long for the eigenvalue -39.* 1/s .*Use dt <= 0.0\d+ s",
-    Undeclared: "own_scheme: is False, but step is no Runge-Kutta step",
     Explosive: "step: plant 'linear_quadratic' diverged in realisation",
     Raising: "running_cost: raised KeyError in .*broken_plants.py",
     OwnSeed: "draw_exogenous: draws different episodes, but the same ones for generators of another seed",

@@ -13,7 +13,7 @@ from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOn
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
-from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
+from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import ROLES, judge
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation

@@ -12,8 +12,8 @@ from rt_torchrl import export_c, load_run
 from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum, mean_with_confidence
-from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
+from rt_torchrl.plants.actuators import ResonantActuator
+from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.calling_simulator import CallingSimulator

@@ -124,7 +124,6 @@ class CryogenicTank(Plant):
         require_sizes(error_sizes)
         self.load = CyclicLoad() if load is None else load
         self.wall, self.wall_heat_capacity = wall, float(wall_heat_capacity)
-        self.own_scheme = wall != "explicit" or type(self).advance is not CryogenicTank.advance
         self.command, self.actions = COMMANDS[command], (COMMANDS[command].signal,)
         self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)

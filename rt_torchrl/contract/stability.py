@@ -18,16 +18,10 @@ def stability(calls: Calls) -> Iterator[str]:
     r"""A violation if a mode that decays in the plant grows in a step: |R(μΔt)| ≤ 1 must hold where Re μ ≤ 0.
 
     R(z) = 1 + z + z²/2 + z³/6 + z⁴/24 reaches its limit at 2.785 on the negative real axis and at 2.83 on the imaginary
-    axis. A plant with a step of its own is not checked, because this R does not describe that step; it must say by
-    ``own_scheme`` that it has one.
+    axis. A plant with a scheme of its own is not checked, because this R does not describe that scheme.
     """
     plant, arguments = calls.plant, calls.some(MANY)
-    if not steps_by_runge_kutta(plant, arguments):
-        if not plant.own_scheme:
-            yield (
-                "own_scheme: is False, but step is no Runge-Kutta step of the vector field, by which the engine "
-                "odeint_adjoint and records would replace it; set own_scheme = True in the class."
-            )
+    if plant.own_scheme:
         return
     for whose, closure in (("the true closure", plant.closure), ("the closure of make_closure", calls.closure)):
         mu = torch.linalg.eigvals(jacobian(plant, closure, arguments))
@@ -43,14 +37,6 @@ def stability(calls: Calls) -> Iterator[str]:
                 f"{stable_step(worst, plant.dt):.3g} s, or treat that mode as settled at once."
             )
             return
-
-
-def steps_by_runge_kutta(plant: Plant, arguments: Arguments) -> bool:
-    """Whether the plant's step has the results of one Runge-Kutta step, which it may wrap."""
-    t, state, command, exogenous = (arguments[name] for name in ("t", "state", "command", "exogenous"))
-    own, applied = plant.step(t, state, command, exogenous, plant.closure).state, plant.actuate(state, command)
-    library = plant.latch(Plant.advance(plant, t, state, applied, exogenous, plant.closure), applied)
-    return torch.allclose(own, library, rtol=1e-12, atol=1e-12)
 
 
 def jacobian(plant: Plant, closure: nn.Module, arguments: Arguments) -> Tensor:

@@ -58,7 +58,7 @@ def recorded(
         ValueError: if an argument is out of its range, or there is jitter and the plant has a scheme of its own.
     """
     _require_recordable(plant, jitter, noise)
-    n = plant.n_steps
+    n, own_scheme = plant.n_steps, plant.own_scheme
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64, device=generator.device) - 0.5)
     offsets[0] = 0.0
@@ -69,7 +69,7 @@ def recorded(
         command = law(times[k], state, z)
         applied = plant.actuate(state, command)
         rows.append(torch.cat([state, applied, z], -1))
-        if k < n and plant.own_scheme:
+        if k < n and own_scheme:
             state = plant.step(times[k], state, command, z, plant.closure).state
         elif k < n:
             state = _held(plant, times[k], state, applied, z, (times[k + 1] - times[k]).item())

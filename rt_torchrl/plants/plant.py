@@ -31,7 +31,7 @@ from rt_torchrl.options import check_options
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import rk4_step, whole_steps
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Ended, Input, Inputs, Observation, State, States, Time
-from rt_torchrl.plants.signal import Measurement, Preview, Signal, chosen, differences
+from rt_torchrl.plants.signal import Measurement, Preview, Signal, bounds, chosen, differences
 
 
 class Transition(NamedTuple):
@@ -74,12 +74,6 @@ class Plant(nn.Module, ABC):
     """What the sensors give; empty in a plant that defines ``observations`` and :meth:`observe` itself."""
     observation_sets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """Names of measurements that are observed together, by the name of the set."""
-    own_scheme: bool = False
-    """Whether :meth:`advance` has a scheme of its own, which a twin must follow to the last digit.
-
-    The engine ``odeint_adjoint`` cannot follow it and is refused. A class that overrides :meth:`advance` has one,
-    unless it says False itself.
-    """
     controller_states: tuple[str, ...] = ()
     """Names of the states that a controller computes, such as filters, integrals and the actions applied last.
 
@@ -91,11 +85,6 @@ class Plant(nn.Module, ABC):
     """Cost L_e of each moment after an early end [unit of L_a]; None in a plant whose episodes never end early."""
     unread: int = 0
     """Number of states, the last ones, that no sensor reads; twins and policies do not know of them."""
-
-    def __init_subclass__(cls, **options: Any):
-        super().__init_subclass__(**options)
-        if "advance" in vars(cls) and "own_scheme" not in vars(cls):
-            cls.own_scheme = cls.advance is not Plant.advance
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
@@ -134,6 +123,16 @@ class Plant(nn.Module, ABC):
         return self
 
     @property
+    def own_scheme(self) -> bool:
+        """Whether :meth:`step` has a scheme of its own, where other ones would integrate another system.
+
+        A plant that overrides neither :meth:`step` nor :meth:`advance` has none. Of another plant, the interval is
+        computed both ways, at states and inputs that it draws.
+        """
+        kind = type(self)
+        return not (kind.step is Plant.step and kind.advance is Plant.advance) and not _steps_by_runge_kutta(self)
+
+    @property
     def horizon(self) -> float:
         """Length of an episode T_o [s]."""
         return self.n_steps * self.dt
@@ -155,7 +154,7 @@ class Plant(nn.Module, ABC):
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """The state after Δt under a held action, by one Runge-Kutta step of the vector field.
 
-        A plant that overrides this method has a scheme of its own; see :attr:`own_scheme`.
+        A plant may override this method by a scheme of its own; see :attr:`own_scheme`.
         """
         return rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
 
@@ -316,6 +315,21 @@ class Plant(nn.Module, ABC):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
+
+
+@torch.no_grad()
+def _steps_by_runge_kutta(plant: Plant) -> bool:
+    """Whether an interval of the plant is a Runge-Kutta step of its vector field, which it may wrap, to rounding."""
+    device = next((tensor.device for tensor in (*plant.buffers(), *plant.parameters())), torch.device("cpu"))
+    generator = torch.Generator(device=device).manual_seed(0)
+    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, 0]
+    t = torch.zeros(1, dtype=state.dtype, device=device)
+    low, high = bounds(plant.actions, device=device)
+    command = (low + 0.3 * (high - low)).nan_to_num(0.0, 0.0, 0.0).expand(2, -1)
+    applied = plant.actuate(state, command)
+    own = plant.step(t, state, command, exogenous, plant.closure).state
+    runge_kutta = plant.latch(Plant.advance(plant, t, state, applied, exogenous, plant.closure), applied)
+    return torch.allclose(own, runge_kutta, rtol=1e-12, atol=1e-12)
 
 
 def require_end_cost(plant: Plant) -> None:
