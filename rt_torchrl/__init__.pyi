@@ -10,7 +10,7 @@ from .plants.plant import Plant, Transition
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from .plants.sampling import require_request, require_stable_step, rk4_step
 from .plants.sensors import BiasedSensor, UnreadInput
-from .plants.signal import Component, Measurement, Phase, Preview, Signal
+from .plants.signal import Measurement, Named, Phase, Preview, Signal
 from .contract import ContractReport, PlantContractError, check_plant
 from .control.acting import ActingController
 from .control.classical import ClassicalController
@@ -117,7 +117,6 @@ __all__ = [
     "CallingSimulator",
     "Clairvoyant",
     "ClassicalController",
-    "Component",
     "ConnectedPlant",
     "ConstraintsConfig",
     "ContractReport",
@@ -168,6 +167,7 @@ __all__ = [
     "LongTermMemoryConfig",
     "Measurement",
     "ModbusLink",
+    "Named",
     "NeuralResidual",
     "OpcUaLink",
     "OperatingLimits",

@@ -115,22 +115,6 @@ class Read(Protocol):
 
 
 @dataclass(frozen=True)
-class Component:
-    """Reads one component of the state or of the exogenous input.
-
-    Args:
-        of: vector of the component.
-        index: place in it.
-    """
-
-    of: Literal["state", "exogenous"]
-    index: int
-
-    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
-        return (state if self.of == "state" else exogenous)[..., self.index]
-
-
-@dataclass(frozen=True)
 class Named:
     """Reads the state or the exogenous input of a name.
 
@@ -150,6 +134,12 @@ class Named:
             f"measurement {self.name!r} of plant {plant.name!r} is none of its states and inputs {known}; give it a "
             "function read(plant, t, state, exogenous)."
         )
+
+
+def state_read(read: Read, states: Sequence[Signal]) -> int | None:
+    """Place of the state that is read as it is; None for what is computed of several, or is no state."""
+    names = [signal.name for signal in states]
+    return names.index(read.name) if isinstance(read, Named) and read.name in names else None
 
 
 @dataclass(frozen=True)
