@@ -96,6 +96,16 @@ class DroppingPolicy(LinearQuadratic):
         return Bounded(Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)))
 
 
+class Cut(nn.Linear):
+    def forward(self, observation):
+        return super().forward(observation.detach())
+
+
+class CutPolicy(LinearQuadratic):
+    def make_policy(self, generator):
+        return Bounded(Cut(2, 1, dtype=torch.float64))
+
+
 class RememberingClosure(LinearQuadratic):
     def make_neural_closure(self, generator, hidden):
         return Bounded(Recurrent(outputs=2))
@@ -280,6 +290,7 @@ BROKEN = {
     RememberingPolicy: f"make_policy: {AGAIN}.*a state of the plant",
     NormalisingPolicy: "make_policy: what it makes raises ValueError: Expected more than 1 value per channel.*eval",
     DroppingPolicy: rf"make_policy: {AGAIN}.*\.eval\(\)",
+    CutPolicy: "make_policy: autograd finds no dependence on state 'position'",
     RememberingClosure: f"make_neural_closure: {AGAIN}",
     FirstDimension: "observe: raised IndexError in .*broken_plants.py, line",
     KeptDimension: r"running_cost: cost has shape \(1,\) for t \(\), .*expected .*shape \(\)",

@@ -22,7 +22,7 @@ from rt_torchrl import (
     Signal,
     check_plant,
 )
-from rt_torchrl.control.check import require_controller
+from rt_torchrl.contract.check import require_controller
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.results_table import next_steps

@@ -9,7 +9,7 @@ import torch
 from printed_commands import TEXTS, blocks
 
 from rt_torchrl import check_plant, load_run
-from rt_torchrl.control.check import require_controller
+from rt_torchrl.contract.check import require_controller
 
 PLANTS = {"quadrotor.md": ("Quadrotor", ["LQR"]), "heated_room.md": ("HeatedRoom", ["Thermostat", "PI"])}
 
