@@ -12,7 +12,6 @@ from .plants.sampling import require_request, require_stable_step, rk4_step
 from .plants.sensors import BiasedSensor, UnreadInput
 from .plants.signal import Measurement, Named, Phase, Preview, Signal
 from .contract import ContractReport, PlantContractError, check_plant
-from .control.acting import ActingController
 from .control.classical import ClassicalController
 
 # Real systems
@@ -41,11 +40,10 @@ from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
-from .control.clairvoyant import Clairvoyant, clairvoyant
+from .evaluation.clairvoyant import Clairvoyant, clairvoyant
 from .control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
 from .control.predictive_control import PredictiveConfig, PredictiveControl
-from .control.receding_horizon import RecedingHorizon
-from .control.receding_horizon_config import RecedingHorizonConfig
+from .control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .fit.identification import Identification, IdentificationConfig
 from .fit.estimation import Estimate, Estimation, EstimationConfig
@@ -108,7 +106,6 @@ __version__: str
 __all__ = [
     "DDPG",
     "TD3",
-    "ActingController",
     "ActorCritic",
     "Actuation",
     "AssimilationConfig",

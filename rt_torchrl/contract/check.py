@@ -190,17 +190,17 @@ def require_controller(name: str, law: object, plant: Plant) -> None:
     memory = controller.first_memory(state)
     _require(f"{about}.first_memory returns", memory, size, f"memory_size={size}")
     try:
-        found = controller.act(state, memory)
+        found = controller.law(state, memory)
     except (IndexError, RuntimeError) as error:
         raise ValueError(
-            f"{about}.act fails for states of shape {tuple(state.shape)} and a memory of shape {tuple(memory.shape)}: "
+            f"{about}.law fails for states of shape {tuple(state.shape)} and a memory of shape {tuple(memory.shape)}: "
             f"{str(error).splitlines()[0]}. Its memory has as many columns as memory_size={size} says."
         ) from error
     if not (isinstance(found, tuple) and len(found) == 2):
-        raise ValueError(f"{about}.act returns {type(found).__name__}; give both: return command, memory.")
+        raise ValueError(f"{about}.law returns {type(found).__name__}; give both: return command, memory.")
     actions = ", ".join(signal.name for signal in plant.actions)
-    _require(f"{about}.act returns a command,", found[0], len(plant.actions), f"actions {actions}")
-    _require(f"{about}.act returns a memory,", found[1], size, f"memory_size={size}")
+    _require(f"{about}.law returns a command,", found[0], len(plant.actions), f"actions {actions}")
+    _require(f"{about}.law returns a memory,", found[1], size, f"memory_size={size}")
 
 
 def _require(about: str, found: object, columns: int, why: str) -> None:

@@ -30,7 +30,7 @@ class ClassicalLaw:
 
     def __call__(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         memory = self._controller.first_memory(state) if self._memory is None else self._memory
-        command, self._memory = self._controller.act(state, memory)
+        command, self._memory = self._controller.law(state, memory)
         return command.clamp(self._controller.low_action, self._controller.high_action)
 
 

@@ -5,7 +5,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
@@ -65,7 +64,7 @@ def simulated(
     if not config.twinning.limits:
         return env
     limits = OperatingLimits(plant, config.twinning.limits)
-    controller = None if first is None else ActingController(first(plant, compiled=compiled).to(device))
+    controller = None if first is None else first(plant, compiled=compiled).to(device)
     zero = env.action_spec.zero()
     low, high = (zero.new_tensor(end) for end in limits.actions)
     rest = torch.minimum(torch.maximum(zero, low), high).clamp(env.action_spec.space.low, env.action_spec.space.high)
