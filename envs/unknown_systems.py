@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from rt_torchrl.envs.cryogenic_tank import unknown as tank
 from rt_torchrl.envs.flapping_wing import unknown as drone
 from rt_torchrl.envs.wind_turbine import unknown as turbine
-from rt_torchrl.plants.extensions.catalogue import System, require_systems
+from rt_torchrl.plants.extension import System, require_systems
 
 SYSTEMS: Mapping[str, Mapping[str, System]] = {
     "wind_turbine": turbine.SYSTEMS,

@@ -1,28 +1,17 @@
 """The public names of the library; ``__init__.py`` imports each at its first use, from the module named here."""
 
 # Plants and their parts
+from .plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
 from .plants.closures import BoundedPerceptron, PositiveCoefficients
-from .plants.disturbance import require_request
-from .plants.extensions.actuator_coefficients import ActuatorCoefficients
-from .plants.extensions.biased_sensor import BiasedSensor
-from .plants.extensions.delayed_actuator import DelayedActuator
-from .plants.extensions.extension import ExtendedClosure, Extension, OwnParameters
-from .plants.extensions.lagged_actuator import LaggedActuator
-from .plants.extensions.lagged_coefficients import LaggedCoefficients
-from .plants.extensions.neural_residual import NeuralResidual
-from .plants.extensions.resonant_actuator import ResonantActuator
-from .plants.extensions.scaled_actuator import ScaledActuator
-from .plants.extensions.scaled_coefficients import ScaledCoefficients
-from .plants.extensions.slow_actuator import SlowActuator
-from .plants.extensions.unread_input import UnreadInput
-from .plants.integrators import rk4_step
-from .plants.measurement import Component, Measurement, Phase, Preview
+from .plants.coefficients import LaggedCoefficients, ScaledCoefficients
+from .plants.extension import ExtendedClosure, Extension
+from .plants.neural_residual import NeuralResidual
 from .plants.plant import Plant, Transition
-from .plants.stability import require_stable_step
 from .plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
-from .plants.signal import Signal
+from .plants.sampling import require_request, require_stable_step, rk4_step
+from .plants.sensors import BiasedSensor, UnreadInput
+from .plants.signal import Measurement, Named, Phase, Preview, Signal
 from .contract import ContractReport, PlantContractError, check_plant
-from .control.acting import ActingController
 from .control.classical import ClassicalController
 
 # Real systems
@@ -51,11 +40,10 @@ from .trajectories.rollout import DivergenceError, Engine, Rollout
 from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
-from .control.clairvoyant import Clairvoyant, clairvoyant
+from .evaluation.clairvoyant import Clairvoyant, clairvoyant
 from .control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
 from .control.predictive_control import PredictiveConfig, PredictiveControl
-from .control.receding_horizon import RecedingHorizon
-from .control.receding_horizon_config import RecedingHorizonConfig
+from .control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .fit.identification import Identification, IdentificationConfig
 from .fit.estimation import Estimate, Estimation, EstimationConfig
@@ -116,17 +104,14 @@ __version__: str
 __all__ = [
     "DDPG",
     "TD3",
-    "ActingController",
     "ActorCritic",
     "Actuation",
-    "ActuatorCoefficients",
     "AssimilationConfig",
     "BiasedSensor",
     "BoundedPerceptron",
     "CallingSimulator",
     "Clairvoyant",
     "ClassicalController",
-    "Component",
     "ConnectedPlant",
     "ConstraintsConfig",
     "ContractReport",
@@ -175,12 +160,12 @@ __all__ = [
     "LongTermMemoryConfig",
     "Measurement",
     "ModbusLink",
+    "Named",
     "NeuralResidual",
     "OpcUaLink",
     "OperatingLimits",
     "OperatingLimitsConfig",
     "OperationConfig",
-    "OwnParameters",
     "Phase",
     "Planner",
     "PlannerConfig",
@@ -223,7 +208,6 @@ __all__ = [
     "ShortHorizon",
     "ShortHorizonConfig",
     "Signal",
-    "SlowActuator",
     "SmoothClip",
     "Snapshot",
     "Start",

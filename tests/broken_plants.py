@@ -96,6 +96,16 @@ class DroppingPolicy(LinearQuadratic):
         return Bounded(Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)))
 
 
+class Cut(nn.Linear):
+    def forward(self, observation):
+        return super().forward(observation.detach())
+
+
+class CutPolicy(LinearQuadratic):
+    def make_policy(self, generator):
+        return Bounded(Cut(2, 1, dtype=torch.float64))
+
+
 class RememberingClosure(LinearQuadratic):
     def make_neural_closure(self, generator, hidden):
         return Bounded(Recurrent(outputs=2))
@@ -210,13 +220,6 @@ class Stiff(LinearQuadratic):
     A = ((0.0, 1.0), (-1.0, -40.0))
 
 
-class Undeclared(LinearQuadratic):
-    """A plant that steps by a scheme of its own, and does not say so."""
-
-    def step(self, t, state, command, exogenous, closure):
-        return Transition(state + self.dt * self.vector_field(t, state, command, exogenous, closure), command)
-
-
 class Explosive(LinearQuadratic):
     A = ((5000.0, 1.0), (-1.0, 0.0))
 
@@ -287,6 +290,7 @@ BROKEN = {
     RememberingPolicy: f"make_policy: {AGAIN}.*a state of the plant",
     NormalisingPolicy: "make_policy: what it makes raises ValueError: Expected more than 1 value per channel.*eval",
     DroppingPolicy: rf"make_policy: {AGAIN}.*\.eval\(\)",
+    CutPolicy: "make_policy: autograd finds no dependence on state 'position'",
     RememberingClosure: f"make_neural_closure: {AGAIN}",
     FirstDimension: "observe: raised IndexError in .*broken_plants.py, line",
     KeptDimension: r"running_cost: cost has shape \(1,\) for t \(\), .*expected .*shape \(\)",
@@ -308,7 +312,6 @@ BROKEN = {
     UnusedWeight: "vector_field: closure weight 'forgotten' changes it at none",
     ReverseOnly: "step: torch.func.jvp under vmap fails",
     Stiff: r"dt: 0.1 s is too long for the eigenvalue -39.* 1/s .*Use dt <= 0.0\d+ s",
-    Undeclared: "own_scheme: is False, but step is no Runge-Kutta step",
     Explosive: "step: plant 'linear_quadratic' diverged in realisation",
     Raising: "running_cost: raised KeyError in .*broken_plants.py",
     OwnSeed: "draw_exogenous: draws different episodes, but the same ones for generators of another seed",

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from rt_torchrl.plants.integrators import rk4_step
+from rt_torchrl.plants.sampling import rk4_step
 
 V_T, A_S, A_HX, M_C = 60.0, 74.1, 200 * math.pi * 0.005 * 2, 500e3
 U_S, U_HX, K_JT = 50.0, 75.0, 500e9

@@ -12,8 +12,8 @@ from test_hypotheses import PLANT, Suspecting, ensemble
 
 from rt_torchrl import Run, control_cost, export_twin, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.actuators import LaggedActuator
+from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.results_table import hypothesis_lines, results_table
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -10,7 +10,7 @@ from broken_plants import BROKEN, TRACED, PartlyDetached
 from linear_quadratic import LinearQuadratic
 
 from rt_torchrl import PlantContractError, check_plant
-from rt_torchrl.contract.stability import amplification, stable_step
+from rt_torchrl.contract.gradients_and_tracing import amplification, stable_step
 
 
 def violations(plant, **options):

@@ -6,14 +6,13 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from test_optimal_gain import optimal_gain
 
-from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.control.tuning import tune
+from rt_torchrl.control.classical import ClassicalController, tune
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
-from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
+from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import ROLES, judge
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
@@ -28,7 +27,7 @@ class PD(ClassicalController):
     default_gains = (0.3, 0.3)
     memory_size = 1
 
-    def act(self, state, memory):
+    def law(self, state, memory):
         return -(self.log_gains.exp() * state).sum(-1, keepdim=True), memory + 1.0
 
 
@@ -70,7 +69,7 @@ def test_a_system_that_has_worn_is_flown_and_judged_as_it_is():
 class Wild(ClassicalController):
     """A law that asks for what is no number."""
 
-    def act(self, state, memory):
+    def law(self, state, memory):
         return torch.nan * state[:, :1], memory
 
 
@@ -151,7 +150,7 @@ def test_the_valve_opens_above_its_band_and_shuts_below_it():
     valve, is_open, found = OnOffValve(CryogenicTank(), (150e3,)), torch.zeros(1, 1).double(), []
     for error in (-2e3, 0.5e3, 1.5e3, 0.5e3, -0.5e3, -1.5e3, 0.5e3):
         state = torch.tensor([[27.0, 42.0, 500e3 + error]], dtype=torch.float64)
-        command, is_open = valve.act(state, is_open)
+        command, is_open = valve.law(state, is_open)
         found.append(round(command.item()))
     assert found == [0, 0, 150_000, 150_000, 150_000, 0, 0]
 
@@ -177,9 +176,9 @@ def test_the_integral_of_the_valve_stops_where_the_valve_does():
     valve, memory = PIValve(plant, (1.0, 1e-3)), torch.zeros(1, 1).double()
     high = torch.tensor([[27.0, 42.0, 540e3]], dtype=torch.float64)
     for _ in range(1000):
-        command, memory = valve.act(high, memory)
+        command, memory = valve.law(high, memory)
     assert memory.item() == 200e3 and command.item() == pytest.approx(240e3)
-    command, memory = valve.act(high - torch.tensor([0.0, 0.0, 80e3]), memory)
+    command, memory = valve.law(high - torch.tensor([0.0, 0.0, 80e3]), memory)
     assert memory.item() == pytest.approx(200e3 - 1e-3 * 40e3 * 30.0)
 
 

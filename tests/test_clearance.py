@@ -8,7 +8,6 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_algorithm import twinning
 
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.runs.real_side import Resting, simulated
 from rt_torchrl.runs.run import Run
@@ -139,7 +138,7 @@ class Lagged(ClassicalController):
 
     memory_size = 1
 
-    def act(self, state, memory):
+    def law(self, state, memory):
         memory = 0.8 * memory + 0.2 * state[..., 1:]
         return -2.0 * memory, memory
 
@@ -168,7 +167,7 @@ def test_the_memory_of_the_fallback_goes_on_while_the_policy_acts():
 def test_the_fallback_is_told_the_time_of_the_episode():
     times = []
 
-    class Clocked(ActingController):
+    class Clocked(Lagged):
         def begin(self):
             times.append("begin")
             super().begin()
@@ -178,7 +177,7 @@ def test_the_fallback_is_told_the_time_of_the_episode():
             return super().act(t, state, exogenous)
 
     plant = LinearQuadratic(horizon=2.0)
-    controller = Clocked(Lagged(plant))
+    controller = Clocked(plant)
     layer = SafetyLayer(
         PlantEnv(plant, seed=0),
         SafetyConfig(interval=plant.dt, limits={"state": ((-9.0, -0.7), (9.0, 0.7))}),

@@ -5,7 +5,6 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
@@ -86,7 +85,7 @@ def test_a_controller_with_a_memory_flies_as_it_steps(name, noise):
     def controlled():
         plant = kind(horizon=40 * kind().dt)
         env, actor, _ = system(plant, noise=noise)
-        return env, actor, ActingController(law(plant))
+        return env, actor, law(plant)
 
     compare(controlled, (0.3, 0.0), rtol=1e-9, atol=1e-9)
 

@@ -10,7 +10,7 @@ from small_runs import SMALL, small_run
 
 from rt_torchrl import DigitalTwin, PlannerConfig
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.plants.state_bounds import StateBounds
+from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
@@ -31,13 +31,13 @@ def flown(*positions):
 
 
 def test_how_often_and_how_far_a_state_is_beyond_its_bounds():
-    found = StateBounds(LinearQuadratic(), POSITION).merit(flown(-1.5, 0.0, 5.0, 3.0).states)
+    found = StateBounds(LinearQuadratic().readings, POSITION).merit(flown(-1.5, 0.0, 5.0, 3.0).states)
     assert found["position outside [%]"].tolist() == [50.0]
     assert found["position beyond [m]"].tolist() == [2.0]
-    one_sided = StateBounds(LinearQuadratic(), {"velocity": (-math.inf, 2.0)})
+    one_sided = StateBounds(LinearQuadratic().readings, {"velocity": (-math.inf, 2.0)})
     assert one_sided.shares(torch.tensor([0.0, 3.0]).double()).tolist() == [0.5]
     with pytest.raises(ValueError, match=r"bounded states speed do not exist; the plant has position, velocity\."):
-        StateBounds(LinearQuadratic(), {"speed": (0.0, 1.0)})
+        StateBounds(LinearQuadratic().readings, {"speed": (0.0, 1.0)})
 
 
 @pytest.mark.parametrize("method", ["augmented_lagrangian", "penalty"])

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from rt_torchrl.control.receding_horizon import RecedingHorizon
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from rt_torchrl.envs.wind_turbine.models import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 

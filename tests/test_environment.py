@@ -6,7 +6,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from tensordict import TensorDict
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.integrators import rk4_step
+from rt_torchrl.plants.sampling import rk4_step
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 

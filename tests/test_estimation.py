@@ -16,7 +16,7 @@ from rt_torchrl.fit.estimation import Estimation, EstimationConfig
 from rt_torchrl.fit.first_values import first_noise
 from rt_torchrl.fit.sensor_record import sensor_record, usual_initial_state
 from rt_torchrl.fit.sensors import Sensor, known_sensors, read, read_slopes, sensors_of
-from rt_torchrl.plants.measurement import Measurement
+from rt_torchrl.plants.signal import Measurement
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 FAST = EstimationConfig(iterations=30)

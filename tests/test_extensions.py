@@ -7,13 +7,10 @@ from scipy.linalg import expm
 from torch import nn
 
 from rt_torchrl import check_plant
-from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
-from rt_torchrl.plants.extensions.extension import Extension
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
-from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
+from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
+from rt_torchrl.plants.coefficients import LaggedCoefficients
+from rt_torchrl.plants.extension import Extension
+from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
@@ -23,7 +20,7 @@ EXTENDED = {
     "lag": lambda: LaggedActuator(LinearQuadratic(), "force", 0.4),
     "resonance": lambda: ResonantActuator(LinearQuadratic(), "force", 3.0, 0.4),
     "delay": lambda: DelayedActuator(LinearQuadratic(), "force", 0.3),
-    "chain": lambda: SlowActuator(LinearQuadratic(), "force", 0.3, stages=3),
+    "chain": lambda: LaggedActuator(LinearQuadratic(), "force", 0.3, stages=3),
     "inflow": lambda: LaggedCoefficients(LinearQuadratic(), 0.5, (0.1, -0.2)),
     "bias": lambda: BiasedSensor(LinearQuadratic(), "position", 0.3, 0.02, scale=0.1),
     "nested": lambda: DelayedActuator(ResonantActuator(LinearQuadratic(), "force", 3.0, 0.4), "force", 0.2),
@@ -112,7 +109,7 @@ def test_a_delay_gives_what_was_asked_for_earlier():
 
 
 def test_the_response_of_a_chain_has_its_mean_delay():
-    plant = SlowActuator(LinearQuadratic(dt=0.01), "force", 0.3, stages=5)
+    plant = LaggedActuator(LinearQuadratic(dt=0.01), "force", 0.3, stages=5)
     x, step = torch.zeros(5, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
     missing = 0.0
     for _ in range(500):
@@ -125,7 +122,7 @@ def test_the_response_of_a_chain_has_its_mean_delay():
     "extend",
     [
         lambda base: LaggedActuator(base, "force", 1e-7),
-        lambda base: SlowActuator(base, "force", 1e-7),
+        lambda base: LaggedActuator(base, "force", 1e-7, stages=6),
         lambda base: LaggedCoefficients(base, 1e-7, (0.0, 0.0)),
         lambda base: BiasedSensor(base, "position", 0.0, scale=1.0),
     ],
@@ -204,12 +201,12 @@ class Stepping(LinearQuadratic):
     "make, message",
     [
         (lambda: LaggedActuator(LinearQuadratic(), "torque", 1.0), r"action='torque'.*force"),
-        (lambda: LaggedActuator(LinearQuadratic(), "force", 0.0), r"force_lag=0.0 s must be positive"),
+        (lambda: LaggedActuator(LinearQuadratic(), "force", 0.0), r"\[0.0\].* must be force_lag \[s\], positive"),
         (lambda: LaggedActuator(Stepping(), "force", 1.0), r"overrides step\(\)"),
         (lambda: LaggedActuator(EXTENDED["lag"](), "force", 1.0), r"already has the states lagged_force"),
         (lambda: ResonantActuator(LinearQuadratic(), "force", 1.0, 1.0), r"damping=1.0.*\(0, 1\)"),
         (lambda: DelayedActuator(LinearQuadratic(), "force", 0.25), r"1 to 64 control intervals of 0.1 s"),
-        (lambda: SlowActuator(LinearQuadratic(), "force", 0.3, stages=0), r"stages=0"),
+        (lambda: LaggedActuator(LinearQuadratic(), "force", 0.3, stages=0), r"stages=0"),
         (lambda: LaggedCoefficients(EXTENDED["lag"](), 1.0, (0.0,)), r"closure of the plant itself"),
         (lambda: BiasedSensor(LinearQuadratic(), "height", 1.0, scale=1.0), r"state='height'.*position, velocity"),
         (lambda: BiasedSensor(LinearQuadratic(), "position", 1.0, scale=0.0), r"scale=0.0 must be positive"),

@@ -6,7 +6,6 @@ from linear_quadratic import LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD, episodes
 
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
@@ -40,14 +39,14 @@ def twinning(*, gains=GAINS, iterations=0, model_free=None, approach=0, approach
         model_based=plant.make_policy(generator),
         config=TwinningConfig(realisations=4, virtual_episodes=4, **parts, **options),
         generator=generator,
-        first=FirstController(ActingController(PD(plant, gains))),
+        first=FirstController(PD(plant, gains)),
     )
 
 
 def test_it_acts_as_it_flies():
     plant = LinearQuadratic(horizon=1.0)
     law = PD(plant, GAINS)
-    acting, (state, exogenous) = ActingController(law), episodes(plant)
+    acting, (state, exogenous) = law, episodes(plant)
     flown = law.fly(state, exogenous)
     assert isinstance(acting, StateFeedback)
     for _ in range(2):
@@ -60,7 +59,7 @@ def test_it_acts_as_it_flies():
 def test_it_flies_the_physics_that_it_is_given():
     plant, other = LinearQuadratic(horizon=1.0), LinearQuadratic(horizon=1.0)
     other._B = 2.0 * other._B
-    acting, (state, exogenous) = ActingController(PD(plant, GAINS)), episodes(plant)
+    acting, (state, exogenous) = PD(plant, GAINS), episodes(plant)
     own, others = acting.fly(state, exogenous), acting.fly(state, exogenous, plant=other)
     wanted = PD(other, GAINS).fly(state, exogenous)
     assert torch.equal(others.states, wanted.states) and not torch.equal(others.states, own.states)

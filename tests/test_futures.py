@@ -9,8 +9,7 @@ from test_optimal_control import matrices
 
 from rt_torchrl.control.forecasts import Decaying, Futures, Held, Scattered
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.control.receding_horizon import RecedingHorizon
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 
 PLANT = LinearQuadratic(horizon=2.0, noise=0.5)
 N = 10

@@ -8,11 +8,9 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL
 
+from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
 from rt_torchrl.plants.closures import named_weights
-from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
-from rt_torchrl.plants.extensions.extension import ExtendedClosure
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
+from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.runs.results import hypotheses_of, twin_entries
 from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run

@@ -8,8 +8,7 @@ import torch
 from scipy.optimize import brentq
 from torchdiffeq import odeint
 
-from rt_torchrl.plants.integrators import RK4_REAL_STABILITY, rk4_step
-from rt_torchrl.plants.stability import require_stable_step
+from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, rk4_step
 
 
 def tensor(*values):

@@ -10,7 +10,7 @@ from rt_torchrl import Rollout, SaturatedAffine, SaturatedMLP, check_plant, cont
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import rosco_turbine
-from rt_torchrl.plants.measurement import Component, Measurement, Preview
+from rt_torchrl.plants.signal import Measurement, Named, Preview
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousConfig
@@ -82,7 +82,7 @@ def test_what_is_not_measured_is_refused(observe):
 def test_a_measurement_without_a_scale_is_refused():
     for scale in (0.0, -1.0, math.inf):
         with pytest.raises(ValueError, match="scale"):
-            Measurement(symbol="y", name="y", unit="m", read=Component("state", 0), scale=scale)
+            Measurement(symbol="y", name="y", unit="m", read=Named("x"), scale=scale)
 
 
 def test_the_phase_of_the_wing_beat():
@@ -197,7 +197,7 @@ def test_a_state_for_the_fast_filter_only_where_it_is_seen():
 
 def test_measurements_keep_all_of_their_signal():
     signal = WindTurbine.states[4]
-    found = Measurement.of(signal, Component("state", 4), scale=2.0).signal
+    found = Measurement.of(signal, Named("pitch"), scale=2.0).signal
     assert dataclasses.asdict(found) == dataclasses.asdict(signal)
 
 

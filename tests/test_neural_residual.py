@@ -5,7 +5,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from scipy.linalg import expm
 
-from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, check_plant
+from rt_torchrl import BiasedSensor, DelayedActuator, LaggedActuator, NeuralResidual, Plant, check_plant
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
@@ -29,8 +29,6 @@ def pushed(base, **options):
 
 class Exact(LinearQuadratic):
     """The oscillator with the solution of its linear equations as a scheme of its own."""
-
-    own_scheme = True
 
     def advance(self, t, state, applied, exogenous, closure):
         joint = torch.zeros(4, 4, dtype=torch.float64)
@@ -110,6 +108,18 @@ def test_it_begins_as_the_plant_itself(base):
     flown = [Rollout(p, p.closure, engine="autograd")(state, exogenous, command).states for p in (plant, base)]
     assert torch.equal(*flown)
     assert plant.states == base.states and plant.unread == base.unread and plant.own_scheme == base.own_scheme
+
+
+def test_a_plant_that_wraps_a_runge_kutta_step_takes_one_of_the_sum():
+    base = CryogenicTank()  # overrides advance for its exponential wall, and has the explicit one
+    ranges = {"wall_temperature": (20.0, 25.0)}
+    plant = NeuralResidual(base, {"wall_temperature": 0.1}, inputs=("wall_temperature",), ranges=ranges)
+    closure = stirred(plant.make_closure(torch.Generator()))
+    generator = torch.Generator().manual_seed(1)
+    state, exogenous = plant.draw_initial_state(3, generator), plant.draw_exogenous(3, generator)[:, 0]
+    arguments = torch.zeros(1).double(), state, 0.0 * exogenous + 1e4, exogenous, closure
+    assert not plant.own_scheme
+    torch.testing.assert_close(plant.advance(*arguments), Plant.advance(plant, *arguments), rtol=1e-14, atol=0.0)
 
 
 def test_around_another_scheme_it_is_of_second_order():

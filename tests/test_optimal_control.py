@@ -8,13 +8,11 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from rt_torchrl.control.bounded_descent import BoundedDescentConfig, descend
-from rt_torchrl.control.clairvoyant import clairvoyant, constant_starts, random_starts
 from rt_torchrl.control.forecasts import Foreseen
-from rt_torchrl.control.receding_horizon import RecedingHorizon
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.control.receding_horizon import BoundedDescentConfig, RecedingHorizon, RecedingHorizonConfig, descend
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.evaluation.clairvoyant import clairvoyant, constant_starts, random_starts
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout

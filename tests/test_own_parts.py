@@ -22,8 +22,8 @@ from rt_torchrl import (
     Signal,
     check_plant,
 )
-from rt_torchrl.control.check import require_controller
-from rt_torchrl.plants.discrepancy import Discrepancy
+from rt_torchrl.contract.check import require_controller
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.results_table import next_steps
 from rt_torchrl.runs.run import Run
@@ -43,13 +43,14 @@ def test_coefficients_are_the_same_for_all_features_by_default():
     torch.testing.assert_close(found, torch.tensor([40.0, 35.0]).double().expand(3, 4, 2))
 
 
-class Turning(Discrepancy):
+class Turning(LinearQuadratic):
     name = "turning"
     states = (
         Signal(symbol="x", name="position", unit="m"),
         Signal(symbol="a", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
     )
     state_sizes = (2.0, 0.5)
+    discrepancy = Plant.discrepancy
 
 
 def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way():
@@ -95,12 +96,12 @@ def law(**own):
 WRONG_LAWS: list[tuple[Any, str]] = [
     (PD(PLANT), "must be a class derived from ClassicalController; give its class, PD"),
     (LinearGain, "must be a class derived from ClassicalController; give a subclass of it"),
-    (law(act=lambda self, state, memory: state[:, :1]), "first: Mine.act returns Tensor; give both"),
-    (law(act=lambda self, state, memory: (state[:, 0], memory)), r"returns a command, \(3,\).*A column is state"),
-    (law(act=lambda self, state, memory: (state[:, :1].float(), memory)), r"command, \(3, 1\) in torch.float32"),
-    (law(act=lambda self, state, memory: (state[:, :1] / 0.0, memory)), "command, numbers that are not finite"),
-    (law(act=lambda self, state, memory: (state[:, :1], state)), r"returns a memory, \(3, 2\).*memory_size=1"),
-    (law(memory_size=0, act=lambda self, state, memory: (state[:, :1], memory[:, [0]])), "as memory_size=0 says"),
+    (law(law=lambda self, state, memory: state[:, :1]), "first: Mine.law returns Tensor; give both"),
+    (law(law=lambda self, state, memory: (state[:, 0], memory)), r"returns a command, \(3,\).*A column is state"),
+    (law(law=lambda self, state, memory: (state[:, :1].float(), memory)), r"command, \(3, 1\) in torch.float32"),
+    (law(law=lambda self, state, memory: (state[:, :1] / 0.0, memory)), "command, numbers that are not finite"),
+    (law(law=lambda self, state, memory: (state[:, :1], state)), r"returns a memory, \(3, 2\).*memory_size=1"),
+    (law(memory_size=0, law=lambda self, state, memory: (state[:, :1], memory[:, [0]])), "as memory_size=0 says"),
     (law(first_memory=lambda self, state: state), r"first_memory returns \(3, 2\).*memory_size=1"),
     (law(default_gains=()), r"default_gains=\(\) of Mine must be .*K_1 .*, one for each entry of gain_units"),
 ]

@@ -9,7 +9,7 @@ import torch
 from printed_commands import TEXTS, blocks
 
 from rt_torchrl import check_plant, load_run
-from rt_torchrl.control.check import require_controller
+from rt_torchrl.contract.check import require_controller
 
 PLANTS = {"quadrotor.md": ("Quadrotor", ["LQR"]), "heated_room.md": ("HeatedRoom", ["Thermostat", "PI"])}
 
@@ -54,7 +54,7 @@ def test_the_thermostat_switches_at_its_edges_alone():
     on = torch.zeros(1, 1).double()
     powers = []
     for temperature in room:
-        power, on = thermostat.act(torch.cat([temperature, temperature]).unsqueeze(0), on)
+        power, on = thermostat.law(torch.cat([temperature, temperature]).unsqueeze(0), on)
         powers.append(power.item())
     assert powers == [3000.0, 3000.0, 0.0, 0.0]
     day, night = (plant.occupied(torch.tensor(3600.0 * hour)).item() for hour in (12.0, 3.0))

@@ -7,7 +7,8 @@ from linear_quadratic import LinearQuadratic
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-from rt_torchrl import check_plant, shipped_plants
+from rt_torchrl import DelayedActuator, ScaledActuator, Transition, check_plant, shipped_plants
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -37,7 +38,7 @@ def plant(kind):
     return shortened(kind, 50)
 
 
-def test_a_plant_that_overrides_its_scheme_says_so():
+def test_a_scheme_of_its_own_is_found_by_what_a_step_does():
     class Own(LinearQuadratic):
         def advance(self, t, state, applied, exogenous, closure):
             return state + self.dt * self.vector_field(t, state, applied, exogenous, closure)
@@ -46,13 +47,29 @@ def test_a_plant_that_overrides_its_scheme_says_so():
         advance = LinearQuadratic.advance
 
     class Wrapping(LinearQuadratic):
-        own_scheme = False
-
         def advance(self, *given):
             return super().advance(*given)
 
-    found = {kind: kind().own_scheme for kind in (LinearQuadratic, Own, Back, Wrapping)}
-    assert found == {LinearQuadratic: False, Own: True, Back: False, Wrapping: False}
+    class Stepping(LinearQuadratic):
+        def step(self, t, state, command, exogenous, closure):
+            return Transition(state + self.dt * self.vector_field(t, state, command, exogenous, closure), command)
+
+    found = {kind: kind().own_scheme for kind in (LinearQuadratic, Own, Back, Wrapping, Stepping)}
+    assert found == {LinearQuadratic: False, Own: True, Back: False, Wrapping: False, Stepping: True}
+    assert {wall: CryogenicTank(wall=wall).own_scheme for wall in ("explicit", "exponential")} == {
+        "explicit": False,
+        "exponential": True,
+    }
+
+
+def test_an_extension_has_the_scheme_of_its_plant_unless_hidden_states_have_their_own_solution():
+    found = [
+        ScaledActuator(CryogenicTank(), "valve_drop", 0.9),
+        ScaledActuator(CryogenicTank(wall="exponential"), "valve_drop", 0.9),
+        DelayedActuator(LinearQuadratic(), "force", 0.3),
+        ScaledActuator(DelayedActuator(LinearQuadratic(), "force", 0.3), "force", 0.9),
+    ]
+    assert [plant.own_scheme for plant in found] == [False, True, True, True]
 
 
 def fly(plant, *, batch=1, seed=0):

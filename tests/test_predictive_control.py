@@ -9,8 +9,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 
 from rt_torchrl.control.forecasts import Decaying
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.control.receding_horizon import RecedingHorizon
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.environment import PlantEnv

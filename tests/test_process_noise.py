@@ -61,7 +61,6 @@ class Turning(Line):
     """The line on a circle, whose position is wrapped at the end of every interval."""
 
     states = (Signal(symbol="x", name="position", unit="rad", low=-math.pi, high=math.pi, periodic=True),)
-    own_scheme = True
 
     def advance(self, t, state, applied, exogenous, closure):
         return self.states[0].wrapped(super().advance(t, state, applied, exogenous, closure))

@@ -18,7 +18,7 @@ from torch.nn.utils import parameters_to_vector
 from rt_torchrl.evaluation.baseline import RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.trajectories.twin import DigitalTwin

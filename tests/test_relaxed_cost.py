@@ -7,9 +7,8 @@ from linear_quadratic import LinearQuadratic
 from scipy.optimize import lsq_linear
 from test_optimal_control import matrices
 
-from rt_torchrl.control.bounded_descent import BoundedDescentConfig
-from rt_torchrl.control.clairvoyant import clairvoyant, constant_starts, random_starts
-from rt_torchrl.control.relaxed_cost import RelaxedCost, held_back
+from rt_torchrl.control.receding_horizon import BoundedDescentConfig
+from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_starts
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import constant

@@ -15,7 +15,7 @@ from test_hypotheses import LAG, Suspecting
 
 from rt_torchrl import PlantContractError
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.exploration import ExplorationConfig

@@ -8,7 +8,7 @@ from linear_quadratic import LinearQuadratic
 from torch import nn
 
 from rt_torchrl import shipped_plants
-from rt_torchrl.contract.calls import random_commands
+from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.trajectories.engines import linearisation, programs, traced_interval

@@ -16,7 +16,7 @@ from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.fit.sensor_log import LogConfig
 from rt_torchrl.fit.simulated_log import ClassicalLaw, recorded
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run

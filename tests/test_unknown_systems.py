@@ -19,11 +19,9 @@ from rt_torchrl.envs.wind_turbine.lagged_power import LaggedPower
 from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
 from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
-from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
-from rt_torchrl.plants.extensions.scaled_coefficients import ScaledCoefficients
-from rt_torchrl.plants.extensions.unread_input import UnreadInput
+from rt_torchrl.plants.actuators import LaggedActuator, ScaledActuator
+from rt_torchrl.plants.coefficients import LaggedCoefficients, ScaledCoefficients
+from rt_torchrl.plants.sensors import UnreadInput
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.trajectories.rollout import Rollout
 

@@ -9,11 +9,10 @@ from small_runs import SMALL
 from test_classical import PD
 
 from rt_torchrl import export_c, load_run
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum, mean_with_confidence
-from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
+from rt_torchrl.plants.actuators import ResonantActuator
+from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.calling_simulator import CallingSimulator
@@ -110,7 +109,7 @@ def test_a_twin_is_judged_by_what_sensors_read():
 def test_state_feedback_acts_on_readings(kind):
     plant = real()
     if kind == "classical":
-        controller = ActingController(PD(BASE))
+        controller = PD(BASE)
     else:
         controller = PredictiveControl(BASE, BASE.closure, PredictiveConfig(horizon=0.5))
     generators = generator(1)
@@ -125,7 +124,7 @@ def test_state_feedback_acts_on_readings(kind):
     torch.testing.assert_close(flown.states[:, -1], s, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("controller", [LinearGain([[0.3, 0.3]]), ActingController(PD(BASE))], ids=["policy", "PD"])
+@pytest.mark.parametrize("controller", [LinearGain([[0.3, 0.3]]), PD(BASE)], ids=["policy", "PD"])
 def test_machine_code_flies_as_steps_do(controller):
     found = []
     for kind in (collector_of, EpisodeCollector):

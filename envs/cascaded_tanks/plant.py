@@ -7,9 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics, ramp
-from rt_torchrl.plants.measurement import Component, Measurement
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Measurement, Signal
 
 STATES = (
     Signal(symbol="h_1", name="upper_level", unit="V"),
@@ -76,9 +75,9 @@ class CascadedTanks(Plant):
     inputs = (WANTED,)
     measurements = (
         Measurement(symbol="e", name="level_error", unit="V", low=-10.0, high=10.0, read=level_error, scale=2.0),
-        Measurement.of(STATES[1], Component("state", 1), offset=5.0, scale=2.0),
-        Measurement.of(STATES[0], Component("state", 0), offset=20.0, scale=10.0),
-        Measurement.of(WANTED, Component("exogenous", 0), offset=5.0, scale=2.0),
+        Measurement.of(STATES[1], offset=5.0, scale=2.0),
+        Measurement.of(STATES[0], offset=20.0, scale=10.0),
+        Measurement.of(WANTED, offset=5.0, scale=2.0),
         Measurement(symbol="y", name="sensed_level", unit="V", high=10.0, read=sensed_level, offset=5.0, scale=2.0),
     )
     observation_sets = {

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rt_torchrl.envs.cryogenic_tank.vent import valve_conductance
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.cost import RunningCost, require_weights
+from rt_torchrl.plants.plant import RunningCost, require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.disturbance import require_request
+from rt_torchrl.plants.sampling import require_request
 
 LOWEST = 600.0
 """Time that no orbit takes: one close to the ground of the Earth takes 5060 s [s]."""

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Measurement, Signal
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -50,11 +49,11 @@ def orbit_sine(plant: "CryogenicTank", t: Tensor, state: Tensor, exogenous: Tens
 MEASUREMENTS = (
     Measurement(symbol="e", name="pressure_error", unit="Pa", read=pressure_error, scale=ERROR_UNIT),
     Measurement(symbol="T_s - T", name="superheat", unit="K", read=superheat, scale=0.05),
-    Measurement.of(STATES[1], Component("state", 1), offset=42.0, scale=6.0),
+    Measurement.of(STATES[1], offset=42.0, scale=6.0),
     Measurement(symbol="t/T_o", name="clock", unit="-", low=0.0, high=1.0, read=clock, offset=0.5, scale=0.5),
     Measurement(symbol=r"\cos 2\pi t/T_h", name="orbit_cosine", unit="-", low=-1.0, high=1.0, read=orbit_cosine),
     Measurement(symbol=r"\sin 2\pi t/T_h", name="orbit_sine", unit="-", low=-1.0, high=1.0, read=orbit_sine),
-    Measurement.of(INPUTS[0], Component("exogenous", 0), offset=130.0, scale=100.0),
+    Measurement.of(INPUTS[0], offset=130.0, scale=100.0),
 )
 MEASURED = ("pressure_error", "superheat", "liquid_volume")
 OBSERVATION_SETS = {

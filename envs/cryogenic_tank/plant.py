@@ -20,10 +20,9 @@ from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.envs.cryogenic_tank.suspects import further_suspects, suspects
 from rt_torchrl.envs.cryogenic_tank.vent import Vent, vent
 from rt_torchrl.envs.cryogenic_tank.wall import wall_rise
-from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sampling import require_stable_step, rk4_step
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.plants.stability import require_stable_step
 
 Wall = Literal["explicit", "exponential"]
 
@@ -125,7 +124,6 @@ class CryogenicTank(Plant):
         require_sizes(error_sizes)
         self.load = CyclicLoad() if load is None else load
         self.wall, self.wall_heat_capacity = wall, float(wall_heat_capacity)
-        self.own_scheme = wall != "explicit" or type(self).advance is not CryogenicTank.advance
         self.command, self.actions = COMMANDS[command], (COMMANDS[command].signal,)
         self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)

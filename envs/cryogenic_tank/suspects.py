@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
+from rt_torchrl.plants.actuators import LaggedActuator
+from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sensors import BiasedSensor
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank

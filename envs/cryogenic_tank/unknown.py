@@ -5,10 +5,10 @@ from functools import partial
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.two_zones import TwoZones
-from rt_torchrl.plants.extensions.biased_sensor import BiasedSensor
-from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
+from rt_torchrl.plants.actuators import LaggedActuator
+from rt_torchrl.plants.extension import System, combined, require_systems
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sensors import BiasedSensor
 
 HOUR = 3600.0
 EPISODE = 120.0 * HOUR

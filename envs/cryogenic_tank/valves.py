@@ -13,7 +13,7 @@ class OnOffValve(ClassicalController):
     r"""A hysteresis valve that opens to a fixed drop above :math:`\tilde p + h` and shuts below :math:`\tilde p - h`.
 
     The valve starts shut. h = 1 kPa is not tuned: a narrower band always lowers J_a a little, but wears the valve out.
-    The drop is tuned: :func:`~rt_torchrl.control.tuning.tune` on twenty loads leaves it where it starts, at the end
+    The drop is tuned: :func:`~rt_torchrl.control.classical.tune` on twenty loads leaves it where it starts, at the end
     of the range.
     """
 
@@ -23,7 +23,7 @@ class OnOffValve(ClassicalController):
     half_band = 1e3  # h [Pa]
     memory_size = 1
 
-    def act(
+    def law(
         self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 1"]
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
         error = state[..., 2:] - self.plant.set_point
@@ -49,11 +49,11 @@ class RestingOnOff(OnOffValve):
     default_gains = (200e3, 43.2e3)
     memory_size = 2
 
-    def act(
+    def law(
         self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 2"]
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 2"]]:
         opening, rest = self.gains.unbind()
-        _, was_open = super().act(state, memory[..., :1])
+        _, was_open = super().law(state, memory[..., :1])
         t = memory[..., 1:]
         is_open = torch.where(t < self.plant.horizon - rest, was_open, 0.0)
         return self.plant.command.of_drop(is_open * opening), torch.cat([is_open, t + self.plant.dt], -1)
@@ -66,7 +66,7 @@ class PIValve(ClassicalController):
 
     The ``placed_gains`` give a time constant of τ = 12 h and K_I = K_P/(4τ): an open valve takes up 1.3 W per kPa of
     drop, and 1 W raises the pressure of the tank at the start by 8.3 Pa/h. From there
-    :func:`~rt_torchrl.control.tuning.tune` on twenty loads finds a tenfold gain and almost no integral. A load of
+    :func:`~rt_torchrl.control.classical.tune` on twenty loads finds a tenfold gain and almost no integral. A load of
     129 W is then held 1 kPa above the target, and an integral would only overshoot after starts that are 25 kPa off.
     """
 
@@ -76,7 +76,7 @@ class PIValve(ClassicalController):
     default_gains = (77.5, 6.1e-10)
     memory_size = 1
 
-    def act(
+    def law(
         self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 1"]
     ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
         K_P, K_I = self.gains.unbind()

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.cost import RunningCost, require_weights
+from rt_torchrl.plants.plant import RunningCost, require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.flapping_wing.plant import FlappingWing

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.disturbance import require_request
+from rt_torchrl.plants.sampling import require_request
 
 GREATEST = 30.0
 """Speed of a wind in which no drone flies [m/s]."""

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Measurement, Signal
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -72,7 +71,7 @@ def filtered_rate_z(plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: 
     return POSITION_FILTER * (state[..., -1] - state[..., 1])
 
 
-STROKE_PLANE = Measurement.of(ACTIONS[1], Component("state", 4), scale=30.0)
+STROKE_PLANE = Measurement.of(ACTIONS[1], scale=30.0)
 """The stroke plane angle that was applied last, of a drone that remembers it."""
 OF_FILTERED = (
     Measurement(symbol=r"\dot e_{x,F}", name="filtered_rate_x", unit="m/s", read=filtered_rate_x),
@@ -84,7 +83,7 @@ MEASUREMENTS = (
     Measurement(symbol="e_z", name="error_z", unit="m", read=error_z, scale=2.0),
     Measurement(symbol=r"\dot e_x", name="error_rate_x", unit="m/s", read=error_rate_x),
     Measurement(symbol=r"\dot e_z", name="error_rate_z", unit="m/s", read=error_rate_z),
-    Measurement.of(INPUTS[0], Component("exogenous", 0), offset=1.0),
+    Measurement.of(INPUTS[0], offset=1.0),
     Measurement(symbol=r"\cos 2\pi ft", name="phase_cosine", unit="-", low=-1.0, high=1.0, read=phase_cosine),
     Measurement(symbol=r"\sin 2\pi ft", name="phase_sine", unit="-", low=-1.0, high=1.0, read=phase_sine),
     STROKE_PLANE,

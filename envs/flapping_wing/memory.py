@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.envs.flapping_wing.measurements import ACTIONS, FILTERED, POSITION_FILTER, STATES
-from rt_torchrl.plants.lag import between, lag
+from rt_torchrl.plants.sampling import between, lag
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.flapping_wing.plant import FlappingWing

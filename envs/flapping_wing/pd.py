@@ -19,7 +19,7 @@ class TrimmedPD(ClassicalController):
     wind. On a drone that observes its position alone, the speeds are those of the filters of the position.
 
     The ``placed_gains`` give a point mass two poles at 2 rad/s, with 0.25 m/s² of lift per degree of A_φ and g of
-    thrust per radian of β_w. From there :func:`~rt_torchrl.control.tuning.tune` on twenty gusts finds steeper gains,
+    thrust per radian of β_w. From there :func:`~rt_torchrl.control.classical.tune` on twenty gusts finds steeper gains,
     with full stroke until the target is near.
     """
 
@@ -29,7 +29,7 @@ class TrimmedPD(ClassicalController):
     default_gains = (571.0, 397.0, 61.5, 44.0)
     trim = (76.74, -12.50)
 
-    def act(
+    def law(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 0"]
     ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 0"]]:
         K_Pz, K_Dz, K_Px, K_Dx = self.gains.unbind()

@@ -17,11 +17,10 @@ from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
 from rt_torchrl.envs.flapping_wing.suspects import further_suspects, suspects
 from rt_torchrl.envs.flapping_wing.wings import Wings
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.cost import RunningCost
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.sampling import require_stable_step
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.plants.stability import require_stable_step
 
 MASSES = (1e-5, 0.05)
 """Masses of which the lightest has a thousandth, and the heaviest ten times the weight that the wings carry [kg]."""

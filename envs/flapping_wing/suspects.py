@@ -3,10 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
-from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
+from rt_torchrl.plants.actuators import LaggedActuator, ResonantActuator
+from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 
 if TYPE_CHECKING:
@@ -27,13 +25,13 @@ def suspects(plant: "FlappingWing") -> Mapping[str, Plant]:
         return LaggedActuator(base, action, LAG)
 
     def late(base: Plant, action: str) -> Plant:
-        return SlowActuator(base, action, DEAD_TIME, stages=4)
+        return LaggedActuator(base, action, DEAD_TIME, stages=4)
 
     def swinging(base: Plant) -> Plant:
         return ResonantActuator(base, PLANE, FREQUENCY, DAMPING)
 
     def after(base: Plant, action: str) -> Plant:
-        return SlowActuator(base, action, SHORT_DEAD_TIME, stages=2)
+        return LaggedActuator(base, action, SHORT_DEAD_TIME, stages=2)
 
     return {
         "plane lags": lagging(plant, PLANE),

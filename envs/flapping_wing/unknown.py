@@ -4,14 +4,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.lagged_coefficients import LaggedCoefficients
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
-from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator
-from rt_torchrl.plants.extensions.slow_actuator import SlowActuator
-from rt_torchrl.plants.extensions.unread_input import UnreadInput
+from rt_torchrl.plants.actuators import LaggedActuator, ResonantActuator, ScaledActuator
+from rt_torchrl.plants.coefficients import LaggedCoefficients
+from rt_torchrl.plants.extension import System, combined, require_systems
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sensors import UnreadInput
 
 AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
 STAGES = 12
@@ -31,7 +28,7 @@ def late(plant: Plant, *, delay: float) -> Plant:
 
     Delay [s] of both actions: engineering guess; vision systems and radio links take 0.05 to 0.2 s.
     """
-    return SlowActuator(SlowActuator(plant, PLANE, delay, stages=STAGES), AMPLITUDE, delay, stages=STAGES)
+    return LaggedActuator(LaggedActuator(plant, PLANE, delay, stages=STAGES), AMPLITUDE, delay, stages=STAGES)
 
 
 def lagging(plant: Plant, *, amplitude: float, plane: float | None = None) -> Plant:

@@ -45,7 +45,6 @@ class Pendulum(Plant):
     """
 
     name = "pendulum"
-    own_scheme = True
 
     greatest_torque, greatest_speed = 2.0, 8.0  # [N m], [rad/s]
     greatest_initial_speed = 1.0  # [rad/s]

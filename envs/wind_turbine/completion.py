@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.measurements import FAST_FILTER, FAST_SPEED, STATES
-from rt_torchrl.plants.lag import between, lag
+from rt_torchrl.plants.sampling import between, lag
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.cost import require_weights
+from rt_torchrl.plants.plant import require_weights
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine

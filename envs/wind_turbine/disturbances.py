@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.disturbance import require_request
+from rt_torchrl.plants.sampling import require_request
 
 CUT_IN_SPEED = 3.0
 """Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""

@@ -52,7 +52,7 @@ class JonkmanController(ClassicalController):
         integral = pitch * (1.0 + pitch / self.c["PC_KK_rad"]) / self.c["PC_KI"]
         return torch.stack([self.plant.gear_ratio * state[:, 0], integral], -1)
 
-    def act(
+    def law(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 2"]
     ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 2"]]:
         speed, integral = memory.unbind(-1)

@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.extensions.actuator_coefficients import ActuatorCoefficients
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -30,12 +30,11 @@ class LaggedPower(Extension):
         ValueError: if the time constant is not positive and finite.
     """
 
-    own_scheme = False
     base: WindTurbine
 
     def __init__(self, base: WindTurbine, time_constant: float):
         meanings = {"force_lag": "time constant of the rotor's power"}
-        own = ActuatorCoefficients({"force_lag": "s"}, meanings, [time_constant])
+        own = PositiveCoefficients([time_constant], names={"force_lag": "s"}, meanings=meanings, factor=FACTOR)
         super().__init__(base, [Signal(symbol="P", name="lagged_power", unit="MW")], own.requires_grad_(False))
 
     advance = Plant.advance

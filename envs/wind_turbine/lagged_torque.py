@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -27,7 +27,6 @@ class LaggedTorque(Extension):
         ValueError: if the time constant is not positive and finite.
     """
 
-    own_scheme = False
     base: WindTurbine
 
     def __init__(self, base: WindTurbine, time_constant: float):

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement, Preview
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.signal import Measurement, Named, Preview, Signal
 
 if TYPE_CHECKING:
     from rt_torchrl.envs.wind_turbine.plant import WindTurbine
@@ -52,7 +51,7 @@ def speed_rate(plant: "WindTurbine", t: Tensor, state: Tensor, exogenous: Tensor
 
 
 def _of_state(index: int, *, offset: float = 0.0, scale: float = 1.0) -> Measurement:
-    return Measurement.of(STATES[index], Component("state", index), offset=offset, scale=scale)
+    return Measurement.of(STATES[index], offset=offset, scale=scale)
 
 
 def _ahead(lead: float) -> Measurement:
@@ -67,7 +66,7 @@ OF_FAST_SPEED = (
         unit="rad/s",
         low=RATED_SPEED - 2.0 * SPEED_SCALE,
         high=RATED_SPEED + SPEED_SCALE,
-        read=Component("state", 6),
+        read=Named(FAST_SPEED.name),
         offset=RATED_SPEED,
         scale=SPEED_SCALE,
     ),
@@ -83,14 +82,14 @@ OF_FAST_SPEED = (
 )
 MEASUREMENTS = (
     Measurement(symbol="e_1", name="speed_error", unit="-", low=-1.0, high=1.0, read=speed_error),
-    Measurement(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0, read=Component("state", 3)),
+    Measurement(symbol="e_2", name="speed_error_integral", unit="-", low=-1.0, high=1.0, read=Named(STATES[3].name)),
     _of_state(0, offset=1.26711, scale=0.2),
     _of_state(1, offset=RATED_SPEED, scale=SPEED_SCALE),
     _of_state(2, offset=WIND_AT_REST, scale=WIND_SCALE),
     _of_state(4, offset=21_546.775, scale=21_546.775),
     _of_state(5, scale=30.0),
     *OF_FAST_SPEED,
-    Measurement.of(INPUTS[0], Component("exogenous", 0), offset=WIND_AT_REST, scale=WIND_SCALE),
+    Measurement.of(INPUTS[0], offset=WIND_AT_REST, scale=WIND_SCALE),
     *map(_ahead, LEADS),
 )
 ERRORS = ("speed_error", "speed_error_integral")

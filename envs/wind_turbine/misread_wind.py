@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.extensions.extension import Extension, replaced
+from rt_torchrl.plants.extension import Extension, replaced
 from rt_torchrl.plants.plant import Plant
 
 
@@ -25,8 +25,6 @@ class MisreadWind(Extension):
     Raises:
         ValueError: if the gain is not positive and finite, or the turbine does not step by its vector field.
     """
-
-    own_scheme = False
 
     def __init__(self, base: Plant, gain: float, *, cutoff: float):
         if not 0.0 < gain < math.inf:

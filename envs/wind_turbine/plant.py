@@ -18,11 +18,10 @@ from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.smoothstep import smoothstep
 from rt_torchrl.envs.wind_turbine.suspects import further_suspects, suspects
-from rt_torchrl.plants.cost import RunningCost
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, RunningCost
 from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.plants.sampling import require_stable_step
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.plants.stability import require_stable_step
 
 DRIVETRAIN_INERTIA = 38_759_228.0 + 534.116 * 97.0**2
 """Inertia of rotor and generator on the low-speed shaft, 43 784 725 kg m² (NREL/TP-500-38060)."""

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
-from rt_torchrl.plants.extensions.lagged_actuator import LaggedActuator
-from rt_torchrl.plants.extensions.neural_residual import NeuralResidual
+from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator
+from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 
 if TYPE_CHECKING:

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
 from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
-from rt_torchrl.plants.extensions.delayed_actuator import DelayedActuator
-from rt_torchrl.plants.extensions.resonant_actuator import ResonantActuator
-from rt_torchrl.plants.extensions.scaled_coefficients import ScaledCoefficients
+from rt_torchrl.plants.actuators import DelayedActuator, ResonantActuator
+from rt_torchrl.plants.coefficients import ScaledCoefficients
+from rt_torchrl.plants.extension import System, combined, require_systems
 from rt_torchrl.plants.plant import Plant
 
 

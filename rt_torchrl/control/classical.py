@@ -1,7 +1,12 @@
-"""Classical controllers that learned policies are compared with: laws of the measured state, with or without memory."""
+"""Classical controllers: laws of the measured state, with or without memory, and the search for their gains.
+
+Learned policies are compared with them, and they act on a real system before any policy is trained.
+"""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,9 +14,9 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.rollout import drive_of, require_finite
+from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
 from rt_torchrl.trajectories.state_feedback import RememberingInterval
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 REMEDY = "Use a smaller dt, or gains that hold the system."
 
@@ -19,8 +24,9 @@ REMEDY = "Use a smaller dt, or gains that hold the system."
 class ClassicalController(nn.Module, ABC):
     r"""A law :math:`(a_k, m_{k+1}) = c(s_k, m_k)` with a memory m, which a ``policy(observation)`` cannot have.
 
-    A subclass defines :meth:`act`, and names its gains and the size of its memory if it has any. The controller keeps
-    the logarithms of its gains, so that a search changes a gain in proportion and never its sign.
+    A subclass defines :meth:`law`, and names its gains and the size of its memory if it has any. The controller keeps
+    the logarithms of its gains, so that a search changes a gain in proportion and never its sign. It is
+    :class:`StateFeedback`: :meth:`act` acts interval by interval and keeps the memory of the episode.
 
     Args:
         plant: the plant to control; its actuators limit range and rate.
@@ -58,14 +64,15 @@ class ClassicalController(nn.Module, ABC):
         self.register_buffer("low_action", low)
         self.register_buffer("high_action", high)
         self._engine = Native(compiled=compiled)
+        self._memory: Tensor | None = None
 
     @property
     def gains(self) -> Float[Tensor, " n_g"]:
-        """The gains in the order and the units of ``gain_units``, for :meth:`act`."""
+        """The gains in the order and the units of ``gain_units``, for :meth:`law`."""
         return self.log_gains.exp()
 
     def named_gains(self) -> dict[str, float]:
-        """The gains by name, for reports; numbers that :meth:`act` reads could not become machine code."""
+        """The gains by name, for reports; numbers that :meth:`law` reads could not become machine code."""
         return dict(zip(self.gain_units, self.log_gains.exp().tolist(), strict=True))
 
     def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
@@ -73,7 +80,7 @@ class ClassicalController(nn.Module, ABC):
         return state.new_zeros(len(state), self.memory_size)
 
     @abstractmethod
-    def act(
+    def law(
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command, which :meth:`respond` clamps to the ranges of the actions, and the new memory.
@@ -87,8 +94,25 @@ class ClassicalController(nn.Module, ABC):
         self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
     ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
         """The command within the ranges of the actions, and the new memory."""
-        command, memory = self.act(state, memory)
+        command, memory = self.law(state, memory)
         return command.clamp(self.low_action, self.high_action), memory
+
+    def begin(self) -> None:
+        """Begin an episode with the first memory."""
+        self._memory = None
+
+    @torch.no_grad()
+    def act(
+        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
+    ) -> Float[Tensor, "batch n_a"]:
+        """The command in the measured state, within the ranges of the actions; time and inputs are not used."""
+        memory = self.first_memory(state) if self._memory is None else self._memory
+        command, self._memory = self.respond(state, memory)
+        return command
+
+    def report(self) -> dict[str, float]:
+        """Nothing: see :meth:`StateFeedback.report`."""
+        return {}
 
     @torch.no_grad()
     def fly(
@@ -120,3 +144,62 @@ class ClassicalController(nn.Module, ABC):
         states = carries[..., : len(plant.states)].transpose(0, 1)
         command = loop.command(carries[:-1], drive).transpose(0, 1)
         return Trajectory(states, plant.actuate(states[:, :-1], command), exogenous)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuned:
+    """Mean J_a at the first gains and at the gains that the search found, and the number of its evaluations."""
+
+    start: float
+    best: float
+    evaluations: int
+
+
+def tune(
+    controller: ClassicalController,
+    initial_state: Float[Tensor, "batch n_s"],
+    exogenous: Float[Tensor, "batch n n_z"],
+    *,
+    evaluations: int = 80,
+    spread: float = 2.0,
+    plant: Plant | None = None,
+) -> Tuned:
+    """Minimise the mean J_a of the episodes over the logarithms of the gains by Nelder and Mead's simplex.
+
+    Args:
+        controller: the controller; the search starts from its present gains and leaves the best ones in it.
+        initial_state: initial states of the episodes.
+        exogenous: exogenous inputs of the episodes.
+        evaluations: greatest number of evaluations; each flies all episodes.
+        spread: factor on one gain between corners of the first simplex, more than 1.
+        plant: physics of the system that is flown; None for the controller's own plant.
+
+    Raises:
+        ValueError: if the controller has no gains, or an argument is out of its range.
+    """
+    from scipy.optimize import minimize  # here, because it takes a second to load and --help need not wait for it
+
+    if not len(controller.log_gains):
+        raise ValueError(f"controller {type(controller).__name__} has no gains to tune.")
+    if evaluations < 1 or not spread > 1.0:
+        raise ValueError(f"evaluations={evaluations} must be at least 1 and spread={spread} more than 1.")
+
+    system = controller.plant if plant is None else plant
+
+    @torch.no_grad()
+    def cost(log_gains: np.ndarray) -> float:
+        controller.log_gains.copy_(torch.as_tensor(log_gains, device=controller.log_gains.device))
+        try:
+            value = control_cost(system, controller.fly(initial_state, exogenous, plant=system)).mean().item()
+        except DivergenceError:
+            return np.inf  # a flight that leaves the finite numbers is worse than any other
+        return value if np.isfinite(value) else np.inf
+
+    first = controller.log_gains.detach().cpu().numpy().copy()
+    simplex = np.vstack([first, first + np.log(spread) * np.eye(len(first))])
+    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-2, "fatol": 1e-4}
+    start = cost(first)
+    found = minimize(cost, first, method="Nelder-Mead", options=options)
+    with torch.no_grad():
+        controller.log_gains.copy_(torch.as_tensor(found.x, device=controller.log_gains.device))
+    return Tuned(start=start, best=float(found.fun), evaluations=int(found.nfev) + 1)

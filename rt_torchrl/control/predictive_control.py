@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.control.forecasts import Decaying, Forecast, Held, Scattered
-from rt_torchrl.control.receding_horizon import RecedingHorizon, Solve
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig, Solve
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.trajectory import Trajectory

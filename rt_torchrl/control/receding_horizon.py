@@ -1,31 +1,244 @@
-"""Model predictive control: the best commands over a horizon, planned again every period."""
+"""Model predictive control: the best commands over a horizon by bounded descent, planned again every period."""
 
+import functools
 import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.bounded_descent import descend
-from rt_torchrl.control.command_cost import CommandCost, TerminalCost
+from rt_torchrl.control.command_cost import PENALTY, CommandCost, TerminalCost
 from rt_torchrl.control.forecasts import Forecast, Futures, Held
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
-from rt_torchrl.control.shared_commands import SharedCommands
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import constant
 
+DIVERGED = 1e6
+"""Cost of a trial that diverges, in costs of the start: greater than any that a line search accepts."""
 Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Function from end times ``batch``, states ``batch n_s`` and inputs ``batch n_z`` there to a cost V ``batch``."""
 Guess = Callable[[Tensor, Tensor], Tensor]
 """Function from states ``batch n_s`` and forecast inputs ``batch n n_z`` to commands ``batch n n_a``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundedDescentConfig:
+    """How commands descend a cost.
+
+    The cost is divided by its value at the start, so that no parameter depends on a plant's units.
+
+    Args:
+        iterations: greatest number of iterations.
+        tolerance: relative decrease of the cost in an iteration below which the descent stops.
+        gradient: greatest component of the projected gradient, of the relative cost, below which the descent stops.
+        memory: number of pairs that approximate the curvature.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    iterations: int = 1000
+    tolerance: float = 1e-10
+    gradient: float = 1e-8
+    memory: int = 20
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument in ("iterations", "memory"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the descent must be at least 1.")
+        for argument in ("tolerance", "gradient"):
+            if not getattr(self, argument) >= 0.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the descent must not be negative.")
+
+
+class Minimum(NamedTuple):
+    """The best point that a descent found, its cost and gradient, and the number of evaluations."""
+
+    point: np.ndarray
+    cost: float
+    gradient: np.ndarray
+    evaluations: int
+
+
+class _Seen:
+    """The function that L-BFGS-B calls; it remembers the best point."""
+
+    def __init__(self, evaluate: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray):
+        self._evaluate, self._shape = evaluate, start.shape
+        cost, gradient = evaluate(start)
+        if not (np.isfinite(cost) and np.isfinite(gradient).all()):
+            raise FloatingPointError("the cost or its gradient is not finite at the start of the descent.")
+        self.best, self._scale, self._first = Minimum(start, cost, gradient, 1), abs(cost) or 1.0, True
+        self.count = 1
+
+    def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
+        if self._first and (flat == self.best.point.ravel()).all():  # L-BFGS-B begins at the start
+            cost, gradient = self.best.cost, self.best.gradient
+        else:
+            point = flat.reshape(self._shape)
+            cost, gradient = self._evaluate(point)
+            self.count += 1
+            if not (np.isfinite(cost) and np.isfinite(gradient).all()):
+                return DIVERGED, np.zeros_like(flat)
+            if cost < self.best.cost:
+                self.best = Minimum(point.copy(), cost, gradient, self.count)
+        self._first = False
+        return cost / self._scale, gradient.ravel() / self._scale
+
+
+def descend(
+    evaluate: Callable[[Float[np.ndarray, "..."]], tuple[float, Float[np.ndarray, "..."]]],
+    start: Float[np.ndarray, "..."],
+    config: BoundedDescentConfig,
+) -> Minimum:
+    """Minimise a cost over a box [0, 1] in all variables.
+
+    Args:
+        evaluate: function from a point to cost and gradient; a trial that is not finite counts as a bad one.
+        start: first point, in the box.
+        config: parameters of the descent.
+
+    Raises:
+        FloatingPointError: if the cost is not finite at the start.
+
+    Source: Zhu, Byrd, Lu and Nocedal, ACM Trans. Math. Softw. 23 (1997) 550, in SciPy.
+    """
+    from scipy.optimize import fmin_l_bfgs_b  # here, because it takes a second to load and --help need not wait for it
+
+    seen = _Seen(evaluate, start)
+    with _libraries().limit(limits=1, user_api="blas"):
+        fmin_l_bfgs_b(  # ``minimize`` converts the bounds two times more, in a tenth of a solve of a short window
+            seen,
+            start.ravel(),
+            bounds=[(0.0, 1.0)] * start.size,
+            m=config.memory,
+            factr=config.tolerance / np.finfo(float).eps,
+            pgtol=config.gradient,
+            maxiter=config.iterations,
+            maxfun=2 * config.iterations + 20,
+        )
+    return seen.best._replace(evaluations=seen.count)
+
+
+@functools.cache
+def _libraries() -> Any:
+    """The linear algebra of NumPy and SciPy.
+
+    L-BFGS-B takes scalar products of thousands of numbers. Two threads wait for each other in each of them, and on a
+    machine with other work they wait for milliseconds.
+    """
+    from threadpoolctl import ThreadpoolController  # after SciPy, whose libraries it finds
+
+    return ThreadpoolController()
+
+
+def projected_gradient(
+    point: Float[np.ndarray, "batch ..."], gradient: Float[np.ndarray, "batch ..."]
+) -> Float[np.ndarray, " batch"]:
+    """Norm of the part of the gradient that leads into the box [0, 1]; zero where no feasible direction descends."""
+    outwards = ((point <= 0.0) & (gradient > 0.0)) | ((point >= 1.0) & (gradient < 0.0))
+    inwards = np.where(outwards, 0.0, gradient)
+    return np.sqrt(np.square(inwards).reshape(len(point), -1).sum(-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecedingHorizonConfig:
+    """Parameters of model predictive control.
+
+    Args:
+        horizon: length of the window over which a plan is made [s].
+        period: time between two plans [s]; None for the time that a command is held.
+        hold: time for which a command of a plan is held [s]; None for a control interval.
+        ends: whether a window ends with the episode, whose last intervals cost nothing after it; otherwise it rolls on.
+        penalty: weight of (command − applied)² over the squared range, in units of L_a; see :class:`CommandCost`.
+        iterations: greatest number of iterations of L-BFGS-B in a solve.
+        tolerance: relative decrease of the cost in an iteration below which a solve ends.
+        memory: number of pairs that approximate the curvature.
+        deadline: longest wall-clock time of a solve [s]; after it the last plan goes on.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    horizon: float
+    period: float | None = None
+    hold: float | None = None
+    ends: bool = False
+    penalty: float = PENALTY
+    iterations: int = 20
+    tolerance: float = 1e-4
+    memory: int = 10
+    deadline: float = math.inf
+
+    def __post_init__(self) -> None:
+        check_options(self, infinite=("deadline",))
+        for argument in ("horizon", "period", "hold", "deadline"):
+            value = getattr(self, argument)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{argument}={value} s of the receding horizon must be positive.")
+        if not self.penalty >= 0.0:
+            raise ValueError(f"penalty={self.penalty} of the receding horizon must not be negative.")
+        self.descent()  # which has ranges of its own
+
+    def descent(self) -> BoundedDescentConfig:
+        """The parameters of a solve."""
+        return BoundedDescentConfig(
+            iterations=self.iterations, tolerance=self.tolerance, gradient=0.0, memory=self.memory
+        )
+
+
+class SharedCommands:
+    r"""The mean cost of several futures, which share the commands until the next plan, and its gradient, as one point.
+
+    .. math:: J = \frac1S\sum_{i\le S} J_i(u_0, \dots, u_{p-1}, u^{(i)}_p, \dots, u^{(i)}_{m-1})
+
+    At the next plan the input is measured again, so that the later commands are those of one future each. A plan whose
+    commands are shared to the end cannot answer what comes, and is too cautious; a plan for one future is too bold.
+
+    Args:
+        cost: cost of each future, one realisation of its window each.
+        shared: number p of held commands that all futures share, at least 1.
+
+    Source: Lucia, Finkler and Engell, J. Process Control 23 (2013) 1306, with a tree that branches once.
+    """
+
+    def __init__(self, cost: CommandCost, shared: int):
+        self.cost, self.shared = cost, shared
+
+    def point(self, plans: Float[np.ndarray, "n_futures m n_a"]) -> Float[np.ndarray, "variables n_a"]:
+        """The variables of a plan for each future; where they must share commands, the means."""
+        first = plans[:, : self.shared].mean(0)
+        return np.concatenate([first, plans[:, self.shared :].reshape(-1, plans.shape[-1])])
+
+    def plans(self, point: Float[np.ndarray, "variables n_a"], count: int) -> Float[np.ndarray, "{count} m n_a"]:
+        """The plan of each of ``count`` futures; p is less where the window is shorter."""
+        if count == 1:
+            return point[None]
+        n_a = point.shape[-1]
+        shared = min(len(point), self.shared)
+        first = np.broadcast_to(point[:shared], (count, shared, n_a))
+        return np.concatenate([first, point[shared:].reshape(count, -1, n_a)], 1)
+
+    def __call__(
+        self, point: Float[np.ndarray, "variables n_a"], count: int
+    ) -> tuple[float, Float[np.ndarray, "variables n_a"]]:
+        """J and its gradient by the variables of ``count`` futures."""
+        costs, slopes = self.cost(self.plans(point, count))
+        if count == 1:
+            return float(costs[0]), slopes[0]
+        first = slopes[:, : self.shared].sum(0)
+        slope = np.concatenate([first, slopes[:, self.shared :].reshape(-1, slopes.shape[-1])])
+        return float(costs.mean()), slope / count
 
 
 class Solve(NamedTuple):

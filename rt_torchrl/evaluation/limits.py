@@ -12,13 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.bounded_descent import BoundedDescentConfig
-from rt_torchrl.control.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
 from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.control.receding_horizon import RecedingHorizon
-from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
+from rt_torchrl.control.receding_horizon import BoundedDescentConfig, RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.evaluation.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
@@ -169,7 +167,7 @@ def classical(episodes: UnseenEpisodes, kind: type[ClassicalController], *, call
     controller = kind(episodes.physics)
     flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1, : len(episodes.plant.readings)]
     memory = controller.first_memory(state)
-    return judged(episodes, flown, timed(lambda: controller.act(state, memory), calls))
+    return judged(episodes, flown, timed(lambda: controller.law(state, memory), calls))
 
 
 def learned(episodes: UnseenEpisodes, policy: nn.Module, *, calls: int = 50) -> Contender:

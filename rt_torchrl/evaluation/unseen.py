@@ -18,7 +18,7 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
 
 if TYPE_CHECKING:
-    from rt_torchrl.plants.state_bounds import StateBounds
+    from rt_torchrl.plants.signal import StateBounds
 
 UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""

@@ -8,9 +8,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.fit.sensor_record import SensorRecord
 from rt_torchrl.fit.sensors import Sensor
-from rt_torchrl.plants.measurement import Component
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import differences
+from rt_torchrl.plants.signal import differences, state_read
 
 FIRST_NOISE = 0.1
 """First guess of an unknown noise level, as a share of the scatter of the readings."""
@@ -48,12 +47,12 @@ def state_sizes(
     drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
     sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
     for column, sensor in enumerate(sensors):
-        place = sensor.measurement.read
-        if isinstance(place, Component) and place.of == "state":
+        place = state_read(sensor.measurement.read, plant.states)
+        if place is not None:
             values = torch.cat([record.readings[:, column] for record in records])
             values = values[~values.isnan()]
             scatter = (values - values.mean()).square().mean().sqrt()
-            sizes[place.index] = torch.maximum(sizes[place.index], scatter)
+            sizes[place] = torch.maximum(sizes[place], scatter)
     return torch.where(sizes > 0.0, sizes, 1.0)
 
 

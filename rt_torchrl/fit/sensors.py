@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.measurement import Component, Measurement, Named, Preview
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Measurement, Named, Preview, state_read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,26 +55,19 @@ def known_sensors(plant: Plant) -> dict[str, Sensor]:
     plant, its actions and inputs, is known and is no sensor.
     """
     driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
-    lacking = len(plant.states)  # states from here on are there only if they are asked for
+    there = {signal.name for signal in plant.states}  # some are there only if they are asked for
     found = {
         m.name: Sensor(measurement=m)
         for m in plant.measurements
         if m.name not in driven
         and not isinstance(m.read, Preview)
-        and not (isinstance(m.read, Component) and m.read.of == "state" and m.read.index >= lacking)
+        and not (isinstance(m.read, Named) and m.read.name not in there)
     }
     states = {
-        signal.name: Sensor(measurement=Measurement.of(signal, Component("state", k)))
-        for k, signal in enumerate(plant.states)
-        if signal.name not in driven
+        signal.name: Sensor(measurement=Measurement.of(signal)) for signal in plant.states if signal.name not in driven
     }
-    own = {name for name in found.keys() & states if not _reads_as_it_is(found[name], states[name])}
+    own = {name for name in found.keys() & states if found[name].measurement.read != Named(name)}
     return found | {name: sensor for name, sensor in states.items() if name not in own}
-
-
-def _reads_as_it_is(own: Sensor, plain: Sensor) -> bool:
-    """Whether a plant's own measurement gives the state of its name as it is."""
-    return own.measurement.read in (plain.measurement.read, Named(plain.name))
 
 
 def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:
@@ -129,9 +122,9 @@ def read_slopes(
 ) -> Float[Tensor, "batch n n_y n_s"]:
     """Derivatives of the readings by the state, in every sample."""
 
-    places = [sensor.measurement.read for sensor in sensors]
-    if all(isinstance(place, Component) and place.of == "state" for place in places):
-        rows = [place.index for place in places if isinstance(place, Component)]
+    places = [state_read(sensor.measurement.read, plant.states) for sensor in sensors]
+    rows = [place for place in places if place is not None]
+    if len(rows) == len(places):
         unit = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)[rows]
         return unit.expand(*states.shape[:2], -1, -1)
 

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.fit.sensor_log import SensorLog, logged_states
-from rt_torchrl.plants.integrators import rk4_step
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sampling import rk4_step
 
 Law = Callable[[Float[Tensor, ""], Float[Tensor, "1 n_s"], Float[Tensor, "1 n_z"]], Float[Tensor, "1 n_a"]]
 """A control law: a function from time [s], state and exogenous input to a command. It may have a memory."""
@@ -30,7 +30,7 @@ class ClassicalLaw:
 
     def __call__(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         memory = self._controller.first_memory(state) if self._memory is None else self._memory
-        command, self._memory = self._controller.act(state, memory)
+        command, self._memory = self._controller.law(state, memory)
         return command.clamp(self._controller.low_action, self._controller.high_action)
 
 
@@ -58,7 +58,7 @@ def recorded(
         ValueError: if an argument is out of its range, or there is jitter and the plant has a scheme of its own.
     """
     _require_recordable(plant, jitter, noise)
-    n = plant.n_steps
+    n, own_scheme = plant.n_steps, plant.own_scheme
     state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
     offsets = jitter * (torch.rand(n + 1, generator=generator, dtype=torch.float64, device=generator.device) - 0.5)
     offsets[0] = 0.0
@@ -69,7 +69,7 @@ def recorded(
         command = law(times[k], state, z)
         applied = plant.actuate(state, command)
         rows.append(torch.cat([state, applied, z], -1))
-        if k < n and plant.own_scheme:
+        if k < n and own_scheme:
             state = plant.step(times[k], state, command, z, plant.closure).state
         elif k < n:
             state = _held(plant, times[k], state, applied, z, (times[k + 1] - times[k]).item())

@@ -1,5 +1,6 @@
 """Closures of general use: any ``closure(features) -> coefficients`` can replace a plant's own."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,40 +10,59 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.policies import mlp
 
+FACTOR = 30.0
+"""Factor within which coefficients of an extension are identified: records do not show what lies beyond."""
+
 
 class PositiveCoefficients(nn.Module):
-    """Base of a closure with a few positive coefficients, which a subclass names.
+    r"""A few positive coefficients, named by a subclass or the arguments: a closure, or parameters of an extension.
 
     By default the closure gives these coefficients whatever the features are. A law that depends on its features, such
     as a polynomial of the speed, overrides ``forward``.
 
-    The trained weights are the logarithms of the coefficients. The coefficients therefore stay positive, and a step
-    changes each of them by the same percentage, whatever its size and unit.
+    The trained weights w are the logarithms of the coefficients. The coefficients therefore stay positive, and a step
+    changes each of them by the same percentage, whatever its size and unit. With a ``factor`` they also stay within it
+    of the first values, :math:`c = c_0\,f^{\tanh w}` with w = 0 at first, so that an identification cannot lose a
+    coefficient that a record no longer shows.
 
     Args:
         coefficients: values of the coefficients, in the order and the units of ``names``.
+        names: unit of each coefficient, by name; None for those of the class.
+        meanings: what each coefficient is, by name; None for those of the class.
+        factor: greatest factor f by which a coefficient differs from its first value; None for no bound.
 
     Raises:
         ValueError: if the number of coefficients is wrong, one of them is not positive and finite, or a meaning is
             given for a coefficient that does not exist.
     """
 
-    names: dict[str, str]
+    names: dict[str, str] = {}
     """Unit of each coefficient, by name."""
     meanings: dict[str, str] = {}
     """What each coefficient is, in a few words, by name; tables of results show it."""
-    true_coefficients: tuple[float, ...]
+    true_coefficients: tuple[float, ...] = ()
     """Coefficients of the real system."""
+    first: Tensor
 
-    def __init__(self, coefficients: Float[Tensor, " n"]):
+    def __init__(
+        self,
+        coefficients: Float[Tensor, " n"] | Sequence[float],
+        *,
+        names: dict[str, str] | None = None,
+        meanings: dict[str, str] | None = None,
+        factor: float | None = None,
+    ):
         super().__init__()
+        self.names = dict(self.names if names is None else names)
+        self.meanings = dict(self.meanings if meanings is None else meanings)
         coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
         shape = (len(self.names),)
         if coefficients.shape != shape or not (coefficients.isfinite() & (coefficients > 0.0)).all():
             wanted = ", ".join(f"{name} [{unit}]" for name, unit in self.names.items())
+            known = f"; those of the real system are {self.true_coefficients}" if self.true_coefficients else ""
             raise ValueError(
-                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and finite; "
-                f"those of the real system are {self.true_coefficients}."
+                f"coefficients={coefficients.tolist()} of {type(self).__name__} must be {wanted}, positive and "
+                f"finite{known}."
             )
         unknown = self.meanings.keys() - self.names.keys()
         if unknown:
@@ -50,7 +70,12 @@ class PositiveCoefficients(nn.Module):
                 f"meanings of {type(self).__name__} describes {', '.join(sorted(unknown))}, which names lacks; its "
                 f"coefficients are {', '.join(self.names)}."
             )
-        self.log_coefficients = nn.Parameter(coefficients.log())
+        self.factor = factor
+        if factor is None:
+            self.log_coefficients = nn.Parameter(coefficients.log())
+        else:
+            self.register_buffer("first", coefficients.clone())
+            self.weights = nn.Parameter(torch.zeros_like(coefficients))
 
     @classmethod
     def true(cls) -> "PositiveCoefficients":
@@ -60,10 +85,14 @@ class PositiveCoefficients(nn.Module):
     @property
     def coefficients(self) -> Float[Tensor, " n"]:
         """The coefficients in the units of ``names``."""
-        return self.log_coefficients.exp()
+        if self.factor is None:
+            return self.log_coefficients.exp()
+        return self.first * torch.exp(math.log(self.factor) * torch.tanh(self.weights))
 
-    def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch n"]:
-        """The coefficients for every row of features, in the order of ``names``."""
+    def forward(self, features: Float[Tensor, "*batch f"] | None = None) -> Float[Tensor, "*batch n"]:
+        """The coefficients for every row of features, or once, in the order of ``names``."""
+        if features is None:
+            return self.coefficients
         return self.coefficients.expand(*features.shape[:-1], len(self.names))
 
     def named_coefficients(self) -> dict[str, Tensor]:

@@ -7,25 +7,31 @@ integrates the vector field over that interval. :meth:`Plant.step` is the map of
 .. math:: s_{k+1} = \Phi(t_k, s_k, a_k, z_k; w_p).
 
 The real system and its digital twin have the *same* map: they differ in the closure that they pass to it.
+
+An episode may end early, such as by overspeed or ground contact. A system that has ended stays in the state in which it
+ended, and each moment after the end t_e costs L_e:
+
+.. math:: J_a = \frac1{T_o}\Big(\int_0^{t_e} L_a\,dt + (T_o - t_e) L_e\Big)
+
+There is no terminal cost Φ_a then. With an absorbing state the cost of an episode is one number, however long the
+episode lasts, and the value of what comes after the end is known: a learner with the discount γ per interval counts
+:math:`-L_e/(1 - \gamma)`.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.discrepancy import Discrepancy
-from rt_torchrl.plants.ending import Ending
-from rt_torchrl.plants.episode_length import whole_steps
-from rt_torchrl.plants.integrators import rk4_step
-from rt_torchrl.plants.measurement import Measurement, Preview, chosen
-from rt_torchrl.plants.merits import Merits
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.policies import SaturatedAffine
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.sampling import rk4_step, whole_steps
+from rt_torchrl.plants.shapes import Action, Actions, Cost, Ended, Input, Inputs, Observation, State, States, Time
+from rt_torchrl.plants.signal import Measurement, Preview, Signal, bounds, chosen, differences
 
 
 class Transition(NamedTuple):
@@ -35,16 +41,16 @@ class Transition(NamedTuple):
     applied: Tensor
 
 
-class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
+class Plant(nn.Module, ABC):
     """Physics and control problem of one system; ``envs/`` holds examples.
 
     A subclass declares its signals in the four class attributes (``inputs`` may be empty), and defines
     :meth:`vector_field`, :meth:`observe`, :meth:`running_cost`, :meth:`draw_initial_state`, :meth:`draw_exogenous` and
-    :meth:`make_closure`. If it declares ``measurements``, of which a policy may observe any
-    choice, ``observations`` and :meth:`observe` follow from the choice. Every method is pure and takes any leading
-    batch dimensions; the last dimension is that of the signals. A method must work when it is compiled, batched and
-    differentiated: it contains no clamp, detach, random number, device choice or Python branch on a tensor.
-    :func:`rt_torchrl.check_plant` finds where a subclass does not fulfil this.
+    :meth:`make_closure`. If it declares ``measurements``, of which a policy may observe any choice, ``observations``
+    and :meth:`observe` follow from the choice. Every method is pure and takes any leading batch dimensions; the last
+    dimension is that of the signals. A method must work when it is compiled, batched and differentiated: it contains no
+    clamp, detach, random number, device choice or Python branch on a tensor. :func:`rt_torchrl.check_plant` finds where
+    a subclass does not fulfil this.
 
     Args:
         dt: control interval and integration step Δt [s].
@@ -68,24 +74,17 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
     """What the sensors give; empty in a plant that defines ``observations`` and :meth:`observe` itself."""
     observation_sets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """Names of measurements that are observed together, by the name of the set."""
-    own_scheme: bool = False
-    """Whether :meth:`advance` has a scheme of its own, which a twin must follow to the last digit.
-
-    The engine ``odeint_adjoint`` cannot follow it and is refused. A class that overrides :meth:`advance` has one,
-    unless it says False itself.
-    """
     controller_states: tuple[str, ...] = ()
     """Names of the states that a controller computes, such as filters, integrals and the actions applied last.
 
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
+    state_sizes: tuple[float, ...] = ()
+    """Differences c_i of the states that count alike in the default discrepancy, in their units; by default ones."""
+    end_cost: float | None = None
+    """Cost L_e of each moment after an early end [unit of L_a]; None in a plant whose episodes never end early."""
     unread: int = 0
     """Number of states, the last ones, that no sensor reads; twins and policies do not know of them."""
-
-    def __init_subclass__(cls, **options: Any):
-        super().__init_subclass__(**options)
-        if "advance" in vars(cls) and "own_scheme" not in vars(cls):
-            cls.own_scheme = cls.advance is not Plant.advance
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
@@ -119,6 +118,21 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
         return self.states[: len(self.states) - self.unread]
 
     @property
+    def innermost(self) -> "Plant":
+        """The plant that extensions extend; a plant that extends none is its own."""
+        return self
+
+    @property
+    def own_scheme(self) -> bool:
+        """Whether :meth:`step` has a scheme of its own, where other ones would integrate another system.
+
+        A plant that overrides neither :meth:`step` nor :meth:`advance` has none. Of another plant, the interval is
+        computed both ways, at states and inputs that it draws.
+        """
+        kind = type(self)
+        return not (kind.step is Plant.step and kind.advance is Plant.advance) and not _steps_by_runge_kutta(self)
+
+    @property
     def horizon(self) -> float:
         """Length of an episode T_o [s]."""
         return self.n_steps * self.dt
@@ -126,50 +140,25 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
     # The system
 
     @abstractmethod
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """Time derivative of the state, ds/dt = f(t, s, a, z, g(s; w_p)), for a held action and exogenous input."""
 
-    def actuate(
-        self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch n_a"]:
+    def actuate(self, state: State, command: Action) -> Action:
         """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
-    def latch(
-        self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch n_s"]:
+    def latch(self, state: State, applied: Action) -> State:
         """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
 
-    def advance(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """The state after Δt under a held action, by one Runge-Kutta step of the vector field.
 
-        A plant that overrides this method has a scheme of its own; see :attr:`own_scheme`.
+        A plant may override this method by a scheme of its own; see :attr:`own_scheme`.
         """
         return rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
 
-    def step(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        command: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Transition:
+    def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
         r"""One control interval from ``t`` on, :math:`\Phi`: actuate, advance under the held action, latch.
 
         The closure is the true one in the real system, and the learned one in the twin.
@@ -177,18 +166,13 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
         applied = self.actuate(state, command)
         return Transition(self.latch(self.advance(t, state, applied, exogenous, closure), applied), applied)
 
-    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> Float[Tensor, "*batch n_s"]:
+    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
         return read
 
     # The control problem
 
-    def observe(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-    ) -> Float[Tensor, "*batch n_o"]:
+    def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         """The observation of the policies, scaled to order one, such as tracking errors.
 
         Raises:
@@ -201,21 +185,57 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
         return torch.stack(seen, -1)
 
     @abstractmethod
-    def running_cost(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-    ) -> Float[Tensor, "*batch"]:
+    def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         r"""Lagrangian L_a of the control problem; the reward is −L_a.
 
         .. math:: J_a = \frac1{T_o}\Big(\int L_a\,dt + \Phi_a(s(T_o))\Big)
         """
 
-    def terminal_cost(self, state: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch"]:
+    def terminal_cost(self, state: State) -> Cost:
         """Cost Φ_a of the state at the end of an episode, in the unit of L_a times seconds; by default zero."""
         return state.new_zeros(state.shape[:-1])
+
+    def ended(self, state: State) -> Ended:
+        """Whether an episode has ended in this state; by default never.
+
+        A plant that overrides this method sets :attr:`end_cost`, greater than what L_a is in a bad episode, or else an
+        early end would pay.
+        """
+        return torch.zeros_like(state[..., 0], dtype=torch.bool)
+
+    def discrepancy(self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]) -> Cost:
+        r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`.
+
+        By default it is half the sum of the squared differences in units of :attr:`state_sizes`, with a periodic state
+        the short way round:
+
+        .. math:: L_p(s, \check s) = \tfrac12 \sum_i \Big(\frac{s_i - \check s_i}{c_i}\Big)^2
+
+        Raises:
+            ValueError: if ``state_sizes`` has not one entry for each state, or one that is not positive.
+        """
+        sizes = self.state_sizes or (1.0,) * len(self.states)
+        if len(sizes) != len(self.states) or not all(size > 0.0 for size in sizes):
+            named = ", ".join(f"{signal.name} [{signal.unit}]" for signal in self.states)
+            raise ValueError(f"state_sizes={sizes} of plant {self.name!r} must have one positive number each: {named}.")
+        return 0.5 * ((differences(self.states, state, measured) / state.new_tensor(sizes)) ** 2).sum(-1)
+
+    def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
+        """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""
+        return {}
+
+    def setpoints(
+        self,
+        states: Float[Tensor, "*batch n n_s"],
+        applied: Float[Tensor, "*batch n n_a"],
+        exogenous: Float[Tensor, "*batch n n_z"],
+    ) -> dict[str, tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]]:
+        """Quantities to be held, named with their units: value and setpoint in each interval; by default none."""
+        return {}
+
+    def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
+        """Kinds of episodes, by name, for which results are also shown separately; by default none."""
+        return {}
 
     def complete_states(
         self,
@@ -295,3 +315,93 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
 
     def extra_repr(self) -> str:
         return f"name={self.name!r}, dt={self.dt} s, horizon={self.horizon} s"
+
+
+@torch.no_grad()
+def _steps_by_runge_kutta(plant: Plant) -> bool:
+    """Whether an interval of the plant is a Runge-Kutta step of its vector field, which it may wrap, to rounding."""
+    device = next((tensor.device for tensor in (*plant.buffers(), *plant.parameters())), torch.device("cpu"))
+    generator = torch.Generator(device=device).manual_seed(0)
+    state, exogenous = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)[:, 0]
+    t = torch.zeros(1, dtype=state.dtype, device=device)
+    low, high = bounds(plant.actions, device=device)
+    command = (low + 0.3 * (high - low)).nan_to_num(0.0, 0.0, 0.0).expand(2, -1)
+    applied = plant.actuate(state, command)
+    own = plant.step(t, state, command, exogenous, plant.closure).state
+    runge_kutta = plant.latch(Plant.advance(plant, t, state, applied, exogenous, plant.closure), applied)
+    return torch.allclose(own, runge_kutta, rtol=1e-12, atol=1e-12)
+
+
+def require_end_cost(plant: Plant) -> None:
+    """Refuse a plant whose episodes end early at no cost, or at one that is no number.
+
+    Raises:
+        ValueError: if there is no finite ``end_cost``.
+    """
+    # An extension ends where its plant does.
+    if type(plant.innermost).ended is not Plant.ended and plant.end_cost is None:
+        raise ValueError(
+            f"plant {plant.name!r} defines ended() and no end_cost; set it to the cost of each moment after an early "
+            "end, greater than the running cost of a bad episode."
+        )
+    if plant.end_cost is not None and not torch.tensor(plant.end_cost).isfinite():
+        raise ValueError(f"end_cost={plant.end_cost} of plant {plant.name!r} must be finite.")
+
+
+def held(plant: Plant, state: State, end: State) -> Tensor:
+    """The state at the end of an interval that began in ``state``: the same one if the episode had ended in it."""
+    return end if plant.end_cost is None else torch.where(plant.ended(state).unsqueeze(-1), state, end)
+
+
+def cost_rate(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, exogenous: Tensor) -> Cost:
+    """L_a in an interval that began in ``state``, or L_e if the episode had ended in it."""
+    running = plant.running_cost(t, state, applied, exogenous)
+    if plant.end_cost is None:
+        return running
+    return torch.where(plant.ended(state), torch.full_like(running, plant.end_cost), running)
+
+
+def final_cost(plant: Plant, state: State) -> Cost:
+    """Φ_a of the last state of an episode, or zero if the episode had ended in it."""
+    terminal = plant.terminal_cost(state)
+    return terminal if plant.end_cost is None else torch.where(plant.ended(state), torch.zeros_like(terminal), terminal)
+
+
+def flight_costs(
+    plant: Plant,
+    t: Tensor,
+    states: Float[Tensor, "*batch m n_s"],
+    applied: Float[Tensor, "*batch n n_a"],
+    exogenous: Float[Tensor, "*batch n n_z"],
+) -> tuple[Float[Tensor, "*batch n"], Ended]:
+    """L_a in each interval of a flight, or L_e from its early end on, and whether it has ended by its last state.
+
+    A flight under recorded actions may leave the state again in which it ended, unlike one of :func:`held`.
+    """
+    running = plant.running_cost(t, states[..., :-1, :], applied, exogenous)
+    if plant.end_cost is None:
+        return running, torch.zeros_like(states[..., 0, 0], dtype=torch.bool)
+    over = plant.ended(states).cumsum(-1) > 0
+    return torch.where(over[..., :-1], torch.full_like(running, plant.end_cost), running), over[..., -1]
+
+
+@runtime_checkable
+class RunningCost(Protocol):
+    """A running cost L_a of a plant, of any batch dimensions; it must not be negative."""
+
+    def __call__(self, plant: Any, t: Time, state: State, applied: Action, exogenous: Input) -> Cost: ...
+
+
+def require_weights(cost: RunningCost) -> None:
+    """Refuse options of a cost that do not fit their types, and weights that are negative.
+
+    Args:
+        cost: a dataclass whose numbers are its weights.
+
+    Raises:
+        ValueError: if an option is of another type, or a weight is negative or not finite.
+    """
+    check_options(cost)
+    for name, weight in vars(cost).items():
+        if isinstance(weight, int | float) and weight < 0.0:
+            raise ValueError(f"{name}={weight} of {type(cost).__name__} must not be negative.")

@@ -7,6 +7,8 @@ Time = Float[Tensor, "*#batch"]
 """Time t [s], one for all realisations or one for each."""
 State = Float[Tensor, "*batch n_s"]
 """States s."""
+Hidden = Float[Tensor, "*batch n_x"]
+"""Hidden states x of an extension, which no sensor reads."""
 Action = Float[Tensor, "*batch n_a"]
 """Commands or applied actions a."""
 Input = Float[Tensor, "*#batch n_z"]

@@ -1,9 +1,13 @@
-"""One scalar of a plant: its symbol, unit and range."""
+r"""Signals of a plant: symbol, unit and range; measurements, of which a policy observes some; bounds on states.
 
+An observation is a measurement y from an offset, in units of a scale, so that it is of order one: :math:`(y - o)/c`.
+"""
+
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -11,8 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.options import require_number
+from rt_torchrl.plants.shapes import State
 
 Values = TypeVar("Values", Tensor, np.ndarray)
+OUTSIDE = " outside [%]"
+"""End of the name of how often a state is outside its bounds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,3 +97,254 @@ def bounds(
         for end in ("low", "high")
     )
     return low, high
+
+
+@runtime_checkable
+class Read(Protocol):
+    """Computes a measurement of a plant from the time, the state and the exogenous input: any such function will do."""
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        """The value, of the shape of ``state[..., 0]``, or one that is broadcast to it.
+
+        Args:
+            plant: the plant, with its parameters.
+            t: time [s].
+            state: states of the plant.
+            exogenous: exogenous inputs of the interval.
+        """
+
+
+@dataclass(frozen=True)
+class Named:
+    """Reads the state or the exogenous input of a name.
+
+    Args:
+        name: name of its signal.
+    """
+
+    name: str
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        for signals, values in ((plant.states, state), (plant.acting_inputs, exogenous)):
+            for place, signal in enumerate(signals):
+                if signal.name == self.name:
+                    return values[..., place]
+        known = ", ".join(signal.name for signal in (*plant.states, *plant.acting_inputs))
+        raise ValueError(
+            f"measurement {self.name!r} of plant {plant.name!r} is none of its states and inputs {known}; give it a "
+            "function read(plant, t, state, exogenous)."
+        )
+
+
+def state_read(read: Read, states: Sequence[Signal]) -> int | None:
+    """Place of the state that is read as it is; None for what is computed of several, or is no state."""
+    names = [signal.name for signal in states]
+    return names.index(read.name) if isinstance(read, Named) and read.name in names else None
+
+
+@dataclass(frozen=True)
+class Phase:
+    r"""Reads the phase of something that recurs, such as the time of the day: :math:`\cos 2\pi t/T` or the sine.
+
+    Cosine and sine together tell the phase without a jump.
+
+    Args:
+        of: cosine or sine.
+        period: length T of a turn [s].
+
+    Raises:
+        ValueError: if ``of`` is something else, or the period is not positive and finite.
+    """
+
+    of: Literal["cosine", "sine"]
+    period: float
+
+    def __post_init__(self) -> None:
+        if self.of not in ("cosine", "sine"):
+            raise ValueError(f"of={self.of!r} of a Phase must be cosine or sine.")
+        require_number("period", self.period)
+        if not self.period > 0.0:
+            raise ValueError(f"period={self.period} s of a Phase must be positive.")
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        turn = 2.0 * math.pi / self.period * t
+        return torch.cos(turn) if self.of == "cosine" else torch.sin(turn)
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Reads an exogenous input that is to come, such as the wind that a lidar measures ahead of the rotor.
+
+    A plant that is asked for a preview has one more exogenous input for it, which :meth:`Plant.with_previews` computes
+    of the whole series.
+
+    Args:
+        index: place of the input among the inputs that act on the plant.
+        lead: time ahead [s].
+    """
+
+    index: int
+    lead: float
+
+    def __call__(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        return exogenous[..., len(plant.acting_inputs) + plant.previews.index(self)]
+
+    def shifted(self, exogenous: Float[Tensor, "*batch n n_b"], dt: float) -> Float[Tensor, "*batch n"]:
+        """The input ``lead`` later; beyond the end of the series, its last value.
+
+        Raises:
+            ValueError: if the time ahead is no whole number of control intervals ``dt`` [s].
+        """
+        steps = round(self.lead / dt)
+        if steps < 1 or not math.isclose(steps * dt, self.lead, rel_tol=1e-9):
+            raise ValueError(
+                f"a preview of {self.lead} s needs a control interval that divides it; dt={dt} s does not."
+            )
+        series = exogenous[..., self.index]
+        held = series[..., -1:].expand(*series.shape[:-1], min(steps, series.shape[-1]))
+        return torch.cat([series[..., steps:], held], -1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement(Signal):
+    """A signal that the sensors of a plant give.
+
+    Args:
+        read: function ``read(plant, t, state, exogenous)`` that computes the value, in ``unit``.
+        offset: value that a policy observes as zero, in ``unit``.
+        scale: change that a policy observes as one, in ``unit``.
+
+    Raises:
+        ValueError: if the scale is not positive, or the offset not finite.
+    """
+
+    read: Read
+    offset: float = 0.0
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.scale > 0.0 and math.isfinite(self.scale) and math.isfinite(self.offset)):
+            raise ValueError(
+                f"Measurement {self.name!r} has offset={self.offset} and scale={self.scale} {self.unit}; the scale "
+                "must be positive, and both finite."
+            )
+
+    @classmethod
+    def of(cls, signal: Signal, read: Read | None = None, *, offset: float = 0.0, scale: float = 1.0) -> "Measurement":
+        """The measurement of a state or an exogenous input.
+
+        Args:
+            signal: signal of the state or input.
+            read: what reads it; None for the state or input of the signal's name.
+            offset: value that a policy observes as zero, in the signal's unit.
+            scale: change that a policy observes as one, in the signal's unit.
+        """
+        read = Named(signal.name) if read is None else read
+        return cls(**dataclasses.asdict(signal), read=read, offset=offset, scale=scale)
+
+    @property
+    def signal(self) -> Signal:
+        """The signal alone."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(Signal)}
+        return Signal(**fields)
+
+    @property
+    def observation(self) -> Signal:
+        """What a policy observes of it."""
+        low, high = ((bound - self.offset) / self.scale for bound in (self.low, self.high))
+        return Signal(symbol=self.symbol, name=self.name, unit="-", low=low, high=high)
+
+    @property
+    def scaling(self) -> str:
+        """The observation in words; empty if the measurement is observed as it is."""
+        if (self.offset, self.scale) == (0.0, 1.0):
+            return ""
+        return f"({self.name} - {self.offset:.9g} {self.unit}) / {self.scale:.9g} {self.unit}"
+
+    def observed(self, plant: Any, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+        """The observation (y − offset)/scale."""
+        return (self.read(plant, t, state, exogenous) - self.offset) / self.scale
+
+
+def chosen(
+    plant: str, wanted: Sequence[str], measurements: Sequence[Measurement], sets: Mapping[str, Sequence[str]]
+) -> tuple[Measurement, ...]:
+    """The measurements that a policy observes, each once and in the order in which they are asked for.
+
+    Args:
+        plant: name of the plant, for the message.
+        wanted: names of measurements and of sets of them; nothing means the first set.
+        measurements: all measurements of the plant.
+        sets: names of measurements, by the name of the set.
+
+    Raises:
+        ValueError: if there is no such measurement or set.
+    """
+    if isinstance(wanted, str):
+        raise ValueError(f"observe={wanted!r} of plant {plant!r} must be a sequence of names, such as ({wanted!r},).")
+    known = {measurement.name: measurement for measurement in measurements}
+    wanted = wanted or tuple(sets)[:1] or tuple(known)
+    unknown = [name for name in wanted if name not in known and name not in sets]
+    if unknown:
+        raise ValueError(
+            f"observe={tuple(wanted)} of plant {plant!r}: {', '.join(unknown)} does not exist; choose among the sets "
+            f"{', '.join(sets) or '(none)'} and the measurements {', '.join(known) or '(none)'}."
+        )
+    names = dict.fromkeys(name for word in wanted for name in sets.get(word, (word,)))
+    return tuple(known[name] for name in names)
+
+
+class StateBounds:
+    """Least and greatest values of some states that sensors read, and by how much trajectories leave them.
+
+    Args:
+        readings: the states that sensors read.
+        states: least and greatest value of each bounded state, by name, in its unit; infinite for no bound.
+
+    Raises:
+        ValueError: if there is no such state.
+    """
+
+    def __init__(self, readings: Sequence[Signal], states: Mapping[str, tuple[float, float]]):
+        places = {signal.name: k for k, signal in enumerate(readings)}
+        unknown = sorted(set(states) - set(places))
+        if unknown:
+            raise ValueError(f"bounded states {', '.join(unknown)} do not exist; the plant has {', '.join(places)}.")
+        self.names = list(states)
+        self._places = [places[name] for name in self.names]
+        self._units = [readings[place].unit for place in self._places]
+        self._low, self._high = ([states[name][end] for name in self.names] for end in (0, 1))
+        self._widths = [_width(*states[name]) for name in self.names]
+
+    def __bool__(self) -> bool:
+        """Whether there is any bound."""
+        return bool(self.names)
+
+    def beyond(self, states: State) -> list[Float[Tensor, "*batch n_b"]]:
+        """How far each bounded state lies below its least and above its greatest value, in shares of the width.
+
+        The width is that between the bounds or, with one bound, its size. Within the bounds both are negative.
+        """
+        seen, widths = states[..., self._places], states.new_tensor(self._widths)
+        return [(states.new_tensor(self._low) - seen) / widths, (seen - states.new_tensor(self._high)) / widths]
+
+    def shares(self, states: State) -> Float[Tensor, "*batch n_b"]:
+        """How far each bounded state lies outside, in shares of the width; zero within the bounds."""
+        return sum((torch.relu(side) for side in self.beyond(states)), start=torch.zeros_like(states[..., :1]))
+
+    def merit(self, states: Float[Tensor, "batch samples n_s"]) -> dict[str, Float[Tensor, " batch"]]:
+        """How often each state is beyond its bounds, and how far at most, in each of some episodes."""
+        found: dict[str, Tensor] = {}
+        outside = self.shares(states[:, 1:]).unbind(-1)
+        for name, unit, width, share in zip(self.names, self._units, self._widths, outside, strict=True):
+            found[f"{name}{OUTSIDE}"] = 100.0 * (share > 0.0).double().mean(-1)
+            found[f"{name} beyond [{unit}]"] = width * share.amax(-1)
+        return found
+
+
+def _width(low: float, high: float) -> float:
+    """The size by which an excess is measured."""
+    if math.isfinite(high - low):
+        return high - low
+    return next((abs(end) for end in (low, high) if math.isfinite(end) and end), 1.0)

@@ -1,7 +1,6 @@
 """The physics that the twin of a run knows, once plants, controllers and options are found to go together."""
 
-from rt_torchrl.contract.check import check_plant
-from rt_torchrl.control.check import require_controller
+from rt_torchrl.contract.check import check_plant, require_controller
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.plants.plant import Plant

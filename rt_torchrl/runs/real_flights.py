@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
@@ -71,7 +70,7 @@ def contenders(
     if known or not clones(policy, untrained[live]):
         found[live] = Contender(f"the live policy ({live.replace('_', '-')})", partial(asked.fly, policy))
     if config.start == "controller" and first is not None:
-        controller = ActingController(first(algorithm.twin.plant).to(device))
+        controller = first(algorithm.twin.plant).to(device)
         name = first.__name__ if first.__name__ not in baselines else f"{first.__name__} (first)"
         found[name] = Contender(name, partial(asked.fly, controller))
     for name, law in baselines.items():

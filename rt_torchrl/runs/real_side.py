@@ -5,12 +5,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.state_bounds import StateBounds
+from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operating_limits import OperatingLimits
@@ -65,7 +64,7 @@ def simulated(
     if not config.twinning.limits:
         return env
     limits = OperatingLimits(plant, config.twinning.limits)
-    controller = None if first is None else ActingController(first(plant, compiled=compiled).to(device))
+    controller = None if first is None else first(plant, compiled=compiled).to(device)
     zero = env.action_spec.zero()
     low, high = (zero.new_tensor(end) for end in limits.actions)
     rest = torch.minimum(torch.maximum(zero, low), high).clamp(env.action_spec.space.low, env.action_spec.space.high)
@@ -86,5 +85,5 @@ def judged_on(
     else:
         unseen = TwinEpisodes(twin, plant, config.unseen, device=device)
     physics = twin.plant
-    unseen.physics, unseen.bounds = physics, StateBounds(plant, config.twinning.bounded_states)
+    unseen.physics, unseen.bounds = physics, StateBounds(plant.readings, config.twinning.bounded_states)
     return unseen

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import nn
 
-from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.fit.column import Column
@@ -60,7 +59,7 @@ def start_of(config: RunConfig, plant: Plant, controller: type[ClassicalControll
         if controller is None:
             raise ValueError("start='controller' needs the controller: give Run(..., first=...), or start='random'.")
         law = controller(plant)
-        return lambda physics, closure: FirstController(ActingController(law).to(_device_of(physics, closure)))
+        return lambda physics, closure: FirstController(law.to(_device_of(physics, closure)))
     if name == "mpc":
         # No critic has learned anything yet that could price the end of a window.
         options = dataclasses.replace(config.twinning.planner.receding_horizon, terminal="plant")

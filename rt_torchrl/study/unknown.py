@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from rt_torchrl.plants.extensions.catalogue import System, require_systems
+from rt_torchrl.plants.extension import System, require_systems
 
 
 def by_plant(names: Sequence[str], systems: Mapping[str, Mapping[str, System]]) -> dict[str, tuple[str, ...]]:

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.control.tuning import tune
+from rt_torchrl.control.classical import ClassicalController, tune
 from rt_torchrl.evaluation.limits import (
     Contender,
     LimitConfig,

@@ -19,8 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.plants.ending import final_cost
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, final_cost
 from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.purity import require_pure_once
@@ -206,7 +205,7 @@ def refusal(engine: Engine, plant: Plant) -> str | None:
     """The reason why an engine cannot roll a plant out, for a message; None if it can."""
     if engine not in ENGINES:
         return f"engine={engine!r} does not exist; choose one of {', '.join(get_args(Engine))}."
-    if (plant.own_scheme or plant.end_cost is not None) and not ENGINES[engine].own_scheme:
+    if not ENGINES[engine].own_scheme and (plant.own_scheme or plant.end_cost is not None):
         others = _listed(name for name, kind in ENGINES.items() if kind.own_scheme)
         does = "steps by a scheme of its own" if plant.own_scheme else "has episodes that end early"
         return f"engine={engine!r} integrates the vector field, but plant {plant.name!r} {does}; use {others}."

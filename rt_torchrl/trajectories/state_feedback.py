@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.ending import held
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, held
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.trajectory import Trajectory
 

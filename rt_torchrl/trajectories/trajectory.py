@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.plants.ending import flight_costs
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, flight_costs
 
 
 class Scenario(NamedTuple):
@@ -97,7 +96,7 @@ def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: flo
 def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"]:
     r"""J_a of each trajectory, :math:`\frac1{T_o}\big(\int L_a\,dt + \Phi_a(s_n)\big)` by its samples.
 
-    Where it ends early, it costs L_e from there on; see :mod:`rt_torchrl.plants.ending`.
+    Where it ends early, it costs L_e from there on; see :mod:`rt_torchrl.plants.plant`.
     """
     states, actions, exogenous, start = trajectory
     n = actions.shape[-2]

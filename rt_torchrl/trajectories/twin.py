@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.ending import require_end_cost
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.programs.fingerprint import fingerprint
 from rt_torchrl.trajectories.rollout import Engine, Rollout, able
 from rt_torchrl.trajectories.sensitivity import Sensitivities

@@ -13,8 +13,8 @@ from rt_torchrl.fit.sensors import Sensor, sensors_of, with_biases
 from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
-from rt_torchrl.plants.measurement import Component
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import state_read
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
@@ -130,8 +130,7 @@ class FirstStates:
 
     def __init__(self, plant: Plant, sensors: tuple[Sensor, ...]):
         drawn = plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(0))
-        reads = [sensor.measurement.read for sensor in sensors]
-        own = [read.index if isinstance(read, Component) and read.of == "state" else None for read in reads]
+        own = [state_read(sensor.measurement.read, plant.states) for sensor in sensors]
         self._columns = [column for column, k in enumerate(own) if k is not None]
         self._read = [k for k in own if k is not None]
         self._mean = drawn.mean(0)

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.plants.ending import cost_rate, final_cost, held
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.plant import Plant, cost_rate, final_cost, held
 
 
 class Drive(NamedTuple):

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.options import quoted
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.trajectories.twin import DigitalTwin

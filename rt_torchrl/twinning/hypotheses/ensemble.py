@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.options import quoted
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine, able
 from rt_torchrl.trajectories.trajectory import Trajectory

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.trajectory import Trajectory

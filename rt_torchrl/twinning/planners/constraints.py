@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.state_bounds import StateBounds
+from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners.constraints_config import ConstraintsConfig
@@ -37,7 +37,7 @@ class Constraints:
     """
 
     def __init__(self, plant: Plant, config: ConstraintsConfig):
-        self.bounds, self.config = StateBounds(plant, config.states), config
+        self.bounds, self.config = StateBounds(plant.readings, config.states), config
         self.reference = 0.0
         self.multipliers = [0.0 for _ in self.bounds.names]
         self._excess = list(self.multipliers)

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
-from rt_torchrl.plants.ending import cost_rate
+from rt_torchrl.plants.plant import cost_rate
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -13,7 +13,7 @@ class FirstController:
     """A controller flies one episode before all others, and policies imitate it; see :class:`Start` for the members.
 
     Args:
-        controller: the controller, as :class:`StateFeedback`, such as :class:`ActingController` around a classical one,
+        controller: the controller, as :class:`StateFeedback`, such as a :class:`ClassicalController`,
             or :class:`PredictiveControl` on the closure of the twin.
     """
 

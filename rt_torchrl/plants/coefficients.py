@@ -1,4 +1,4 @@
-"""A force that follows the flow with a lag: the coefficients of the closure are filtered."""
+"""Coefficients of a plant's closure that reach the system late, or as a share."""
 
 import math
 
@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.extensions.actuator_coefficients import ActuatorCoefficients
-from rt_torchrl.plants.extensions.extension import Extension
+from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Hidden, Input, State, Time
 from rt_torchrl.plants.signal import Signal
 
 
@@ -59,14 +60,7 @@ class LaggedCoefficients(Extension):
 
     initial: Tensor
 
-    def __init__(
-        self,
-        base: Plant,
-        time_constant: float,
-        start: tuple[float, ...],
-        *,
-        elements: tuple[int, ...] = (),
-    ):
+    def __init__(self, base: Plant, time_constant: float, start: tuple[float, ...], *, elements: tuple[int, ...] = ()):
         if isinstance(base, Extension):
             raise ValueError(
                 "LaggedCoefficients changes the closure of the plant itself; extend its result, not its base."
@@ -77,39 +71,24 @@ class LaggedCoefficients(Extension):
                 f"start holds {len(start)} coefficients; it must hold as many for each of {places} places."
             )
         hidden = [Signal(symbol=f"c_{k}", name=f"lagged_coefficient_{k}", unit="-") for k in range(len(start))]
-        super().__init__(base, hidden, self._coefficients(time_constant).requires_grad_(False))
+        names, meanings = {"force_lag": "s"}, {"force_lag": "time constant of the force"}
+        own = PositiveCoefficients([time_constant], names=names, meanings=meanings, factor=FACTOR)
+        super().__init__(base, hidden, own)
         self._shape = (*elements, len(start) // places)
         self.register_buffer("initial", torch.tensor(start, dtype=torch.float64))
 
-    def _at_places(self, held: Float[Tensor, "*batch n"]) -> Float[Tensor, "..."]:
+    def _at_places(self, held: Hidden) -> Float[Tensor, "..."]:
         """The hidden states in the shape of what the closure gives."""
         return held.reshape(*held.shape[:-1], *self._shape)
 
-    def _coefficients(self, time_constant: float) -> ActuatorCoefficients:
-        return ActuatorCoefficients({"force_lag": "s"}, {"force_lag": "time constant of the force"}, [time_constant])
-
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         base, held = self.split(state)
         lagging = _Lagging(self.of_base(closure), self._at_places(held), torch.ones_like(self.initial[0]))
         field = self.base.vector_field(t, base, action, exogenous, lagging)
         said = lagging.said[0].reshape(held.shape)
         return torch.cat([field, (said - held) / closure.get_submodule("own")()[0]], -1)
 
-    def advance(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         base, held = self.split(state)
         steps = self.dt / closure.get_submodule("own")()[0]
         left = torch.exp(-steps)
@@ -118,5 +97,49 @@ class LaggedCoefficients(Extension):
         mean = torch.stack(lagging.said).mean(0).reshape(held.shape)
         return torch.cat([end, mean + (held - mean) * left], -1)
 
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n"]:
+    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Hidden:
         return self.initial.expand(*base.shape[:-1], len(self.initial))
+
+
+class _Scaled(nn.Module):
+    """A closure times a gain.
+
+    Args:
+        closure: the closure.
+        gain: the gain.
+    """
+
+    def __init__(self, closure: nn.Module, gain: float):
+        super().__init__()
+        self.closure, self.gain = closure, gain
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.gain * self.closure(features)
+
+
+class ScaledCoefficients(Extension):
+    """A plant on which a share of its closure's coefficients acts, such as a rotor with losses in its shaft.
+
+    It has no hidden states, and its closure is that of the plant, which can take all of it.
+
+    Args:
+        base: the plant, perhaps extended by what has no parameters of its own.
+        gain: share of all coefficients.
+
+    Raises:
+        ValueError: if the gain is not positive and finite, or the base has parameters of its own.
+    """
+
+    def __init__(self, base: Plant, gain: float):
+        if not 0.0 < gain < math.inf:
+            raise ValueError(f"gain={gain} of the coefficients must be positive and finite.")
+        if isinstance(base, Extension) and base.of_base(base.closure) is not base.closure:
+            raise ValueError("ScaledCoefficients changes the closure of the plant itself; extend its result.")
+        super().__init__(base, [])
+        self.gain = gain
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+        return self.base.vector_field(t, state, action, exogenous, _Scaled(closure, self.gain))
+
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
+        return self.base.advance(t, state, applied, exogenous, _Scaled(closure, self.gain))

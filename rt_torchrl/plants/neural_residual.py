@@ -9,37 +9,32 @@ from torch import Tensor, nn
 
 from rt_torchrl.options import quoted
 from rt_torchrl.plants.closures import BoundedPerceptron
-from rt_torchrl.plants.extensions.extension import Extension, OwnParameters
-from rt_torchrl.plants.innermost import innermost
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Input, State, Time
 from rt_torchrl.plants.signal import Signal
 
 Range = tuple[float, float]
 
 
-class ResidualRates(OwnParameters):
+class ResidualRates(nn.Module):
     """The network of a :class:`NeuralResidual`; its weights have no names and no units.
 
     Args:
         ranges: range of each feature, which is scaled to [−1, 1].
         bounds: greatest absolute value of each rate.
         hidden: width of each hidden layer.
-        seed: seed of the first weights; those of the last layer are zero.
+        seed: seed of the first weights; those of the last layer are zero, so that all rates are.
     """
 
     def __init__(self, ranges: Sequence[Range], bounds: Sequence[float], hidden: Sequence[int], seed: int):
         super().__init__()
-        self._arguments = ranges, bounds, hidden, seed
         generator = torch.Generator().manual_seed(seed)
         self.network = BoundedPerceptron(ranges, bounds, hidden=hidden, generator=generator)
 
     def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch m"]:
         """The rates."""
         return self.network(features)
-
-    def fresh(self) -> "ResidualRates":
-        """The network as it began, whose rates are zero, to be trained."""
-        return ResidualRates(*self._arguments)
 
 
 class NeuralResidual(Extension):
@@ -88,19 +83,13 @@ class NeuralResidual(Extension):
         for name, (_, signal) in zip(inputs, signals, strict=True):
             scaled += _scaled(signal, given.get(name))
         own = ResidualRates(scaled, bounds, tuple(hidden), seed)
-        super().__init__(base, [], own.requires_grad_(False))
-        self.own_scheme, self._whole = base.own_scheme, type(base).advance is Plant.advance
+        super().__init__(base, [], own)
+        self._whole = not base.own_scheme
         self._seen = signals
         names = list(greatest)
         self._rates = [names.index(s.name) if s.name in names else None for s in base.states]
 
-    def residual(
-        self,
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def residual(self, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """What the network adds to the rates of all states [state unit / s]."""
         met = exogenous + torch.zeros_like(state[..., :1])
         values, features = torch.cat([action, state, met], -1), []
@@ -114,25 +103,11 @@ class NeuralResidual(Extension):
         rates, zero = closure.get_submodule("own")(torch.stack(features, -1)), torch.zeros_like(state[..., 0])
         return torch.stack([zero if k is None else rates[..., k] for k in self._rates], -1)
 
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         field = self.base.vector_field(t, state, action, exogenous, self.of_base(closure))
         return field + self.residual(state, action, exogenous, closure)
 
-    def advance(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """One Runge-Kutta step of the sum, or the plant's own scheme between two halves of the residual's step."""
         if self._whole:
             return Plant.advance(self, t, state, applied, exogenous, closure)
@@ -147,7 +122,7 @@ class NeuralResidual(Extension):
 
 def _bounds(base: Plant, greatest: Mapping[str, float]) -> list[float]:
     """Greatest residual of each state that has one [state unit / s]."""
-    names, inner = [state.name for state in base.readings], innermost(base)
+    names, inner = [state.name for state in base.readings], base.innermost
     sizes = dict(zip((state.name for state in inner.states), inner.state_sizes, strict=False))
     if not greatest:
         raise ValueError(f"greatest names no state of plant {base.name!r}; choose some of {quoted(names)}.")

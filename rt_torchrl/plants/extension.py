@@ -1,13 +1,27 @@
-"""A plant with additional dynamics, which no sensor reads."""
+"""A plant with additional dynamics, which no sensor reads, and real systems that are made of such plants by name."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import (
+    Action,
+    Actions,
+    Cost,
+    Ended,
+    Hidden,
+    Input,
+    Inputs,
+    Observation,
+    State,
+    States,
+    Time,
+)
 from rt_torchrl.plants.signal import Signal
 
 
@@ -43,16 +57,8 @@ class ExtendedClosure(nn.Module):
         """The parameters of each of the nested extensions, those of the innermost first."""
         return [*(self.base.all_own if isinstance(self.base, ExtendedClosure) else ()), self.own]
 
-    def forward(self, features: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
+    def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch n"]:
         return self.base(features)
-
-
-class OwnParameters(nn.Module, ABC):
-    """The parameters of an extension."""
-
-    @abstractmethod
-    def fresh(self) -> nn.Module:
-        """Parameters with the values that a twin begins with, to be trained."""
 
 
 class Extension(Plant):
@@ -61,13 +67,14 @@ class Extension(Plant):
     .. math:: (\bar a, x_{k+1}) = r(t_k, x_k, a_k; w), \qquad s_{k+1} = \Phi(t_k, s_k, \bar a, z_k; w_p)
 
     Here ā is the action that acts on the plant while the actuators believe that a does. The states are those of the
-    plant followed by x; the control problem is that of the plant. Parameters w are in the closure, beside those of the
-    plant's closure, so that a twin of the extended plant identifies both. Extensions nest.
+    plant followed by x. Task and draws are those of the plant, in its :meth:`true_state` and under the action that
+    acts, so that an extension says how its dynamics differ and nothing else. Parameters w are in the closure, beside
+    those of the plant's closure, so that a twin of the extended plant identifies both. Extensions nest.
 
     Args:
         base: the plant.
         hidden: signals of the hidden states x.
-        own: parameters w of the true system, with which a twin begins afresh; None for none.
+        own: parameters w of the true system, which are frozen; None for none. A twin begins with :meth:`fresh` ones.
 
     Raises:
         ValueError: if the plant overrides ``step`` as a whole, so that nothing can act between actuator and system, or
@@ -75,9 +82,8 @@ class Extension(Plant):
     """
 
     name = "extension"  # until the plant gives its own
-    own_scheme = True  # between samples the hidden states follow their exact solution, not the vector field
 
-    def __init__(self, base: Plant, hidden: Sequence[Signal], own: OwnParameters | None = None):
+    def __init__(self, base: Plant, hidden: Sequence[Signal], own: nn.Module | None = None):
         if type(base).step is not Plant.step:
             raise ValueError(
                 f"plant {base.name!r} overrides step(), so that nothing can act between its actuators and its system; "
@@ -88,163 +94,133 @@ class Extension(Plant):
         twice = {signal.name for signal in base.states} & {signal.name for signal in hidden}
         if twice:
             raise ValueError(f"plant {base.name!r} already has the states {', '.join(sorted(twice))}.")
-        closure = base.closure if own is None else ExtendedClosure(base.closure, own)
+        closure = base.closure if own is None else ExtendedClosure(base.closure, own.requires_grad_(False))
         super().__init__(dt=base.dt, horizon=base.horizon, closure=closure)
         self.base, self.name, self.unread = base, base.name, base.unread + len(hidden)
         self.states, self.actions, self.inputs = (*base.states, *hidden), base.actions, base.inputs
         self.observations, self.observed, self.previews = base.observations, base.observed, base.previews
         self.controller_states, self.end_cost = base.controller_states, base.end_cost
-        self._fresh = None if own is None else own.fresh
+        self._parameterised = own is not None
+
+    @property
+    def innermost(self) -> Plant:
+        return self.base.innermost
+
+    @property
+    def own_scheme(self) -> bool:
+        """Whether hidden states follow their exact solution between samples, or the plant has its own scheme."""
+        if type(self).advance is Plant.advance:
+            return False
+        return len(self.states) > len(self.base.states) or self.base.own_scheme or super().own_scheme
 
     # The additional dynamics
 
-    def respond(
-        self,
-        hidden: Float[Tensor, "*batch n_x"],
-        applied: Float[Tensor, "*batch n_a"],
-        closure: nn.Module,
-    ) -> tuple[Float[Tensor, "*batch n_a"], Float[Tensor, "*batch n_x"]]:
-        """The action that acts in this interval, and the hidden states at its end; by default both as they are."""
-        return applied, hidden
+    def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
+        """The action that acts in this interval, and the hidden states at its end; by default :meth:`acting`, and x."""
+        return self.acting(hidden, applied), hidden
 
-    def rates(
-        self,
-        hidden: Float[Tensor, "*batch n_x"],
-        applied: Float[Tensor, "*batch n_a"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_x"]:
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
         """The rates of the hidden states, whose solution over an interval :meth:`respond` gives."""
         return torch.zeros_like(hidden)
 
-    def acting(
-        self, hidden: Float[Tensor, "*batch n_x"], applied: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch n_a"]:
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
         """The action that acts at the start of an interval, by which its cost is judged; by default the applied one."""
         return applied
 
-    def meeting(
-        self, hidden: Float[Tensor, "*batch n_x"], exogenous: Float[Tensor, "*#batch n_z"]
-    ) -> Float[Tensor, "*#batch n_z"]:
+    def meeting(self, hidden: Hidden, exogenous: Input) -> Input:
         """The inputs that act on the plant in an interval; by default those that sensors read."""
         return exogenous
 
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch n_x"]:
+    def true_state(self, state: State) -> Float[Tensor, "*batch n_b"]:
+        """The states of the plant, by which cost, end and merit are judged; by default those that sensors read."""
+        return self.split(state)[0]
+
+    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Hidden:
         """The hidden states at the start of an episode, from the states of the plant; by default there are none."""
         return base[..., :0]
 
-    # The system
+    def fresh(self) -> nn.Module:
+        """The parameters w that a twin begins with, to be trained; by default those of the true system."""
+        return copy.deepcopy(self.closure.get_submodule("own")).requires_grad_()
 
-    def split(
-        self, state: Float[Tensor, "*batch n_s"]
-    ) -> tuple[Float[Tensor, "*batch n_b"], Float[Tensor, "*batch n_x"]]:
-        """States of the plant and hidden states."""
+    # The dynamics
+
+    def split(self, state: State) -> tuple[Float[Tensor, "*batch n_b"], Hidden]:
+        """States of the plant, as sensors read them, and hidden states."""
         n = len(self.base.states)
         return state[..., :n], state[..., n:]
 
     def of_base(self, closure: nn.Module) -> nn.Module:
         """The part of the closure that belongs to the plant."""
-        return closure if self._fresh is None else closure.get_submodule("base")
+        return closure.get_submodule("base") if self._parameterised else closure
 
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         base, hidden = self.split(state)
         acting, met = self.acting(hidden, action), self.meeting(hidden, exogenous)
         field = self.base.vector_field(t, base, acting, met, self.of_base(closure))
         return torch.cat([field, self.rates(hidden, action, closure)], -1)
 
-    def advance(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """The plant's own scheme under the mean of the action that acts on it in this interval."""
         base, hidden = self.split(state)
         acting, end = self.respond(hidden, applied, closure)
         met = self.meeting(hidden, exogenous)
         return torch.cat([self.base.advance(t, base, acting, met, self.of_base(closure)), end], -1)
 
-    def actuate(
-        self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch n_a"]:
+    def actuate(self, state: State, command: Action) -> Action:
         return self.base.actuate(self.split(state)[0], command)
 
-    def latch(
-        self, state: Float[Tensor, "*batch n_s"], applied: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch n_s"]:
+    def latch(self, state: State, applied: Action) -> State:
         base, hidden = self.split(state)
         return torch.cat([self.base.latch(base, applied), hidden], -1)
 
-    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> Float[Tensor, "*batch n_s"]:
-        base = self.base.at_rest(read)
+    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
+        return self._with_rest(self.base.at_rest(read))
+
+    def _with_rest(self, base: Float[Tensor, "*batch n_b"]) -> State:
         return torch.cat([base, self.rest(base)], -1)
 
-    # The control problem, which is that of the plant
+    # The task, which is that of the plant
 
-    def observe(
-        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch n_s"], exogenous: Float[Tensor, "*#batch n_z"]
-    ) -> Float[Tensor, "*batch n_o"]:
+    def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         return self.base.observe(t, self.split(state)[0], exogenous)
 
-    def running_cost(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch n_a"],
-        exogenous: Float[Tensor, "*#batch n_z"],
-    ) -> Float[Tensor, "*batch"]:
-        base, hidden = self.split(state)
-        return self.base.running_cost(t, base, self.acting(hidden, applied), exogenous)
+    def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
+        acting = self.acting(self.split(state)[1], applied)
+        return self.base.running_cost(t, self.true_state(state), acting, exogenous)
 
-    def terminal_cost(self, state: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch"]:
-        return self.base.terminal_cost(self.split(state)[0])
+    def terminal_cost(self, state: State) -> Cost:
+        return self.base.terminal_cost(self.true_state(state))
 
-    def ended(self, state: Float[Tensor, "*batch n_s"]) -> Bool[Tensor, "*batch"]:
-        return self.base.ended(self.split(state)[0])
+    def ended(self, state: State) -> Ended:
+        return self.base.ended(self.true_state(state))
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
-    ) -> Float[Tensor, "*batch"]:
+    def discrepancy(self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]) -> Cost:
         """The discrepancy of the plant; hidden states, which no sensor reads, are not compared."""
         return self.base.discrepancy(self.split(state)[0], self.split(measured)[0])
 
-    def merit(
-        self,
-        states: Float[Tensor, "batch samples n_s"],
-        applied: Float[Tensor, "batch n n_a"],
-        exogenous: Float[Tensor, "batch n n_z"],
-    ) -> dict[str, Float[Tensor, " batch"]]:
-        base, hidden = self.split(states)
-        return self.base.merit(base, self.acting(hidden[:, :-1], applied), exogenous)
+    def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
+        acting = self.acting(self.split(states[:, :-1])[1], applied)
+        return self.base.merit(self.true_state(states), acting, exogenous)
 
     def setpoints(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-        base, hidden = self.split(states)
-        return self.base.setpoints(base, self.acting(hidden, applied), exogenous)
+        acting = self.acting(self.split(states)[1], applied)
+        return self.base.setpoints(self.true_state(states), acting, exogenous)
 
-    def categories(self, exogenous: Float[Tensor, "batch n n_z"]) -> dict[str, Bool[Tensor, " batch"]]:
+    def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
         return self.base.categories(exogenous)
 
     def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
         """States of the plant from a log; hidden states at rest."""
-        base = self.base.complete_states(measured, exogenous, actions)
-        return torch.cat([base, self.rest(base)], -1)
+        return self._with_rest(self.base.complete_states(measured, exogenous, actions))
 
     def controller_start(self, measured: Tensor, exogenous: Tensor) -> Tensor:
         return self.base.controller_start(measured, exogenous)
 
-    # Randomness
+    # The draws, which are those of the plant
 
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
-        base = self.base.draw_initial_state(batch, generator)
-        return torch.cat([base, self.rest(base)], -1)
+        return self._with_rest(self.base.draw_initial_state(batch, generator))
 
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps n_z"]:
         return self.base.draw_exogenous(batch, generator)
@@ -255,15 +231,15 @@ class Extension(Plant):
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
         return self._with_own(self.base.make_neural_closure(generator, hidden))
 
+    def make_policy(self, generator: torch.Generator) -> nn.Module:
+        return self.base.make_policy(generator)
+
     def extended(self, closure: nn.Module) -> nn.Module:
         """A closure of the plant without extensions, with the parameters of all its extensions beside it."""
         return self._with_own(self.base.extended(closure) if isinstance(self.base, Extension) else closure)
 
     def _with_own(self, closure: nn.Module) -> nn.Module:
-        return ExtendedClosure(closure, self._fresh()) if self._fresh is not None else closure
-
-    def make_policy(self, generator: torch.Generator) -> nn.Module:
-        return self.base.make_policy(generator)
+        return ExtendedClosure(closure, self.fresh()) if self._parameterised else closure
 
 
 def place_of(plant: Plant, action: str) -> int:
@@ -278,7 +254,7 @@ def place_of(plant: Plant, action: str) -> int:
     return names.index(action)
 
 
-def settled(plant: Plant, action: int, states: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch"]:
+def settled(plant: Plant, action: int, states: State) -> Cost:
     """An actuator's position at the start: the state of its name, or else the place in its range nearest to zero."""
     signal, names = plant.actions[action], [state.name for state in plant.states]
     if signal.name in names:
@@ -291,3 +267,51 @@ def replaced(
 ) -> Float[Tensor, "*batch n"]:
     """The values with another one in a place."""
     return torch.cat([values[..., :place], value.unsqueeze(-1), values[..., place + 1 :]], -1)
+
+
+Change = Callable[[Any], Plant]
+"""A function that makes another plant of a plant."""
+System = Mapping[str, Change]
+"""What makes a real system of a plant, by the part of the plant that it changes."""
+
+
+def require_systems(names: Sequence[str], systems: Mapping[str, System]) -> None:
+    """Refuse names of real systems that do not exist, or cannot be combined.
+
+    Args:
+        names: names of the systems that are combined.
+        systems: all systems, by name.
+
+    Raises:
+        ValueError: if a name does not exist, or two of the systems change the same part.
+    """
+    missing = [name for name in names if name not in systems]
+    if missing:
+        raise ValueError(f"unknown={tuple(names)}: {', '.join(missing)} does not exist; choose {', '.join(systems)}.")
+    changed: dict[str, str] = {}
+    for name in names:
+        for part in systems[name]:
+            if part in changed:
+                raise ValueError(
+                    f"unknown={tuple(names)}: {changed[part]} and {name} both change the {part}; give one of them."
+                )
+            changed[part] = name
+
+
+def combined(plant: Plant, names: Sequence[str], systems: Mapping[str, System], parts: Sequence[str]) -> Plant:
+    """The plant with all that the named systems have beside it.
+
+    Args:
+        plant: the plant that a twin knows.
+        names: names of the systems; none gives the plant.
+        systems: all systems, by name.
+        parts: all parts of the plant that a system may change, in the order in which the changes are made.
+
+    Raises:
+        ValueError: as :func:`require_systems`.
+    """
+    require_systems(names, systems)
+    changes = {part: change for name in names for part, change in systems[name].items()}
+    for part in parts:
+        plant = changes[part](plant) if part in changes else plant
+    return plant

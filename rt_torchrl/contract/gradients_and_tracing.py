@@ -1,0 +1,303 @@
+"""Checks of what engines and compilers need: stable steps, exact derivatives in both modes, and traceable methods."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rt_torchrl.contract.draws import seeded
+from rt_torchrl.contract.methods import Arguments, Calls, Method
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.programs.program import UntraceableError
+from rt_torchrl.programs.vector_functions import lanes_of_this_machine
+from rt_torchrl.trajectories.engines.compilation import raised_limits, without_warnings_of_libraries
+from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
+from rt_torchrl.trajectories.engines.linearisation import linearise
+from rt_torchrl.trajectories.engines.programs import point_of
+from rt_torchrl.trajectories.engines.traced_interval import Programs, UncomparedError
+
+STEP = 1e-6
+"""Step of a difference, as a share of the argument's size; rounding then errs by 1e-10, and curvature by 1e-12."""
+RELATIVE, ABSOLUTE = 1e-5, 1e-6
+"""Greatest gap, as a share of the derivative and of the size of the method's value."""
+SIGNALS = {"state": "states", "command": "actions", "applied": "actions", "exogenous": "inputs"}
+CHECKED = ("vector_field", "step", "running_cost", "terminal_cost", "observe")
+GROWTH = 1.0 + 1e-6
+"""Factor per step above which a decaying mode counts as growing; that of an undamped mode is 1 to rounding."""
+TRACEABLE = (
+    "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
+    "throughout"
+)
+
+
+@torch.no_grad()
+def stability(calls: Calls) -> Iterator[str]:
+    r"""A violation if a mode that decays in the plant grows in a step: |R(μΔt)| ≤ 1 must hold where Re μ ≤ 0.
+
+    R(z) = 1 + z + z²/2 + z³/6 + z⁴/24 reaches its limit at 2.785 on the negative real axis and at 2.83 on the imaginary
+    axis. A plant with a scheme of its own is not checked, because this R does not describe that scheme.
+    """
+    plant, arguments = calls.plant, calls.some(20)
+    if plant.own_scheme:
+        return
+    for whose, closure in (("the true closure", plant.closure), ("the closure of make_closure", calls.closure)):
+        mu = torch.linalg.eigvals(jacobian(plant, closure, arguments))
+        decays = mu.real <= 1e-9 * mu.abs()
+        growth = torch.where(decays, amplification(mu * plant.dt), 0.0)
+        if growth.max() > GROWTH:
+            k, b, mode = (growth == growth.max()).nonzero()[0].tolist()
+            worst = mu[k, b, mode]
+            yield (
+                f"dt: {plant.dt:g} s is too long for the eigenvalue {worst:.4g} 1/s of the vector field under {whose}, "
+                f"|eigenvalue|·dt = {worst.abs() * plant.dt:.3g}, at state {arguments['state'][k, b].tolist()}: it "
+                f"decays, but grows {growth.max():.3g} times in a Runge-Kutta step. Use dt <= "
+                f"{stable_step(worst, plant.dt):.3g} s, or treat that mode as settled at once."
+            )
+            return
+
+
+def jacobian(plant: Plant, closure: nn.Module, arguments: Arguments) -> Tensor:
+    """∂f/∂s at every time and episode, ``n batch n_s n_s``, by central differences: no gradient is trusted yet."""
+    t, state, applied, exogenous = (arguments[name] for name in ("t", "state", "applied", "exogenous"))
+    size = 1e-6 * (1e-3 + state.abs().amax((0, 1)))
+    columns = []
+    for shift in torch.diag(size):
+        ends = [plant.vector_field(t, state + sign * shift, applied, exogenous, closure) for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2.0 * shift.sum()))
+    return torch.stack(columns, -1)
+
+
+def amplification(z: Tensor) -> Tensor:
+    """The factor |R(z)| of a four-stage Runge-Kutta step of fourth order."""
+    return (1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))).abs()
+
+
+def stable_step(mu: Tensor, dt: float) -> float:
+    """The longest step, to 5 %, in which a mode that decays does not grow."""
+    while amplification(mu * dt) > GROWTH:
+        dt *= 0.95
+    return dt
+
+
+def gradients(calls: Calls) -> Iterator[str]:
+    """Wrong derivatives of each method by states and actions, and by the weights of the twin's closure and the policy.
+
+    They are taken at states of flights. A finding under the true closure is not repeated under the twin's closure.
+    """
+    arguments, told = calls.some(5), set()
+    latest = {method.name: method for method in calls.methods()}  # under the twin's closure
+    for method in calls.methods():
+        if method.name not in CHECKED or method.name in told:
+            continue
+        for argument in ("state", "command", "applied"):
+            if argument in method.takes:
+                for text in _by_argument(calls, method, arguments, argument):
+                    told.add(method.name)
+                    yield text
+    for name in ("vector_field", "step"):
+        yield from _by_weights(calls, latest[name], arguments, calls.closure, "closure")
+    if "observe" not in told:
+        policy = calls.plant.make_policy(seeded(calls.seed))
+        command = calls.commanded_by(policy)
+        yield from _by_argument(calls, command, arguments, "state")
+        yield from _by_weights(calls, command, arguments, policy, "policy")
+
+
+class _Derivative(NamedTuple):
+    """A directional derivative by reverse mode and by finite differences; ``reached`` if autograd saw a path."""
+
+    reverse: Tensor
+    differences: Tensor
+    reached: bool
+
+
+def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: str) -> Iterator[str]:
+    measure = _measure(method, arguments, calls.seed)
+    value = arguments[argument].clone().requires_grad_()
+    reached, gradient = _gradient(lambda: measure({**arguments, argument: value}), [value])
+    signals = getattr(calls.plant, SIGNALS[argument])
+    for k, signal in enumerate(signals):
+        shift = torch.zeros_like(value.detach())
+        size = 1e-3 + value.detach()[..., k].abs().max()
+        shift[..., k] = STEP * size
+        with torch.no_grad():
+            ends = [measure({**arguments, argument: value + sign * shift}) for sign in (1.0, -1.0)]
+        found = _Derivative(gradient[0][..., k] * size, (ends[0] - ends[1]) / (2.0 * STEP), reached)
+        yield from _verdict(method.name, f"{argument} {signal.name!r}", found)
+
+
+def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.Module, whose: str) -> Iterator[str]:
+    """Wrong derivatives along one random direction for each tensor of weights."""
+    measure = _measure(method, arguments, calls.seed)
+    weights = {name: w for name, w in module.named_parameters() if w.requires_grad}
+    reached, gradient = _gradient(lambda: measure(arguments).sum(), list(weights.values()))
+    generator, dormant = seeded(calls.seed), _dormant(module)
+    for (name, weight), slope in zip(weights.items(), gradient, strict=True):
+        direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
+        direction *= 1e-3 + weight.detach().abs().max()
+        differences = _along(weight, direction, lambda: measure(arguments).sum())
+        found = _Derivative((slope * direction).sum(), differences, reached)
+        of_all = list(_verdict(method.name, f"{whose} weight {name!r}", found))
+        yield from of_all
+        matters = slope.any() or differences.any() or id(weight) in dormant
+        if not of_all and method.name == "vector_field" and not matters:
+            yield (
+                f"vector_field: closure weight {name!r} changes it at none of {measure(arguments).numel()} states; "
+                "leave the weight out, or start it where it matters."
+            )
+
+
+def _dormant(closure: nn.Module) -> set[int]:
+    """Weights of hidden layers that matter as soon as the last layer of their perceptron is no longer zero."""
+    found = [m.network for m in closure.modules() if isinstance(m, BoundedPerceptron)]
+    asleep = [network for network in found if not network[-1].get_parameter("weight").any()]
+    return {id(weight) for network in asleep for layer in network[:-1] for weight in layer.parameters()}
+
+
+@torch.no_grad()
+def _along(weight: nn.Parameter, direction: Tensor, measure: Callable[[], Tensor]) -> Tensor:
+    """The central difference along a direction; the weight then has its value again, to the bit."""
+    kept, ends = weight.clone(), []
+    for sign in (1.0, -1.0):
+        weight.copy_(kept + sign * STEP * direction)
+        ends.append(measure())
+    weight.copy_(kept)
+    return (ends[0] - ends[1]) / (2.0 * STEP)
+
+
+def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[Arguments], Tensor]:
+    """A random combination of a method's outputs, in units of their size, for each time and episode."""
+    with torch.no_grad():
+        outputs = method.outputs(arguments)
+    generator, weights = seeded(seed), []
+    for (_, trailing), value in zip(method.gives.items(), outputs, strict=True):
+        share = torch.randn(trailing, generator=generator, dtype=torch.float64)
+        weights.append(share / (1e-3 + value.abs().amax((0, 1))))
+
+    def measure(changed: Arguments) -> Tensor:
+        pairs = zip(method.outputs(changed), weights, strict=True)
+        return torch.stack([(value * w).reshape(*value.shape[:2], -1).sum(-1) for value, w in pairs]).sum(0)
+
+    return measure
+
+
+def _gradient(measure: Callable[[], Tensor], inputs: list[Tensor]) -> tuple[bool, list[Tensor]]:
+    """Whether autograd sees a path at all, and the gradients, which are zero where it sees none."""
+    with torch.enable_grad():
+        total = measure().sum()
+        if not total.requires_grad:
+            return False, [torch.zeros_like(x) for x in inputs]
+        found = torch.autograd.grad(total, inputs, allow_unused=True)
+    return True, [torch.zeros_like(x) if g is None else g for x, g in zip(inputs, found, strict=True)]
+
+
+def _verdict(method: str, by: str, found: _Derivative) -> Iterator[str]:
+    reverse, differences = torch.broadcast_tensors(found.reverse.detach(), found.differences)
+    gap = (reverse - differences).abs()
+    bad = ~(gap <= ABSOLUTE + RELATIVE * differences.abs())
+    if not bad.any():
+        return
+    if not reverse.isfinite().all():
+        yield (
+            f"{method}: its derivative by {by} is not finite; expected a finite slope everywhere: mind sqrt, norm and "
+            "pow at zero, and torch.where, whose unused branch still passes its slope on."
+        )
+    elif not reverse[bad].any():
+        yield (
+            f"{method}: autograd finds no dependence on {by}, finite differences do ({_largest(differences, bad)}); "
+            "the path is cut: use torch operations on the tensors themselves, without detach, item, float, numpy, "
+            "torch.tensor or no_grad."
+        )
+    else:
+        yield (
+            f"{method}: its derivative by {by} is {_largest(reverse, bad)}, by finite differences "
+            f"{_largest(differences, bad)} (in units of the signals' sizes, in {int(bad.sum())} of {bad.numel()} "
+            "places); a part of the path is cut (detach, item, numpy), or it jumps: use smooth laws, or torch.where "
+            "between laws that meet."
+        )
+
+
+def _largest(values: Tensor, chosen: Tensor) -> str:
+    picked = values[chosen]
+    return f"{picked[picked.abs().argmax()].item():.6g}"
+
+
+def forward_mode(calls: Calls) -> Iterator[str]:
+    """A violation if the Jacobian of the step by batched forward-mode products differs from that by reverse mode.
+
+    The parallel engine uses the forward-mode products. Both Jacobians are exact, so that only rounding may differ; it
+    is measured against entries down to a millionth of the greatest.
+    """
+    arguments = calls.some(3)
+    drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"])
+    interval, state = Interval(calls.plant, calls.closure, None), arguments["state"].requires_grad_()
+    try:
+        with without_warnings_of_libraries():
+            jacobians = linearise(interval, (), state.detach(), drive)
+    except Exception as error:
+        yield f"step: torch.func.jvp under vmap fails: {_first_line(error)} {_where(error)}Expected {TRACEABLE}."
+        return
+    rows = [torch.autograd.grad(end.sum(), state, retain_graph=True)[0] for end in interval(state, drive).unbind(-1)]
+    reverse = torch.stack(rows, -2)
+    gap = ((jacobians - reverse).abs() / (1e-6 * reverse.abs().max() + reverse.abs())).max()
+    if gap > 1e-6:
+        yield (
+            f"step: its Jacobian by forward mode differs from that by reverse mode, by {gap:.1e}; an own "
+            "torch.autograd.Function needs a jvp that is right."
+        )
+
+
+def tracing(calls: Calls) -> Iterator[str]:
+    """Methods that are not one graph; they are traced without a compiler, so that only the plant can fail."""
+    arguments = calls.some(3)
+    for method in calls.methods():
+
+        def traced(arguments: Arguments, method: Method = method) -> tuple[Tensor, ...]:
+            return method.outputs(arguments)
+
+        try:
+            with raised_limits():
+                found = torch.compile(traced, fullgraph=True, backend="eager")(arguments)
+        except Exception as error:
+            yield f"{method.name}: is not one graph: {_first_line(error)} {_where(error)}Expected {TRACEABLE}."
+            continue
+        for (name, _), one, other in zip(method.gives.items(), found, method.outputs(arguments), strict=True):
+            if not torch.allclose(one, other, rtol=1e-10, atol=1e-10):
+                yield f"{method.name}: {name} has another value when it is traced; expected {TRACEABLE}."
+
+
+def untraceable(calls: Calls) -> str | None:
+    """What keeps the engine ``native`` from the plant under its own policy, with the line of code; None if nothing.
+
+    Whatever the code raises for one realisation keeps it from the plant.
+    """
+    plant, arguments, lanes = calls.plant, calls.arguments, lanes_of_this_machine()
+    policy = plant.make_policy(seeded(calls.seed))
+    initial_state = torch.nn.functional.pad(arguments["state"][0], (0, 1))  # the cost is one more state
+    drive = Drive(arguments["t"], arguments["exogenous"], arguments["command"][..., :0])
+    point = point_of(initial_state, drive, lanes.number)
+    try:
+        interval = CostInterval(Interval(plant, calls.closure, policy))
+        Programs(interval, point, lanes).prepare_sweep(interval, False)
+    except UncomparedError:
+        return None
+    except Exception as error:
+        return str(error) if isinstance(error, UntraceableError) else f"{type(error).__name__}: {_first_line(error)}"
+    return None
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__
+
+
+def _where(error: Exception) -> str:
+    """The last line of the user's code that the compiler names."""
+    lines = str(error).splitlines()
+    places = [k for k, line in enumerate(lines) if line.strip().startswith('File "')]
+    if not places:
+        return ""
+    code = lines[places[-1] + 1].strip() if places[-1] + 1 < len(lines) else ""
+    return f"({lines[places[-1]].strip()}: {code}) "

@@ -1,0 +1,199 @@
+"""Actuators that lag, ring, act late or do only a share of what they are asked for."""
+
+import math
+
+import torch
+from torch import nn
+
+from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
+from rt_torchrl.plants.extension import Extension, place_of, replaced, settled
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Hidden, State
+from rt_torchrl.plants.signal import Signal
+
+LONGEST_DELAY = 64
+"""Greatest number of control intervals of a delay: each is a hidden state, which every engine carries along."""
+
+
+class LaggedActuator(Extension):
+    r"""A plant with an actuator that follows what it is asked for through n equal lags, whose time constants sum to T.
+
+    .. math:: \frac Tn\dot x_j = x_{j-1} - x_j, \quad j = 1 \dots n, \quad x_0 = a
+
+    One lag is the usual first-order actuator. A chain is a dead time T whose response rises within some
+    :math:`T/\sqrt n`; unlike that of :class:`DelayedActuator`, its parameter is continuous, so that a twin identifies
+    it. Each stage has its exact solution for the mean of the stage before it over the interval,
+    :math:`x' = u + (x - u)e^{-h}` with the mean :math:`u + (x - u)(1 - e^{-h})/h` and :math:`h = n\Delta t/T`. The mean
+    of the last stage acts on the plant. One lag is exact for any T > 0; a short T makes the plant that is extended.
+
+    Args:
+        base: the plant.
+        action: name of the action that lags.
+        time_constant: T of the true system, which a twin identifies [s].
+        stages: number n of lags.
+
+    Raises:
+        ValueError: if there is no such action, a time constant is not positive and finite, or there is no stage.
+    """
+
+    def __init__(self, base: Plant, action: str, time_constant: float, *, stages: int = 1):
+        if stages < 1:
+            raise ValueError(f"stages={stages} of {action} must be at least 1.")
+        self.place, self.stages = place_of(base, action), stages
+        signal, ends = base.actions[self.place], [""] if stages == 1 else [f"_{k}" for k in range(1, stages + 1)]
+        hidden = [
+            Signal(symbol=f"{signal.symbol}'{end}", name=f"lagged_{action}{end}", unit=signal.unit) for end in ends
+        ]
+        names, meanings = {f"{action}_lag": "s"}, {f"{action}_lag": f"time constant of {action}"}
+        own = PositiveCoefficients([time_constant], names=names, meanings=meanings, factor=FACTOR)
+        super().__init__(base, hidden, own)
+
+    def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
+        steps = self.dt * self.stages / closure.get_submodule("own")()[0]
+        left = torch.exp(-steps)
+        share = (1.0 - left) / steps
+        mean, ends = applied[..., self.place], []
+        for x in hidden.unbind(-1):
+            off = x - mean
+            ends.append(mean + off * left)
+            mean = mean + off * share
+        return replaced(applied, self.place, mean), torch.stack(ends, -1)
+
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
+        before = torch.cat([applied[..., self.place : self.place + 1], hidden[..., :-1]], -1)
+        return (before - hidden) * self.stages / closure.get_submodule("own")()[0]
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, hidden[..., -1])
+
+    def rest(self, base: State) -> Hidden:
+        return settled(self.base, self.place, base).unsqueeze(-1).expand(*base.shape[:-1], self.stages)
+
+
+class ResonantActuator(Extension):
+    r"""A plant with an actuator that follows what it is asked for as an underdamped oscillator.
+
+    .. math:: \ddot x + 2\zeta\omega\dot x + \omega^2x = \omega^2a, \qquad \zeta = \frac{d}{1 + d} < 1
+
+    Between samples x has its exact solution for a held a. Its mean over the interval acts on the plant; the integral of
+    the equation over Δt gives it, :math:`\bar a = a - (\Delta\dot x + 2\zeta\omega\Delta x)/(\omega^2\Delta t)`.
+
+    Args:
+        base: the plant.
+        action: name of the action.
+        frequency: natural frequency ω of the true system [rad/s].
+        damping: damping ratio ζ of the true system [-], in (0, 1).
+
+    Raises:
+        ValueError: if there is no such action, ω is not positive and finite, or ζ is out of its range.
+    """
+
+    def __init__(self, base: Plant, action: str, frequency: float, damping: float):
+        self.place = place_of(base, action)
+        if not 0.0 < damping < 1.0:
+            raise ValueError(f"damping={damping} of {action} must lie in (0, 1); use LaggedActuator beyond.")
+        signal = base.actions[self.place]
+        position = Signal(symbol=signal.symbol + "'", name=f"resonant_{action}", unit=signal.unit)
+        rate = Signal(symbol=rf"\dot{{{signal.symbol}}}'", name=f"rate_of_{action}", unit=f"{signal.unit}/s")
+        names = {f"{action}_frequency": "rad/s", f"{action}_damping_odds": "-"}
+        meanings = dict(zip(names, (f"natural frequency of {action}", "zeta/(1 - zeta) of it"), strict=True))
+        odds = damping / (1.0 - damping)
+        own = PositiveCoefficients([frequency, odds], names=names, meanings=meanings, factor=FACTOR)
+        super().__init__(base, [position, rate], own)
+
+    def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
+        asked, (x, v) = applied[..., self.place], hidden.unbind(-1)
+        omega, odds = closure.get_submodule("own")().unbind()
+        zeta = odds / (1.0 + odds)
+        decay, ringing = zeta * omega, omega * torch.sqrt(1.0 - zeta * zeta)
+        left, turn = torch.exp(-decay * self.dt), ringing * self.dt
+        cosine, sine = left * torch.cos(turn), left * torch.sin(turn) / ringing
+        off = x - asked
+        end = off * (cosine + decay * sine) + v * sine
+        rate = v * (cosine - decay * sine) - omega * omega * off * sine
+        mean = asked - (rate - v + 2.0 * decay * (end - off)) / (omega * omega * self.dt)
+        return replaced(applied, self.place, mean), torch.stack([asked + end, rate], -1)
+
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
+        x, v = hidden.unbind(-1)
+        omega, odds = closure.get_submodule("own")().unbind()
+        zeta = odds / (1.0 + odds)
+        pull = omega * omega * (applied[..., self.place] - x)
+        return torch.stack([v, pull - 2.0 * zeta * omega * v], -1)
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, hidden[..., 0])
+
+    def rest(self, base: State) -> Hidden:
+        position = settled(self.base, self.place, base)
+        return torch.stack([position, torch.zeros_like(position)], -1)
+
+
+class DelayedActuator(Extension):
+    r"""A plant with an actuator that does in each interval what it was asked for n intervals ago.
+
+    .. math:: \bar a_k = a_{k-n}
+
+    The hidden states are the n actions under way, the oldest first.
+
+    Args:
+        base: the plant.
+        action: name of the action.
+        delay: dead time [s], a whole number n of control intervals, 1 to 64.
+
+    Raises:
+        ValueError: if there is no such action, or the delay is out of its range.
+    """
+
+    def __init__(self, base: Plant, action: str, delay: float):
+        self.place, self.intervals = place_of(base, action), round(delay / base.dt)
+        n, signal = self.intervals, base.actions[self.place]
+        if not (1 <= n <= LONGEST_DELAY and math.isclose(n * base.dt, delay, rel_tol=1e-9)):
+            raise ValueError(
+                f"delay={delay} s of {action} must be 1 to {LONGEST_DELAY} control intervals of {base.dt:g} s; "
+                "approximate a longer one by LaggedActuator with several stages."
+            )
+        hidden = [
+            Signal(symbol=f"{signal.symbol}_{{-{k}}}", name=f"{action}_{k}_ago", unit=signal.unit)
+            for k in range(n, 0, -1)
+        ]
+        super().__init__(base, hidden)
+
+    def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
+        under_way = torch.cat([hidden[..., 1:], applied[..., self.place : self.place + 1]], -1)
+        return self.acting(hidden, applied), under_way
+
+    def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
+        """The mean rates over an interval: a dead time has no differential equation."""
+        return (self.respond(hidden, applied, closure)[1] - hidden) / self.dt
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, hidden[..., 0])
+
+    def rest(self, base: State) -> Hidden:
+        return settled(self.base, self.place, base).unsqueeze(-1).expand(*base.shape[:-1], self.intervals)
+
+
+class ScaledActuator(Extension):
+    r"""A plant with an actuator that does :math:`\bar a = ga`, such as one whose supply voltage sags.
+
+    It has no hidden states and no parameters that a twin identifies. The range of the action is that of what the
+    actuator is asked for; what it does may lie beyond.
+
+    Args:
+        base: the plant.
+        action: name of the action.
+        gain: gain g.
+
+    Raises:
+        ValueError: if there is no such action, or the gain is not positive and finite.
+    """
+
+    def __init__(self, base: Plant, action: str, gain: float):
+        self.place, self.gain = place_of(base, action), gain
+        if not 0.0 < gain < math.inf:
+            raise ValueError(f"gain={gain} of {action} must be positive and finite, such as 0.95 for a loss of 5 %.")
+        super().__init__(base, [])
+
+    def acting(self, hidden: Hidden, applied: Action) -> Action:
+        return replaced(applied, self.place, self.gain * applied[..., self.place])

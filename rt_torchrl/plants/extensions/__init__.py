@@ -1,1 +1,0 @@
-"""Dynamics that a system may have beside those of its plant: each makes a new plant of any plant."""
