@@ -86,6 +86,11 @@ class Plant(nn.Module, Discrepancy, Ending, Merits, ABC):
         super().__init_subclass__(**options)
         if "advance" in vars(cls) and "own_scheme" not in vars(cls):
             cls.own_scheme = cls.advance is not Plant.advance
+        if "discrepancy" in vars(cls):
+            raise ValueError(
+                f"{cls.__name__}.discrepancy: L_p is a sum of squares, so that least squares fit it; give the scales "
+                "of the states instead, discrepancy_scales, with math.inf for a state that is not compared."
+            )
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()

@@ -1,5 +1,6 @@
 """A plant with additional dynamics, which no sensor reads."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -210,11 +211,10 @@ class Extension(Plant):
     def ended(self, state: Float[Tensor, "*batch n_s"]) -> Bool[Tensor, "*batch"]:
         return self.base.ended(self.split(state)[0])
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
-    ) -> Float[Tensor, "*batch"]:
-        """The discrepancy of the plant; hidden states, which no sensor reads, are not compared."""
-        return self.base.discrepancy(self.split(state)[0], self.split(measured)[0])
+    @property
+    def discrepancy_scales(self) -> tuple[float, ...]:
+        """Those of the plant; hidden states, which no sensor reads, are not compared."""
+        return (*self.base.discrepancy_scales, *(math.inf,) * (len(self.states) - len(self.base.states)))
 
     def merit(
         self,
