@@ -57,10 +57,9 @@ from .control.predictive_control import PredictiveConfig, PredictiveControl
 from .control.receding_horizon import RecedingHorizon
 from .control.receding_horizon_config import RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
-from .fit.identification import Identification, IdentificationConfig
-from .fit.estimation import Estimate, Estimation, EstimationConfig
+from .fit.least_squares import Estimate, Estimation, EstimationConfig
 from .fit.sensor_log import LogConfig, read_log
-from .fit.sensor_record import SensorRecord, sensor_record
+from .fit.record import SensorRecord, sensor_record
 from .fit.sensors import Sensor, sensors_of
 from .fit.uncertainty import Uncertainty
 
@@ -162,8 +161,6 @@ __all__ = [
     "Futures",
     "Held",
     "HypothesesConfig",
-    "Identification",
-    "IdentificationConfig",
     "IncrementalTD3",
     "IncrementalTD3Config",
     "Injection",

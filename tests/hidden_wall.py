@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from rt_torchrl.fit.sensor_record import sensor_record
+from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import sensors_of
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant

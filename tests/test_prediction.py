@@ -7,9 +7,9 @@ from straight_line import Line, Slope, line_segment, noise_of
 from test_uncertainty import NOISE, TIMES, exact_covariance, line_estimate, position
 
 from rt_torchrl.fit.coverage import coverage
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
 from rt_torchrl.fit.prediction import Prediction, predict, residual_tests
-from rt_torchrl.fit.sensor_record import sensor_record
+from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import sensors_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -107,7 +107,7 @@ def test_bands_of_a_perceptron_hold_the_curve():
     """Pointwise, where data was, over 100 draws of the noise and of the first weights."""
     from test_uncertainty import curve_estimate
 
-    from rt_torchrl.fit.curve import band
+    from rt_torchrl.fit.uncertainty import band
 
     x = torch.linspace(-2.0, 2.0, 41).double()
     inside = [band(curve_estimate(seed).uncertainty, x, x[:, None]).covers(x.sin()) for seed in range(100)]

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from rt_torchrl.figures.style import REAL, TWIN, array, caption, legend_below, panels, time_unit, with_unit
 from rt_torchrl.fit.prediction import Prediction
-from rt_torchrl.fit.sensor_record import SensorRecord
+from rt_torchrl.fit.record import SensorRecord
 
 
 def simulated_and_measured(prediction: Prediction, record: SensorRecord, dt: float, *, title: str) -> Figure:

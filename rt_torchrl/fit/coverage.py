@@ -8,11 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.fit.covariance import named_values
-from rt_torchrl.fit.curve import band
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.sensor_record import SensorRecord, sensor_record
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
+from rt_torchrl.fit.record import SensorRecord, sensor_record
 from rt_torchrl.fit.sensors import Sensor
+from rt_torchrl.fit.uncertainty import band, named_values
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds

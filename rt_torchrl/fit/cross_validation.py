@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.sensor_record import SensorRecord
+from rt_torchrl.fit.record import SensorRecord
 
 Guess = Callable[[Float[Tensor, " n_y"]], Float[Tensor, " n_s"]]
 """Makes the first guess of a state from the readings in its sample."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rt_torchrl.fit.record import SensorRecord, usual_initial_state
 from rt_torchrl.fit.resampling import ROUNDING
 from rt_torchrl.fit.sensor_log import SensorLog, logged_states
-from rt_torchrl.fit.sensor_record import SensorRecord, usual_initial_state
 from rt_torchrl.fit.sensors import Sensor, known_sensors, sensors_of
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal

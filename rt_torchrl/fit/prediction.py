@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.covariance import inverse_information
-from rt_torchrl.fit.estimation import Estimate, Estimation
+from rt_torchrl.fit.least_squares import Estimate, Estimation
 from rt_torchrl.fit.likelihood import Likelihood
-from rt_torchrl.fit.sensor_record import SensorRecord
+from rt_torchrl.fit.record import SensorRecord
+from rt_torchrl.fit.uncertainty import inverse_information
 
 
 class Prediction(NamedTuple):
@@ -89,11 +89,11 @@ def predict(estimation: Estimation, estimate: Estimate, record: SensorRecord, *,
     (block,) = whole.residuals()
     n = whole.weight_count
     C = estimate.uncertainty.weights_covariance
-    by_weights, by_start = block.jacobian[..., :n], block.jacobian[..., n:]
+    by_weights, by_start = block.jacobian[0].split([n, block.jacobian.shape[-1] - n], -1)
     variance = ((by_weights @ C) * by_weights).sum(-1) + ((by_start @ start.matrix) * by_start).sum(-1)
     untold = estimate.uncertainty.untold(by_weights) | start.unknown(by_start)
     variance = torch.where(untold, torch.inf, variance)
-    simulated = whole.simulated()
+    (simulated,) = whole.simulated()
     deviation = torch.where(record.seen, noise * variance.clamp_min(0.0).sqrt(), torch.nan)
     return Prediction(simulated, record.readings - simulated, deviation, noise.clone(), whole.initial().detach()[0])
 

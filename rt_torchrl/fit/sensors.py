@@ -16,6 +16,7 @@ from torch import Tensor
 
 from rt_torchrl.plants.measurement import Component, Measurement, Named, Preview
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Input, Inputs, State, States, Time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +78,27 @@ def _reads_as_it_is(own: Sensor, plain: Sensor) -> bool:
     return own.measurement.read in (plain.measurement.read, Named(plain.name))
 
 
+def state_sensors(plant: Plant) -> tuple[Sensor, ...]:
+    r"""Sensors of the states that J_p compares, with the noise that makes J_p their likelihood.
+
+    .. math:: \sigma_i = c_i / \sqrt{\Delta t}
+
+    With these noises J of :mod:`rt_torchrl.fit.likelihood` is the sum of J_p over all records, with the scales c of
+    :attr:`Plant.discrepancy_scales`.
+    """
+    return tuple(
+        Sensor(measurement=Measurement.of(signal, Component("state", k)), noise=scale / math.sqrt(plant.dt))
+        for k, (signal, scale) in enumerate(zip(plant.states, plant.discrepancy_scales, strict=True))
+        if scale < math.inf
+    )
+
+
+def state_of(sensor: Sensor) -> int | None:
+    """Place of the state that a sensor reads as it is; None for a sensor of anything else."""
+    place = sensor.measurement.read
+    return place.index if isinstance(place, Component) and place.of == "state" else None
+
+
 def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:
     """The sensors of the named states and measurements of a plant, with unknown noise.
 
@@ -111,9 +133,9 @@ def with_biases(sensors: Sequence[Sensor], names: Sequence[str]) -> tuple[Sensor
 def read(
     sensors: Sequence[Sensor],
     plant: Plant,
-    t: Float[Tensor, "*batch"],
-    state: Float[Tensor, "*batch n_s"],
-    exogenous: Float[Tensor, "*batch n_z"],
+    t: Time,
+    state: State,
+    exogenous: Input,
 ) -> Float[Tensor, "*batch n_y"]:
     """What the sensors would read without noise and bias."""
     found = [sensor.measurement.read(plant, t, state, exogenous) for sensor in sensors]
@@ -121,22 +143,12 @@ def read(
 
 
 def read_slopes(
-    sensors: Sequence[Sensor],
-    plant: Plant,
-    t: Float[Tensor, "batch n"],
-    states: Float[Tensor, "batch n n_s"],
-    exogenous: Float[Tensor, "batch n n_z"],
+    sensors: Sequence[Sensor], plant: Plant, t: Float[Tensor, "batch n"], states: States, exogenous: Inputs
 ) -> Float[Tensor, "batch n n_y n_s"]:
     """Derivatives of the readings by the state, in every sample."""
 
-    places = [sensor.measurement.read for sensor in sensors]
-    if all(isinstance(place, Component) and place.of == "state" for place in places):
-        rows = [place.index for place in places if isinstance(place, Component)]
-        unit = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)[rows]
-        return unit.expand(*states.shape[:2], -1, -1)
-
-    def one(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
+    def reading(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
         return read(sensors, plant, t, state, z)
 
-    slopes: Tensor = torch.func.vmap(torch.func.vmap(torch.func.jacrev(one, argnums=1)))(t, states, exogenous)
+    slopes: Tensor = torch.func.vmap(torch.func.vmap(torch.func.jacrev(reading, argnums=1)))(t, states, exogenous)
     return slopes
