@@ -15,11 +15,18 @@ import torch
 import tyro
 
 from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, check_options, main_of, read_log
-from rt_torchrl.fit.column import Column
 from rt_torchrl.fit.least_squares import Identified, identify
-from rt_torchrl.fit.log_readings import filled, initial_spread, logged_readings, sensors_in
-from rt_torchrl.fit.resampling import ROUNDING, Resampled, hold_out, resample
-from rt_torchrl.fit.sensor_log import checked
+from rt_torchrl.fit.log import Column, checked
+from rt_torchrl.fit.resampling import (
+    ROUNDING,
+    Resampled,
+    filled,
+    hold_out,
+    initial_spread,
+    logged_readings,
+    resample,
+    sensors_in,
+)
 from rt_torchrl.fit.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.results_file import new_folder, write_results

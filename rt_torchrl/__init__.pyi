@@ -58,7 +58,7 @@ from .control.receding_horizon import RecedingHorizon
 from .control.receding_horizon_config import RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
-from .fit.sensor_log import LogConfig, read_log
+from .fit.log import LogConfig, read_log
 from .fit.record import SensorRecord, sensor_record
 from .fit.sensors import Sensor, sensors_of
 from .fit.uncertainty import Uncertainty

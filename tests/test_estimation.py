@@ -171,14 +171,14 @@ def test_states_and_measurements_of_a_plant_are_sensors(kind, name):
 
 def test_what_cannot_be_estimated_is_refused():
     plant, sensors, records = room_records(lengths=(40,))
-    twin = DigitalTwin(plant, Envelope.true())
+    twin, unseen = DigitalTwin(plant, Envelope.true()), records[0]._replace(readings=torch.nan * records[0].readings)
     for wrong, message in (
         (lambda: sensors_of(plant, ["roof"]), r"sensors=\('roof',\) .* choose among air, wall"),
         (lambda: sensors_of(plant, []), "nothing cannot be measured"),
         (lambda: Sensor(measurement=sensors[0].measurement, noise=0.0), "noise=0.0 of sensor 'air'"),
         (lambda: Estimation(twin, sensors, spread=-torch.ones(2).double()), r"spread=\[-1.0, -1.0\]"),
         (lambda: first_noise(sensors, []), r"records=\[\]"),
-        (lambda: first_noise(sensors, [records[0].masked(0, 0)]), "sensor 'air' has no sample"),
+        (lambda: first_noise(sensors, [unseen]), "sensor 'air' has no sample"),
         (lambda: EstimationConfig(prior=-1.0), "prior=-1.0"),
         (lambda: EstimationConfig(rounds=0), "rounds=0"),
     ):

@@ -14,15 +14,16 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
-from rt_torchrl.fit.log_readings import filled, initial_spread, logged_readings, sensors_in
+from rt_torchrl.fit.log import SensorLog, checked
 from rt_torchrl.fit.record import sensor_record
-from rt_torchrl.fit.resampling import hold_out, resample
-from rt_torchrl.fit.sensor_log import SensorLog, checked
+from rt_torchrl.fit.resampling import filled, hold_out, initial_spread, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensors_of, state_sensors
-from rt_torchrl.fit.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
+
+record_log = recipe("record_log")
+policy_law, recorded = record_log.policy_law, record_log.recorded
 
 ROBUST = EstimationConfig(errors="robust")
 

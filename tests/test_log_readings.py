@@ -15,9 +15,8 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation
-from rt_torchrl.fit.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
-from rt_torchrl.fit.resampling import resample
-from rt_torchrl.fit.sensor_log import SensorLog, checked
+from rt_torchrl.fit.log import SensorLog, checked
+from rt_torchrl.fit.resampling import filled, hidden_states, initial_spread, logged_readings, resample, sensors_in
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from test_export_recipe import recipe
 
 from rt_torchrl.envs.pendulum.models import UniformRod
 from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
-from rt_torchrl.fit.log_readings import logged_readings, sensors_in
-from rt_torchrl.fit.resampling import hold_out, resample
-from rt_torchrl.fit.sensor_log import checked
-from rt_torchrl.fit.simulated_log import recorded
+from rt_torchrl.fit.log import checked
+from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
@@ -27,6 +26,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
+recorded = recipe("record_log").recorded
 RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"
 
 
@@ -188,6 +188,8 @@ COMPILED = """
 import sys, torch
 sys.path.insert(0, "tests")
 from test_pendulum import Pendulum, Rollout, control_cost, seeded
+
+recorded = recipe("record_log").recorded
 
 plant = Pendulum(horizon=0.25)
 # A window of a short horizon has a start for each realisation; lengths and numbers of realisations both change.

@@ -8,6 +8,7 @@ import torch
 from hidden_wall import Envelope, room_records
 from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
+from test_export_recipe import recipe
 from torch import nn
 
 from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
@@ -15,7 +16,6 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.design import next_manoeuvres, weight_information
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
-from rt_torchrl.fit.prediction import predict
 from rt_torchrl.fit.prior import Belief, BeliefPrior
 from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import Sensor, sensors_of, state_sensors
@@ -126,6 +126,7 @@ def test_a_prior_bounds_what_the_data_do_not_say():
 
 
 def test_a_prediction_in_a_wind_of_which_no_record_tells_has_no_bound():
+    predict = recipe("cascaded_tanks").predict
     task = Estimation(DigitalTwin(Line(), Slope()), position())
     sensors, values = position(), 0.5 * TIMES + NOISE * noise_of(81, 0)
     estimate = task.run([sensor_record(Line(), sensors, line_segment(values))])

@@ -39,12 +39,6 @@ class SensorRecord(NamedTuple):
         """Whether there is a sample."""
         return ~self.readings.isnan()
 
-    def masked(self, first: int, last: int) -> "SensorRecord":
-        """The record with the samples ``first`` to ``last`` − 1 alone; the others count as missing."""
-        kept = torch.full_like(self.readings, torch.nan)
-        kept[first:last] = self.readings[first:last]
-        return self._replace(readings=kept)
-
     def part(self, first: int, last: int, dt: float, guess: Float[Tensor, " n_s"] | None = None) -> "SensorRecord":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the samples around them.
 
