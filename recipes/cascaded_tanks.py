@@ -1,11 +1,13 @@
 """Identify the Cascaded Tanks benchmark from its record, and plan a controller on the identified twin."""
 
 import json
+import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rt_torchrl import begin_loading
 
@@ -14,6 +16,7 @@ if __name__ == "__main__":
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rt_torchrl import (
     DigitalTwin,
@@ -29,8 +32,8 @@ from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
-from rt_torchrl.fit.cross_validation import Fold, folds, pooled
-from rt_torchrl.fit.prediction import Prediction, predict, residual_tests
+from rt_torchrl.fit.likelihood import Likelihood
+from rt_torchrl.fit.uncertainty import inverse_information
 from rt_torchrl.runs.results_file import write_results
 
 
@@ -111,6 +114,170 @@ def guess(readings: torch.Tensor) -> torch.Tensor:
     return torch.stack([torch.tensor(20.0, dtype=torch.float64), readings[0]])
 
 
+class Fold(NamedTuple):
+    """A part of a record that is simulated, and the parts that the twin is identified from."""
+
+    training: list[SensorRecord]
+    held_out: SensorRecord
+
+
+def folds(
+    record: SensorRecord, count: int, dt: float, guess: Callable[[Tensor], Tensor], *, shortest: int = 100
+) -> list[Fold]:
+    """Divide a record into parts of equal length, each of which is held out once.
+
+    Args:
+        record: the record.
+        count: number of parts.
+        dt: control interval [s].
+        guess: makes the first guess of a state from the readings in its sample.
+        shortest: number of control intervals that a part needs.
+
+    Raises:
+        ValueError: if there are fewer than two parts, or they are too short.
+    """
+    n = len(record.actions)
+    if count < 2 or n // count < shortest:
+        raise ValueError(
+            f"folds={count} of a record of {n} control intervals must be at least 2, and each at least {shortest} "
+            "intervals long."
+        )
+    cuts = [round(k * n / count) for k in range(count + 1)]
+
+    def part(first: int, last: int) -> SensorRecord:
+        return record.part(first, last, dt, guess(record.readings[first]))
+
+    return [
+        Fold([part(*ends) for ends in ((0, first), (last, n)) if ends[1] > ends[0]], part(first, last))
+        for first, last in zip(cuts[:-1], cuts[1:], strict=True)
+    ]
+
+
+def pooled(rms: list[float], held_out: list[SensorRecord]) -> float:
+    """RMS error over all parts together, from those of each part."""
+    lengths = torch.tensor([len(record.readings) for record in held_out], dtype=torch.float64)
+    squares = torch.tensor(rms, dtype=torch.float64).square()
+    return float((lengths * squares).sum() / lengths.sum()) ** 0.5
+
+
+class Prediction(NamedTuple):
+    """A simulated record.
+
+    Args:
+        readings: simulated readings.
+        errors: measured readings less simulated ones; NaN where a sample is missing.
+        deviation: standard deviation of the simulated readings by the uncertainty of weights and initial state.
+        noise: standard deviation of the sensors' noise.
+        initial: initial state.
+    """
+
+    readings: Tensor
+    errors: Tensor
+    deviation: Tensor
+    noise: Tensor
+    initial: Tensor
+
+    @property
+    def rms(self) -> Tensor:
+        """Root mean square error of every sensor over all samples, the first ones included."""
+        return self.errors.square().nanmean(0).sqrt()
+
+    def rms_interval(self, block: int, *, draws: int = 2000, seed: int = 0) -> tuple[float, float]:
+        """95 % interval of the RMS error of the first sensor, by a bootstrap of blocks of neighbouring samples.
+
+        Args:
+            block: number of samples of a block, longer than the memory of the errors.
+            draws: number of bootstrap samples.
+            seed: seed of the draws.
+
+        Raises:
+            ValueError: if a block is not shorter than the record.
+        """
+        squares = self.errors[:, 0].square()
+        squares = squares[~squares.isnan()]
+        if not 1 <= block < len(squares):
+            raise ValueError(f"block={block} of the bootstrap must lie between 1 and {len(squares) - 1} samples.")
+        sums = squares.cumsum(0)
+        means = (sums[block:] - sums[:-block]) / block
+        count = math.ceil(len(squares) / block)
+        picked = torch.randint(len(means), (draws, count), generator=torch.Generator().manual_seed(seed))
+        found = means[picked].mean(-1).sqrt().quantile(torch.tensor([0.025, 0.975], dtype=torch.float64))
+        low, high = found.tolist()
+        return low, high
+
+
+def predict(estimation: Estimation, estimate: Estimate, record: SensorRecord, *, first: int = 50) -> Prediction:
+    """Simulate a record, with the initial state from its first samples.
+
+    Args:
+        estimation: the estimation, with the twin under the identified weights.
+        estimate: its result, from other records or from this one.
+        record: record to simulate.
+        first: number of samples that the initial state is estimated from.
+
+    Raises:
+        ValueError: if there is no such sample.
+        DivergenceError: if the twin diverges.
+    """
+    if first < 1:
+        raise ValueError(f"first={first} samples of the record must be at least 1.")
+    noise = estimate.likelihood.noise
+    readings = record.readings.clone()
+    readings[first:] = torch.nan
+    begun = estimation.fit_initial_states([record._replace(readings=readings)], noise)
+    start = inverse_information(begun.normal_equations().matrix)
+    whole = Likelihood(estimation.twin, [record], estimation.sensors, begun.initial, noise, biases=begun.biases)
+    (block,) = whole.residuals()
+    n = whole.weight_count
+    C = estimate.uncertainty.weights_covariance
+    by_weights, by_start = block.jacobian[0].split([n, block.jacobian.shape[-1] - n], -1)
+    variance = ((by_weights @ C) * by_weights).sum(-1) + ((by_start @ start.matrix) * by_start).sum(-1)
+    untold = estimate.uncertainty.untold(by_weights) | start.unknown(by_start)
+    variance = torch.where(untold, torch.inf, variance)
+    (simulated,) = whole.simulated()
+    deviation = torch.where(record.seen, noise * variance.clamp_min(0.0).sqrt(), torch.nan)
+    return Prediction(simulated, record.readings - simulated, deviation, noise.clone(), whole.initial().detach()[0])
+
+
+class ResidualTests(NamedTuple):
+    """Whether the errors of a simulation are noise: their correlations, with the bound for white noise.
+
+    Args:
+        auto: autocorrelation of the errors at lags 1, 2 ….
+        cross: correlation of the errors with an action, at lags 0, 1 … of the action behind.
+        bound: value that 95 % of the correlations of white noise do not exceed.
+    """
+
+    auto: Tensor
+    cross: Tensor
+    bound: float
+
+    def describe(self) -> str:
+        """The outcome in a sentence."""
+        outside = [(x.abs() > self.bound).double().mean().item() for x in (self.auto, self.cross)]
+        return (
+            f"{outside[0]:.0%} of the autocorrelations and {outside[1]:.0%} of the correlations with the action lie "
+            f"outside ±{self.bound:.3f}, where 5 % of those of white noise lie; neighbouring errors correlate by "
+            f"{self.auto[0].item():.2f}"
+        )
+
+
+def residual_tests(prediction: Prediction, record: SensorRecord, *, lags: int = 25) -> ResidualTests:
+    """Correlations of the errors of the first sensor, with themselves and with the first action.
+
+    Raises:
+        ValueError: if the record is not longer than the lags, or samples are missing.
+    """
+    e = prediction.errors[:-1, 0]
+    if not 1 <= lags < len(e) or e.isnan().any():
+        raise ValueError(f"lags={lags} of the residual tests need a longer record, without missing samples.")
+    e, u = e - e.mean(), record.actions[:, 0] - record.actions[:, 0].mean()
+    scale = e.norm() * u.norm()
+    auto = torch.stack([(e[k:] * e[:-k]).sum() for k in range(1, lags + 1)]) / e.square().sum()
+    cross = torch.stack([(e[k:] * u[: len(u) - k]).sum() for k in range(lags)]) / scale
+    return ResidualTests(auto, cross, 1.96 / math.sqrt(len(e)))
+
+
 def cross_validated(parts: list[Fold], config: Config) -> dict[str, Any]:
     """RMS error over all parts, of the physics and of every prior of the perceptron [V]."""
     found: dict[str, list[float]] = {}
@@ -134,7 +301,6 @@ def error(prediction: Prediction) -> float:
 
 def main(config: Config) -> None:
     from rt_torchrl.figures import save_figure
-    from rt_torchrl.figures.simulation import simulated_and_measured
 
     benchmark = read_benchmark(config.data)
     record = sensor_record_of(benchmark.voltage, benchmark.level)
@@ -169,6 +335,34 @@ def sensor_record_of(voltage: np.ndarray, level: np.ndarray) -> SensorRecord:
     readings = torch.from_numpy(np.ascontiguousarray(level)).double()[:, None]
     actions = torch.from_numpy(np.ascontiguousarray(voltage)).double()[:-1, None]
     return SensorRecord(readings, actions, torch.zeros_like(actions), guess(readings[0]))
+
+
+def simulated_and_measured(prediction: Prediction, record: SensorRecord, dt: float, *, title: str) -> Any:
+    """The first sensor over time, as measured and as simulated with the 95 % interval of a reading; the errors below.
+
+    Args:
+        prediction: the simulated record.
+        record: the measured record.
+        dt: control interval [s].
+        title: title of the figure.
+    """
+    from rt_torchrl.figures.style import REAL, TWIN, array, caption, legend_below, panels, time_unit, with_unit
+
+    unit, length = time_unit(dt * len(record.actions))
+    t = (record.start + dt * np.arange(len(record.readings))) / length
+    figure, axes = panels(2, title=title, size=(9.0, 5.6), sharex=True, height_ratios=[2, 1])
+    above, below = axes[:, 0]
+    middle = array(prediction.readings[:, 0])
+    half = 1.96 * array((prediction.deviation[:, 0] ** 2 + prediction.noise[0] ** 2).sqrt())
+    above.fill_between(t, middle - half, middle + half, color=TWIN, alpha=0.25, linewidth=0, label="95 % interval")
+    above.plot(t, array(record.readings[:, 0]), color=REAL, linewidth=1.2, label="measured")
+    above.plot(t, middle, color=TWIN, linewidth=1.2, label="simulated")
+    below.plot(t, array(prediction.errors[:, 0]), color=REAL, linewidth=0.9)
+    caption(above, "level [V]", f"RMS error {with_unit(prediction.rms[0].item(), 'V')}")
+    caption(below, "measured less simulated [V]")
+    below.set_xlabel(f"time [{unit}]")
+    legend_below(figure, [above])
+    return figure
 
 
 def drawn_closures(estimate: Estimate, count: int, seed: int):

@@ -11,36 +11,27 @@ from rt_torchrl import begin_loading
 if __name__ == "__main__":
     begin_loading()
 
-import numpy as np
 import torch
 import tyro
 
-from rt_torchrl import (
-    DigitalTwin,
-    Estimation,
-    EstimationConfig,
-    Identification,
-    IdentificationConfig,
-    Plant,
-    check_options,
-    main_of,
-    read_log,
+from rt_torchrl import DigitalTwin, Estimation, EstimationConfig, Plant, Trajectory, check_options, main_of, read_log
+from rt_torchrl.fit.least_squares import Identified, identify
+from rt_torchrl.fit.log import Column, checked
+from rt_torchrl.fit.resampling import (
+    ROUNDING,
+    Resampled,
+    filled,
+    hold_out,
+    initial_spread,
+    logged_readings,
+    resample,
+    sensors_in,
 )
-from rt_torchrl.fit.column import Column
-from rt_torchrl.fit.estimate_table import metrics_of_sensors, table_of_sensors, weight_lines
-from rt_torchrl.fit.identification import Identified, held_back, measured_states
-from rt_torchrl.fit.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
-from rt_torchrl.fit.resampling import ROUNDING, Resampled, hold_out, resample
-from rt_torchrl.fit.sensor_identification import identify
-from rt_torchrl.fit.sensor_log import SensorLog, checked
 from rt_torchrl.fit.sensors import with_biases
 from rt_torchrl.runs.loaded_run import config_class_of
 from rt_torchrl.runs.results_file import new_folder, write_results
 from rt_torchrl.runs.shipped_plants import plant_class
 from rt_torchrl.runs.tensor_file import save_tensors
-
-SLOW = 1.5
-"""Number of control intervals between rows above which many control instants have no sample."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +47,8 @@ class Config:
             HEADER=SIGNAL*FACTOR+OFFSET.
         drop: leave out rows with a value that is missing or out of range; they become gaps.
         missing: keep rows in which a sensor lacks its sample; only that sample is left out.
-        sensors: states and measurements whose columns the twin is fitted to by maximum likelihood; by default the
-            plant's own J_p is used, or all columns of sensors if a state is not measured, a sample is missing, or rows
-            are further apart than control intervals.
-        biased: sensors that may be off by a constant, which is estimated; the fit is then by maximum likelihood.
+        sensors: states and measurements whose columns the twin is fitted to; by default all that the log holds.
+        biased: sensors that may be off by a constant, which is estimated.
         guess: first guesses of the initial values of states that are not measured, as STATE=VALUE.
         dt: control interval of the twin [s]; by default the plant's own.
         gap: longest time between two rows that is bridged [s]; by default three sampling intervals.
@@ -67,8 +56,7 @@ class Config:
         held_out: share at the end of the log on which the twin is judged and not trained.
         seed: seed of the closure's first weights, if these are random.
         log_dir: folder of the results, which holds none yet; by default runs/identify/PLANT/TIME.
-        identification: options of the search for the weights.
-        estimation: options of the search by maximum likelihood.
+        estimation: options of the search for the weights, by maximum likelihood.
     """
 
     log: Annotated[Path, tyro.conf.Positional]
@@ -86,9 +74,6 @@ class Config:
     held_out: float = 0.25
     seed: int = 0
     log_dir: Path | None = None
-    identification: Annotated[IdentificationConfig, tyro.conf.arg(name="")] = field(
-        default_factory=IdentificationConfig
-    )
     estimation: EstimationConfig = field(default_factory=lambda: EstimationConfig(errors="robust"))
 
     def __post_init__(self):
@@ -134,11 +119,6 @@ class Config:
                 raise ValueError(f"guess={text!r} is not understood; write STATE=VALUE, such as wall=15.") from None
         return found
 
-    def by_likelihood(self, plant: Plant, log: SensorLog, interval: float) -> bool:
-        """Whether the twin is fitted by maximum likelihood; J_p needs a sample in every control interval."""
-        holes = any(np.isnan(values).any() for values in log.columns.values()) or interval > SLOW * plant.dt
-        return bool(self.sensors or self.biased or self.guess or holes or hidden_states(plant, log))
-
     def make_folder(self, plant: str) -> Path:
         """Create the folder of the results and return its path.
 
@@ -163,9 +143,8 @@ class Config:
 
 def main(config: Config) -> None:
     # Here, because --help need not wait for Matplotlib.
-    from rt_torchrl.figures import identification as charts
     from rt_torchrl.figures import save_figure
-    from rt_torchrl.figures import uncertainty as uncertain
+    from rt_torchrl.figures import uncertainty as charts
 
     plant = config.make_plant()
     columns = [Column.parse(text) for text in config.columns]
@@ -175,55 +154,73 @@ def main(config: Config) -> None:
     folder = config.make_folder(plant.name)
     print(report_of_parts(parts, plant, rows=len(log.times)))
     closure = plant.make_closure(torch.Generator().manual_seed(config.seed))
-    if config.by_likelihood(plant, log, parts.interval):
-        sensors = with_biases(sensors_in(plant, log, config.sensors), config.biased)
-        task = Estimation(
-            DigitalTwin(plant, closure), sensors, spread=initial_spread(plant, log), config=config.estimation
-        )
-        records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
-        judged = identify(task, *records)
-        metrics, shown = metrics_of_sensors(judged), table_of_sensors
-        drawn = {"twin_and_log": uncertain.twin_and_sensors(plant.dt, sensors, *records, judged)}
-        drawn |= {"correlations": uncertain.correlations(judged.estimate.uncertainty)}
-    else:
-        measured = measured_states(plant, log)
-        found = Identification(plant, closure, free=measured, config=config.identification).run(*split)
-        metrics, shown = metrics_of(plant, measured, found), table
-        drawn = {"twin_and_log": charts.twin_and_log(plant, measured, *split, found), "weights": charts.weights(found)}
+    sensors = with_biases(sensors_in(plant, log, config.sensors), config.biased)
+    spread = initial_spread(plant, log)
+    task = Estimation(DigitalTwin(plant, closure), sensors, spread=spread, config=config.estimation)
+    records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in split]
+    found = identify(task, *records)
     described = parts._asdict() | {"segments": [(s.start, len(s.actions)) for s in parts.segments]}
-    metrics = {"plant": plant.name} | metrics | {"log": described, "config": dataclasses.asdict(config)}
+    metrics = {"plant": plant.name} | metrics_of(found) | {"log": described, "config": dataclasses.asdict(config)}
+    for side, segments in zip(("training", "held_out"), split, strict=True):
+        metrics[side]["seconds"] = plant.dt * sum(len(segment.actions) for segment in segments)
     metrics["held_back"] = held_back(plant, parts.segments)
     write_results(folder / "metrics.json", metrics)
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
+    drawn = {
+        "twin_and_log": charts.twin_and_sensors(plant.dt, sensors, *records, found),
+        "weights": charts.weights(found.estimate),
+        "correlations": charts.correlations(found.estimate.uncertainty),
+    }
     for name, figure in drawn.items():
         save_figure(figure, folder / "figures" / f"{name}.png")
-    print(shown(metrics))
+    print(table(metrics))
     for name, share in filter(lambda entry: entry[1], metrics["held_back"].items()):
         print(f"  the plant's actuators hold back {name} in {share:.1%} of the log")
     print(f"results in {folder}")
 
 
-def metrics_of(plant: Plant, measured: list[int], found: Identified) -> dict[str, Any]:
-    """The content of ``metrics.json``, with the errors of the measured states; unknown numbers are null."""
-    summary: dict[str, Any] = {"iterations": found.iterations}
-    for name in ("training", "held_out"):
-        before, after = getattr(found, name)
-        rms = {
-            plant.states[k].name: {
-                "unit": plant.states[k].unit,
-                "before": before.rms[k].item(),
-                "after": after.rms[k].item(),
-            }
-            for k in measured
-        }
-        summary[name] = {"seconds": after.seconds, "J_p_before": before.J_p, "J_p": after.J_p}
-        summary[name] |= {"J_p_ratio": after.J_p / before.J_p, "rms": rms}
-    summary["autocorrelation"] = {plant.states[k].name: found.autocorrelation[k].item() for k in measured}
+def metrics_of(found: Identified) -> dict[str, Any]:
+    """The content of ``metrics.json``: errors of every sensor, weights, noise, initial states; unknown is null."""
+    estimate = found.estimate
+    sensors, states = estimate.likelihood.sensors, estimate.likelihood.plant.states
+    summary: dict[str, Any] = {"iterations": estimate.iterations, "prior": estimate.stiffness}
+    for side in ("training", "held_out"):
+        before, after = (map(_number, judged.rms.tolist()) for judged in getattr(found, side))
+        each = zip(sensors, before, after, strict=True)
+        rms = {s.name: {"unit": s.measurement.unit, "before": first, "after": last} for s, first, last in each}
+        summary[side] = {"rms": rms}
+    names = [sensor.name for sensor in sensors]
+    summary["autocorrelation"] = dict(zip(names, map(_number, found.autocorrelation.tolist()), strict=True))
+    summary["noise"], summary["bias"] = estimate.noise, estimate.biases
+    errors, intervals = estimate.uncertainty.standard_errors(), estimate.uncertainty.intervals()
     summary["weights"] = {
-        name: {key: value if math.isfinite(value) else None for key, value in entry.items()}
-        for name, entry in found.weights.items()
+        name: {
+            "before": estimate.before[name],
+            "after": value,
+            "standard_error": _number(errors[name]),
+            "interval": [_number(end) for end in intervals[name]],
+        }
+        for name, value in estimate.after.items()
     }
-    return summary
+    first, scatter = estimate.initial.tolist(), estimate.uncertainty.initial_errors().tolist()
+    summary["initial_states"] = [
+        {state.name: [value, _number(error)] for state, value, error in zip(states, *pair, strict=True)}
+        for pair in zip(first, scatter, strict=True)
+    ]
+    return summary | {"warnings": estimate.uncertainty.warnings()}
+
+
+def held_back(plant: Plant, segments: list[Trajectory]) -> dict[str, float]:
+    """Share of the control intervals in which the plant's actuators would not have applied the logged action.
+
+    In these intervals the action that the actuators allow drives the twin. They are a sign of wrong rate limits, units
+    or columns.
+    """
+    found = []
+    for segment in segments:
+        allowed = plant.actuate(segment.states[:-1], segment.actions)
+        found.append((allowed - segment.actions).abs() > 1e-6 * segment.actions.abs().amax(0).clamp_min(1e-12))
+    return dict(zip((a.name for a in plant.actions), torch.cat(found).double().mean(0).tolist(), strict=True))
 
 
 def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
@@ -244,18 +241,32 @@ def report_of_parts(parts: Resampled, plant: Plant, *, rows: int) -> str:
 
 def table(metrics: dict[str, Any]) -> str:
     """The results, for the terminal."""
-    lines = [f"  {'':<32}{'before':>12}{'after':>12}{'ratio':>12}"]
-    for name in ("training", "held_out"):
-        found, shown = metrics[name], name.replace("_", " ")
-        costs = (found["J_p_before"], found["J_p"], found["J_p_ratio"])
-        lines.append(f"  {'J_p, ' + shown:<32}" + "".join(f"{value:>12.4g}" for value in costs))
-        for state, rms in found["rms"].items():
-            label = f"RMS {state} [{rms['unit']}]"
-            lines.append(f"    {label:<30}{rms['before']:>12.4g}{rms['after']:>12.4g}")
-    correlation = ", ".join(f"{name} {value:.2f}" for name, value in metrics["autocorrelation"].items())
+    lines = [f"  {'':<32}{'before':>12}{'after':>12}"]
+    for side in ("training", "held_out"):
+        lines.append(f"  RMS errors, {side.replace('_', ' ')}")
+        for sensor, rms in metrics[side]["rms"].items():
+            label = f"{sensor} [{rms['unit']}]"
+            lines.append(f"    {label:<30}{_shown(rms['before']):>12}{_shown(rms['after']):>12}")
+    levels = ", ".join(f"{name} {value:.3g}" for name, value in metrics["noise"].items())
+    lines.append(f"  noise of the sensors: {levels}")
+    biases = ", ".join(f"{name} {value:.3g}" for name, value in metrics["bias"].items() if value)
+    lines += [f"  bias of the sensors: {biases}"] if biases else []
+    correlation = ", ".join(f"{name} {_shown(value)}" for name, value in metrics["autocorrelation"].items())
     lines.append(f"  correlation of neighbouring residuals: {correlation}")
-    lines += weight_lines(metrics["weights"])
+    lines.append(f"  {'weight':<32}{'before':>12}{'after':>12}{'std. error':>12}")
+    for name, entry in metrics["weights"].items():
+        error = "not shown" if entry["standard_error"] is None else f"{entry['standard_error']:.2g}"
+        lines.append(f"  {name:<32}{entry['before']:>12.5g}{entry['after']:>12.5g}{error:>12}")
+    lines += [f"  note: {warning}" for warning in metrics["warnings"]]
     return "\n".join(lines)
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _shown(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.4g}"
 
 
 if __name__ == "__main__":

@@ -45,10 +45,9 @@ from .control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scat
 from .control.predictive_control import PredictiveConfig, PredictiveControl
 from .control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 from .evaluation.limits import LimitConfig
-from .fit.identification import Identification, IdentificationConfig
-from .fit.estimation import Estimate, Estimation, EstimationConfig
-from .fit.sensor_log import LogConfig, read_log
-from .fit.sensor_record import SensorRecord, sensor_record
+from .fit.least_squares import Estimate, Estimation, EstimationConfig
+from .fit.log import LogConfig, read_log
+from .fit.record import SensorRecord, sensor_record
 from .fit.sensors import Sensor, sensors_of
 from .fit.uncertainty import Uncertainty
 
@@ -145,8 +144,6 @@ __all__ = [
     "Futures",
     "Held",
     "HypothesesConfig",
-    "Identification",
-    "IdentificationConfig",
     "Injection",
     "LaggedActuator",
     "LaggedCoefficients",

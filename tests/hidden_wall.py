@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from rt_torchrl.fit.sensor_record import sensor_record
+from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import sensors_of
 from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
@@ -44,8 +44,7 @@ class Room(Plant):
         rate = (outdoors * (exogenous[..., 0] - air) - into_wall + action[..., 0]) / 0.5e6
         return torch.stack([rate, into_wall / (1e6 * capacity)], -1)
 
-    def discrepancy(self, state, measured):
-        return 0.5 * (state[..., 0] - measured[..., 0]) ** 2
+    discrepancy_scales = (1.0, float("inf"))
 
     def draw_initial_state(self, batch, generator):
         return 20.0 + 3.0 * torch.randn(batch, 2, generator=generator, dtype=torch.float64)

@@ -76,9 +76,6 @@ class LinearQuadratic(Plant):
         quadratic = (state.unsqueeze(-2) * self._Q).sum(-1) * state
         return quadratic.sum(-1) + ((applied.unsqueeze(-2) * self._R).sum(-1) * applied).sum(-1)
 
-    def discrepancy(self, state, measured):
-        return 0.5 * ((state - measured) ** 2).sum(-1)
-
     def draw_initial_state(self, batch, generator):
         return torch.randn(batch, len(self.states), generator=generator, dtype=torch.float64)
 

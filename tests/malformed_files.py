@@ -21,8 +21,8 @@ from rt_torchrl.envs.wind_turbine.polars import Blade, Polar
 from rt_torchrl.envs.wind_turbine.power_coefficient import DATA, PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import read_wind
 from rt_torchrl.envs.wind_turbine.wind_record import GREATEST_SPEED
+from rt_torchrl.fit.log import SensorLog, checked, read_log
 from rt_torchrl.fit.resampling import INTERVALS_PER_ROW, resample
-from rt_torchrl.fit.sensor_log import SensorLog, checked, read_log
 from rt_torchrl.runs import checkpoint
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.run_settings import as_written

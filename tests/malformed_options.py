@@ -29,8 +29,7 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
-from rt_torchrl.fit.column import Column
-from rt_torchrl.fit.sensor_log import SensorLog
+from rt_torchrl.fit.log import Column, SensorLog
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.action_limits import ActionLimits
 from rt_torchrl.systems.faulty_system import Injection

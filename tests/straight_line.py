@@ -36,9 +36,6 @@ class Line(Plant):
     def vector_field(self, t, state, action, exogenous, closure):
         return closure(exogenous).expand_as(state)
 
-    def discrepancy(self, state, measured):
-        return 0.5 * ((state - measured) ** 2).sum(-1)
-
     def draw_initial_state(self, batch, generator):
         return torch.zeros(batch, 1, dtype=torch.float64)
 

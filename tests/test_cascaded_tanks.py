@@ -15,7 +15,6 @@ from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
-from rt_torchrl.fit.cross_validation import folds, pooled
 from rt_torchrl.trajectories.rollout import Rollout
 
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -178,6 +177,7 @@ def test_options_out_of_range_are_refused(option):
 def test_every_part_of_a_record_is_held_out_once():
     made = recipe()
     record = made.sensor_record_of(np.linspace(1.0, 2.0, 401), np.linspace(3.0, 5.0, 401))
+    folds, pooled = made.folds, made.pooled
     parts = folds(record, 4, 4.0, made.guess)
     assert [len(part.held_out.actions) for part in parts] == [100] * 4
     assert [len(part.training) for part in parts] == [1, 2, 2, 1]

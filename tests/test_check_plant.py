@@ -31,11 +31,11 @@ def test_every_violation_is_told_at_once():
         def observe(self, t, state, exogenous):
             return state.detach()
 
-        def discrepancy(self, state, measured):
-            return 0.1 + super().discrepancy(state, measured)
+        def terminal_cost(self, state):
+            return -1.0 + super().terminal_cost(state)
 
     found = violations(Broken())
-    assert {text.split(":")[0] for text in found} == {"observe", "discrepancy", "running_cost"}
+    assert {text.split(":")[0] for text in found} == {"observe", "terminal_cost", "running_cost"}
     with pytest.raises(
         PlantContractError, match=rf"'linear_quadratic' breaks its contract in {len(found)} ways:\n  1. "
     ):

@@ -171,6 +171,6 @@ def direct_of(extra, extras):
 
 def test_one_word_for_the_folder_of_the_results():
     """Recipes that print, or read a run and write beside it or nowhere, have none."""
-    without = {"benchmark", "compare", "coverage", "export", "record_log"}
+    without = {"benchmark", "compare", "export", "record_log"}
     for name in set(RECIPES) - without:
         assert "--log-dir" in help_of(name), name

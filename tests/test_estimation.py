@@ -12,9 +12,8 @@ from straight_line import Line, Slope, flown, line_segment, noise_of
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.first_values import first_noise
-from rt_torchrl.fit.sensor_record import sensor_record, usual_initial_state
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, first_noise
+from rt_torchrl.fit.record import sensor_record, usual_initial_state
 from rt_torchrl.fit.sensors import Sensor, known_sensors, read, read_slopes, sensors_of
 from rt_torchrl.plants.signal import Measurement
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -47,7 +46,7 @@ def test_derivatives_are_those_of_backpropagation():
         inputs = torch.cat([record.exogenous, record.exogenous[-1:]])
         error = read(sensors, plant, t, flown_again.states[0], inputs) + likelihood.biases() - record.readings
         cost = cost + 0.5 * ((error / likelihood.noise).nan_to_num() ** 2).sum()
-    cost = cost + 0.5 * (((first - likelihood.initial.measured) / spread) ** 2).sum()
+    cost = cost + 0.5 * (((first - likelihood.initial.guess) / spread) ** 2).sum()
     gradient = torch.cat([g.flatten() for g in torch.autograd.grad(cost, unknowns)])
     found = likelihood.normal_equations()
     # The same derivatives, forward instead of backward.
@@ -172,14 +171,14 @@ def test_states_and_measurements_of_a_plant_are_sensors(kind, name):
 
 def test_what_cannot_be_estimated_is_refused():
     plant, sensors, records = room_records(lengths=(40,))
-    twin = DigitalTwin(plant, Envelope.true())
+    twin, unseen = DigitalTwin(plant, Envelope.true()), records[0]._replace(readings=torch.nan * records[0].readings)
     for wrong, message in (
         (lambda: sensors_of(plant, ["roof"]), r"sensors=\('roof',\) .* choose among air, wall"),
         (lambda: sensors_of(plant, []), "nothing cannot be measured"),
         (lambda: Sensor(measurement=sensors[0].measurement, noise=0.0), "noise=0.0 of sensor 'air'"),
         (lambda: Estimation(twin, sensors, spread=-torch.ones(2).double()), r"spread=\[-1.0, -1.0\]"),
         (lambda: first_noise(sensors, []), r"records=\[\]"),
-        (lambda: first_noise(sensors, [records[0].masked(0, 0)]), "sensor 'air' has no sample"),
+        (lambda: first_noise(sensors, [unseen]), "sensor 'air' has no sample"),
         (lambda: EstimationConfig(prior=-1.0), "prior=-1.0"),
         (lambda: EstimationConfig(rounds=0), "rounds=0"),
     ):

@@ -9,7 +9,9 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
 from torch import nn
 
-from rt_torchrl.fit.identification import Identification, IdentificationConfig
+from rt_torchrl.fit.least_squares import Estimation
+from rt_torchrl.fit.record import sensor_record
+from rt_torchrl.fit.sensors import state_sensors
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -109,12 +111,12 @@ def test_the_error_of_a_first_sample_does_not_leave_a_weight_where_it_shows_nowh
     """With the first sample, two metres too low, the best slope is above the cap, from where no gradient leads back."""
     values = 0.9 * 0.1 * np.arange(101) + 0.01 * noise_of(101, 0)
     values[0] -= 2.0
-    segments, closure = [line_segment(values)], Capped()
-    fixed = Capped()
-    options = {"initial": "measured"}
-    Identification(Line(), fixed, free=(0,), config=IdentificationConfig(**options)).run(segments, segments)
+    plant, fixed, closure = Line(), Capped(), Capped()
+    sensors = state_sensors(plant)
+    records = [sensor_record(plant, sensors, line_segment(values))]
+    Estimation(DigitalTwin(plant, fixed), sensors, spread=torch.zeros(1).double()).run(records)
     assert fixed.w[0] > 1.0
-    Identification(Line(), closure, free=(0,), config=IdentificationConfig()).run(segments, segments)
+    Estimation(DigitalTwin(plant, closure), sensors).run(records)
     # The regression holds the wrong sample too: two metres at the end of ten seconds weigh 0.01 m/s or so.
     times = 0.1 * np.arange(101)
     assert closure.w[0].item() == pytest.approx(np.polyfit(times, values, 1)[0], abs=1e-4)

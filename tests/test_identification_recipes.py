@@ -94,12 +94,3 @@ def test_a_twin_with_every_memory_is_judged_after_every_episode(tmp_path):
     memory = recipe("memory")
     memory.main(memory.Config(seeds=1, episodes=2, unseen=2, log_dir=tmp_path))
     assert {"memory.json", "memory.png"} <= {path.name for path in tmp_path.iterdir()}
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["wind_turbine", "flapping_wing", "cascaded_tanks"])
-def test_bands_of_neural_closures_hold_the_curve(name):
-    """C_p, C_L and the outlet of a tank, pointwise where the records have been."""
-    coverage = recipe("coverage")
-    found = coverage.curves_of(coverage.CURVES[name], 20, 0.01, 0)
-    assert found.mean() >= 0.85

@@ -14,11 +14,9 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.log_readings import filled, hidden_states, initial_spread, logged_readings, sensors_in
-from rt_torchrl.fit.resampling import resample
-from rt_torchrl.fit.sensor_identification import autocorrelation
-from rt_torchrl.fit.sensor_log import SensorLog, checked
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation
+from rt_torchrl.fit.log import SensorLog, checked
+from rt_torchrl.fit.resampling import filled, hidden_states, initial_spread, logged_readings, resample, sensors_in
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -131,7 +129,9 @@ def test_the_room_is_identified_from_a_file(room_log, capsys):
         assert entry["interval"][0] < entry["after"] < entry["interval"][1]
     assert metrics["held_out"]["rms"]["air"]["after"] == pytest.approx(0.05, rel=0.4)  # 50 samples
     assert 0.0 < metrics["initial_states"][0]["wall"][1] < 1.0
-    assert {path.name for path in (room_log / "results/figures").iterdir()} == {"twin_and_log.png", "correlations.png"}
+    assert {path.name for path in (room_log / "results/figures").iterdir()} == {
+        f"{name}.png" for name in ("twin_and_log", "weights", "correlations")
+    }
     shown = capsys.readouterr().out
     assert "noise of the sensors: air 0.0" in shown and "to_wall" in shown
     torch.load(room_log / "results" / "weights.pt", weights_only=True)
@@ -187,17 +187,6 @@ def test_errors_of_a_slow_log_are_those_of_its_rows():
     # The two grids integrate the same system, to fourth order.
     torch.testing.assert_close(found[0], found[1], rtol=0.02, atol=0)
     assert 0.25 < found[0][1].item() < 0.6  # half, of the part of the noise that is smooth
-
-
-@pytest.mark.parametrize("step, expected", [(0.1, False), (0.14, False), (0.2, True)])
-def test_a_log_slower_than_the_twin_is_fitted_by_its_rows_alone(step, expected):
-    plant = LinearQuadratic(dt=0.1)
-    zero = np.zeros(60)
-    log = SensorLog(
-        times=step * np.arange(60), columns=dict.fromkeys(("position", "velocity", "force", "disturbance"), zero)
-    )
-    config = identify_recipe().Config(log=Path("log.csv"), plant="own")
-    assert config.by_likelihood(plant, log, resample(log, plant).interval) is expected
 
 
 def test_samples_are_not_interpolated_across_rows_that_were_left_out():

@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 
-from rt_torchrl.fit.identification import IdentificationConfig
+from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
 from rt_torchrl.systems.exploration import ExplorationConfig
@@ -84,7 +84,7 @@ def test_layers_without_units_are_refused():
 
 CONFIGS = {
     DescentConfig: {"optimiser": "newton", "rate": math.inf, "gradient_limit": math.nan},
-    IdentificationConfig: {"optimiser": "newton", "initial": "guessed", "rate": math.nan, "iterations": math.nan},
+    EstimationConfig: {"errors": "newton", "prior": math.inf, "rounds": math.nan, "iterations": math.nan},
     ExogenousConfig: {"knots": math.nan, "tube": math.inf, "penalty": math.inf, "kernel_width": math.inf},
     AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
     RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "tolerance": math.inf, "stall": math.nan},

@@ -63,6 +63,22 @@ def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way()
         Turning().discrepancy(one[:, :1], other[:, :1])
 
 
+def test_a_discrepancy_that_is_no_sum_of_squares_is_refused_with_what_to_give_instead():
+    with pytest.raises(ValueError, match=r"Own.discrepancy: .* give the scales .* discrepancy_scales, with math.inf"):
+
+        class Own(LinearQuadratic):
+            def discrepancy(self, state, measured):
+                return (state - measured).abs().sum(-1)
+
+
+def test_a_state_without_a_finite_scale_is_not_compared():
+    class Half(LinearQuadratic):
+        discrepancy_scales = (2.0, math.inf)
+
+    one, other = torch.tensor([[3.0, math.nan]]).double(), torch.tensor([[1.0, 5.0]]).double()
+    assert Half().discrepancy(one, other).item() == 0.5
+
+
 class Clocked(LinearQuadratic):
     measurements = (
         Measurement.of(LinearQuadratic.states[1], offset=1.0, scale=2.0),

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from test_export_recipe import recipe
 
 from rt_torchrl.envs.pendulum.models import UniformRod
 from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
-from rt_torchrl.fit.identification import Identification, IdentificationConfig
-from rt_torchrl.fit.resampling import hold_out, resample
-from rt_torchrl.fit.sensor_log import checked
-from rt_torchrl.fit.simulated_log import recorded
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
+from rt_torchrl.fit.log import checked
+from rt_torchrl.fit.resampling import hold_out, logged_readings, resample, sensors_in
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
@@ -26,6 +26,7 @@ from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
+recorded = recipe("record_log").recorded
 RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"
 
 
@@ -134,12 +135,15 @@ def test_mass_and_length_follow_from_a_log_that_passes_the_seam():
     log = recorded(plant, lambda t, state, z: spin * (-1.0) ** (t // 1.0), generator, noise=0.002)
     assert np.abs(np.diff(log.columns["angle"])).max() > math.pi  # it passes the seam
     # Noise takes a speed at the stop beyond its range.
-    parts = resample(checked(log, plant, drop=True), plant)
-    training, held_out = hold_out(parts.segments, plant.dt, 0.25)
-    closure = UniformRod.guess(0.9)
-    found = Identification(plant, closure, free=(0, 1), config=IdentificationConfig()).run(training, held_out)
-    for entry in found.weights.values():
-        assert abs(entry["after"] - 1.0) < 4.0 * entry["standard_error"] < 0.1
+    log = checked(log, plant, drop=True)
+    parts, sensors = resample(log, plant), sensors_in(plant, log)
+    sides = hold_out(parts.segments, plant.dt, 0.25)
+    records = [[logged_readings(log, plant, sensors, part, parts.gap) for part in side] for side in sides]
+    twin = DigitalTwin(plant, UniformRod.guess(0.9))
+    found = identify(Estimation(twin, sensors, config=EstimationConfig(errors="robust")), *records)
+    errors = found.estimate.uncertainty.standard_errors()
+    for name, value in found.estimate.after.items():
+        assert abs(value - 1.0) < 4.0 * errors[name] < 0.1
     # Noise of 0.2 % of angles up to π and speeds up to 8; a turn would stand out by 2π over √60.
     assert (found.training[1].rms < 0.02).all() and (found.held_out[1].rms < 0.05).all()
     assert found.autocorrelation.abs().max() < 0.6
@@ -184,6 +188,8 @@ COMPILED = """
 import sys, torch
 sys.path.insert(0, "tests")
 from test_pendulum import Pendulum, Rollout, control_cost, seeded
+
+recorded = recipe("record_log").recorded
 
 plant = Pendulum(horizon=0.25)
 # A window of a short horizon has a start for each realisation; lengths and numbers of realisations both change.

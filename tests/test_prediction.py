@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 import torch
+from interval_coverage import CASES, CURVES, coverage, curves_of
 from straight_line import Line, Slope, line_segment, noise_of
+from test_export_recipe import recipe
 from test_uncertainty import NOISE, TIMES, exact_covariance, line_estimate, position
 
-from rt_torchrl.fit.coverage import coverage
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.prediction import Prediction, predict, residual_tests
-from rt_torchrl.fit.sensor_record import sensor_record
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
+from rt_torchrl.fit.record import sensor_record
 from rt_torchrl.fit.sensors import sensors_of
+from rt_torchrl.fit.uncertainty import band
 from rt_torchrl.trajectories.twin import DigitalTwin
+
+made = recipe("cascaded_tanks")
+Prediction, predict, residual_tests = made.Prediction, made.predict, made.residual_tests
 
 
 def predicted(first=20):
@@ -89,12 +93,8 @@ def test_intervals_of_a_regression_hold_the_truth():
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["flapping_wing", "cryogenic_tank", "cascaded_tanks", "pendulum", "wind_turbine"])
 def test_intervals_hold_the_truth_on_each_plant(name):
-    """200 simulations with 1 % of noise, as ``recipes/coverage.py`` counts them."""
-    from test_cascaded_tanks import RECIPES
-    from test_export_recipe import recipe
-
-    assert (RECIPES / "coverage.py").exists()
-    case = recipe("coverage").CASES[name]
+    """200 simulations with 1 % of noise of the sensors' scatter."""
+    case = CASES[name]
     plant, generator = case.plant(), torch.Generator().manual_seed(0)
     given = {"config": EstimationConfig(iterations=20), "flights": case.flights}
     found = coverage(plant, case.closure(plant), sensors_of(plant, case.sensors), generator=generator, **given)
@@ -107,8 +107,13 @@ def test_bands_of_a_perceptron_hold_the_curve():
     """Pointwise, where data was, over 100 draws of the noise and of the first weights."""
     from test_uncertainty import curve_estimate
 
-    from rt_torchrl.fit.curve import band
-
     x = torch.linspace(-2.0, 2.0, 41).double()
     inside = [band(curve_estimate(seed).uncertainty, x, x[:, None]).covers(x.sin()) for seed in range(100)]
     assert np.mean(inside) >= 0.85
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", CURVES)
+def test_bands_of_neural_closures_hold_the_curve(name):
+    """C_p, C_L and the outlet of a tank, pointwise where the records have been."""
+    assert curves_of(CURVES[name], 20, 0.01, 0).mean() >= 0.85

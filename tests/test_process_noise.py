@@ -8,10 +8,10 @@ import torch
 from straight_line import Line, Slope, line_segment, noise_of
 from test_uncertainty import NOISE, position
 
-from rt_torchrl.fit.estimation import Estimation
-from rt_torchrl.fit.sensor_record import chained, sensor_record
+from rt_torchrl.fit.least_squares import Estimation
+from rt_torchrl.fit.prior import Belief, BeliefPrior
+from rt_torchrl.fit.record import chained, sensor_record
 from rt_torchrl.fit.sensors import sensors_of
-from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.twin import DigitalTwin
 
@@ -165,7 +165,7 @@ def test_what_no_record_has_told_stays_unknown_in_a_belief():
         sensor_record(Line(), position(), line_segment((0.5 + 0.3 * z) * TIMES + NOISE * noise_of(N + 1, 5), wind=z))
         for z in (0.0, 3.0)
     )
-    belief = Belief.of(task.run([calm]).uncertainty)
+    belief = task.run([calm]).uncertainty.belief()
     assert belief.covariance[1, 1] > 1e7 and belief.covariance[0, 0] < 1.0
     found = task.run([storm], BeliefPrior(closure, belief, 1e-3)).uncertainty
     alone = Estimation(DigitalTwin(Line(), Slope()), position()).run([calm, storm]).uncertainty

@@ -25,7 +25,6 @@ ROOMS_OF = {
     "asynchronous.py": {"runs"},
     "benchmark.py": {"runs", "trajectories"},
     "cascaded_tanks.py": {"figures", "fit", "runs"},
-    "coverage.py": {"evaluation", "fit"},
     "compare.py": {"figures", "runs", "study"},
     "export.py": {"export", "runs"},
     "gallery.py": {"runs"},

@@ -10,8 +10,8 @@ from test_sensor_log import PLANT, jittered, signals
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.fit import resampling
+from rt_torchrl.fit.log import SensorLog, checked
 from rt_torchrl.fit.resampling import hold_means, hold_out, resample
-from rt_torchrl.fit.sensor_log import SensorLog, checked
 
 
 def test_instantaneous_signals_are_interpolated():

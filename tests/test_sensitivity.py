@@ -129,8 +129,8 @@ def test_matrix_is_the_hessian_where_the_residual_vanishes():
 def test_levenberg_marquardt_identifies_the_closure_to_rounding():
     plant = LinearQuadratic(noise=0.0)
     twin, flown, exogenous = recorded(plant)
-    assimilation = Assimilation(twin, AssimilationConfig(method="levenberg_marquardt"))
-    assimilation.second_order.run(lambda: assimilation.normal_equations(flown), iterations=15)
+    assimilation = Assimilation(twin, AssimilationConfig())
+    LevenbergMarquardt(twin.closure).run(lambda: assimilation.normal_equations(flown), iterations=15)
     # The record is noise-free and J_p quadratic at its minimum: Newton's convergence ends in rounding.
     torch.testing.assert_close(twin.closure.matrix, plant.closure.matrix, rtol=0, atol=1e-8)
 

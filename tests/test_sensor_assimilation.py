@@ -10,11 +10,10 @@ from straight_line import Line, Slope, line_segment, noise_of
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.first_values import state_sizes
-from rt_torchrl.fit.sensor_record import chained, sensor_record
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, usual_sizes
+from rt_torchrl.fit.prior import BeliefPrior
+from rt_torchrl.fit.record import chained, sensor_record
 from rt_torchrl.fit.sensors import sensors_of
-from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -162,7 +161,7 @@ def test_pushes_in_step_4_are_those_of_an_estimation():
     records = [sensor_record(plant, sensors, one) for one in line_records((0.8, 0.1), pushes=1.0)]
     first = FirstStates(plant, sensors)
     records = [one._replace(guess=first.guess(one)) for one in records]
-    size = state_sizes(plant, torch.stack([one.guess for one in records]), sensors, records)
+    size = usual_sizes(plant, torch.stack([one.guess for one in records]), sensors, records)
     parts = [part for one in records for part in chained(one, 30, plant.dt)]
     found = Estimation(DigitalTwin(plant, own), sensors, spread=first.spread, process=2.0 * size).run(parts)
     assert closure.w.tolist() == pytest.approx(own.w.tolist(), abs=1e-6)
@@ -183,7 +182,7 @@ def test_weights_that_drift_are_followed_from_episode_to_episode():
         prior = None if belief is None else BeliefPrior(own, belief, 0.05)
         options = EstimationConfig(rounds=4, starts=10 if prior is None else 1)
         task = Estimation(DigitalTwin(plant, own), sensors, spread=first.spread, config=options)
-        belief = Belief.of(task.run(read, prior).uncertainty)
+        belief = task.run(read, prior).uncertainty.belief()
         assert closure.w.tolist() == pytest.approx(own.w.tolist(), abs=1e-6)
     again, _ = line_step(drift=0.05)
     again.load_state_dict(step.state_dict())

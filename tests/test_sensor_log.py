@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from test_export_recipe import recipe
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.fit.column import Column
+from rt_torchrl.fit.log import Column, SensorLog, checked, logged_signals, read_log
 from rt_torchrl.fit.resampling import resample
-from rt_torchrl.fit.sensor_log import SensorLog, checked, logged_signals, read_log
-from rt_torchrl.fit.simulated_log import policy_law, recorded
 from rt_torchrl.trajectories.rollout import Rollout
+
+record_log = recipe("record_log")
+policy_law, recorded = record_log.policy_law, record_log.recorded
 
 pytest.importorskip("pandas"), pytest.importorskip("pint")
 PLANT = LinearQuadratic(dt=0.1)

@@ -9,12 +9,12 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from small_runs import SMALL
 from test_classical import PD
+from test_export_recipe import recipe
 from test_hypotheses import ASSIMILATION as NEWTON
 from test_hypotheses import LAG, Suspecting
 
 from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.fit.sensor_log import LogConfig
-from rt_torchrl.fit.simulated_log import ClassicalLaw, recorded
+from rt_torchrl.fit.log import LogConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.policies import SaturatedMLP
@@ -34,6 +34,9 @@ from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
 from rt_torchrl.twinning.planners import PlannerConfig
 from rt_torchrl.twinning.referees import ROLES
 from rt_torchrl.twinning.starts.recorded_flights import transitions_of
+
+record_log = recipe("record_log")
+ClassicalLaw, recorded = record_log.ClassicalLaw, record_log.recorded
 
 GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Regions, profiles, design of manoeuvres and bands of curves, against closed forms of regression."""
+"""Standard errors, regions, design of manoeuvres and bands of curves, against closed forms and Monte Carlo."""
 
 import math
 
@@ -6,22 +6,24 @@ import numpy as np
 import pytest
 import torch
 from hidden_wall import Envelope, room_records
-from straight_line import Line, Slope, line_segment, noise_of
+from linear_quadratic import LinearClosure, LinearQuadratic
+from straight_line import Line, Slope, flown, line_segment, noise_of
+from test_export_recipe import recipe
 from torch import nn
 
+from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures import uncertainty as charts
-from rt_torchrl.fit.covariance import standard_errors
-from rt_torchrl.fit.curve import band
 from rt_torchrl.fit.design import next_manoeuvres, weight_information
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.output_error import InitialStates, OutputError
-from rt_torchrl.fit.prediction import predict
-from rt_torchrl.fit.sensor_record import sensor_record
-from rt_torchrl.fit.sensors import Sensor, sensors_of
-from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig
+from rt_torchrl.fit.prior import Belief, BeliefPrior
+from rt_torchrl.fit.record import sensor_record
+from rt_torchrl.fit.sensors import Sensor, sensors_of, state_sensors
+from rt_torchrl.fit.uncertainty import Uncertainty, band, named_values, newey_west
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.trajectories.twin import DigitalTwin
 
+ROBUST = EstimationConfig(errors="robust")
 TIMES = 0.1 * np.arange(81)
 NOISE = 0.2
 
@@ -66,8 +68,7 @@ def test_errors_correlations_and_ellipses_are_those_of_regression():
 
 def test_robust_errors_see_that_neighbours_are_alike():
     """Means of neighbours have half the variance of white noise, but sums of them the same: 81 samples, 10 draws."""
-    config = EstimationConfig(errors="robust")
-    robust = line_estimate(smooth=True, config=config).uncertainty.weights_covariance[0, 0].sqrt().item()
+    robust = line_estimate(smooth=True, config=ROBUST).uncertainty.weights_covariance[0, 0].sqrt().item()
     assert robust == pytest.approx(math.sqrt(exact_covariance()[0, 0]), rel=0.5)
 
 
@@ -104,8 +105,6 @@ def test_what_the_data_do_not_say_does_not_depend_on_units(weights, values):
         assert errors == pytest.approx([known, math.inf], rel=1e-6)
         (warning,) = (text for text in found.warnings() if "hardly" not in text)
         assert "the data say nothing of wind" in warning if wind == 0.0 else "calm and wind apart: 1 comb" in warning
-        by_cost = OutputError(DigitalTwin(Line(), closure), [segment], InitialStates.as_measured([segment]))
-        assert [math.isinf(error) for error in standard_errors(by_cost).values()] == [math.isinf(known), True]
         assert found.correlations()[:, 1].isnan().all()
         # The slope in the wind of the record is known, that in any other wind is not.
         x = torch.tensor([wind, wind + 1.0]).double()
@@ -127,6 +126,7 @@ def test_a_prior_bounds_what_the_data_do_not_say():
 
 
 def test_a_prediction_in_a_wind_of_which_no_record_tells_has_no_bound():
+    predict = recipe("cascaded_tanks").predict
     task = Estimation(DigitalTwin(Line(), Slope()), position())
     sensors, values = position(), 0.5 * TIMES + NOISE * noise_of(81, 0)
     estimate = task.run([sensor_record(Line(), sensors, line_segment(values))])
@@ -233,3 +233,72 @@ def test_what_makes_no_region_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             wrong()
+
+
+def regression_error(n, dt, *, smooth):
+    """Standard error of the slope of a line through n samples with such noise, by (XᵀX)⁻¹XᵀΩX(XᵀX)⁻¹."""
+    X = np.stack([np.ones(n), dt * np.arange(n)], -1)
+    omega = np.eye(n)
+    if smooth:
+        omega = 0.5 * np.eye(n) + 0.25 * (np.eye(n, k=1) + np.eye(n, k=-1))
+    inverse = np.linalg.inv(X.T @ X)
+    return math.sqrt((inverse @ X.T @ omega @ X @ inverse)[1, 1])
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_standard_errors_are_those_of_regression(smooth):
+    """Mean over draws of the estimated variance against the exact one, for white and for smoothed noise."""
+    n, found = 300, []
+    for seed in range(10):
+        segment = line_segment(0.5 * 0.1 * np.arange(n) + noise_of(n, seed, smooth=smooth))
+        record = sensor_record(Line(), position(), segment)
+        estimate = Estimation(DigitalTwin(Line(), Slope()), position(), config=ROBUST).run([record])
+        found.append(estimate.uncertainty.weights_covariance[0, 0].item())
+    expected = regression_error(n, 0.1, smooth=smooth)
+    # A variance from 300 samples and 6 lags scatters by √(2·2·6/300) = 28 %, of which ten draws leave 8 %, half of
+    # that in the error; the window takes another few per cent of the correlation and of the trend.
+    assert math.sqrt(np.mean(found)) == pytest.approx(expected, rel=0.12)
+
+
+def test_scatter_over_logs_is_the_standard_error():
+    """Monte Carlo on the oracle plant: noise drawn anew, weights fitted anew."""
+    plant = LinearQuadratic(horizon=4.0)
+    sensors = state_sensors(plant)
+    (clean,) = flown(plant, torch.Generator().manual_seed(0), (40,))
+    estimates, errors = [], []
+    for seed in range(12):
+        generator = torch.Generator().manual_seed(100 + seed)
+        noise = 0.02 * torch.randn(clean.states.shape, generator=generator, dtype=torch.float64)
+        record = sensor_record(plant, sensors, clean._replace(states=clean.states + noise, start=0.0))
+        closure = LinearClosure(plant.true_closure)
+        found = Estimation(DigitalTwin(plant, closure), sensors, config=ROBUST).run([record])
+        estimates.append(closure.matrix.detach().flatten().clone())
+        errors.append(torch.tensor(list(found.uncertainty.standard_errors().values())))
+    z = (torch.stack(estimates) - torch.tensor(plant.true_closure).double().flatten()) / torch.stack(errors)
+    # 48 standard normal numbers, four at a time correlated: their mean square is 1 within 0.4 or so. With 41 samples
+    # of two states and 4 lags the errors themselves are low by some 10 %.
+    assert 0.5 < (z**2).mean() < 2.2
+
+
+def test_scores_of_white_noise_sum_to_their_variance():
+    scores = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = newey_west(scores)
+    # Fourteen lags of 20 000 samples: 2·14·2/3/20 000 is a scatter of 3 %.
+    torch.testing.assert_close(found / 20_000, torch.eye(2).double(), rtol=0, atol=0.12)
+
+
+def test_named_errors_follow_from_those_of_the_logarithms():
+    """The standard error of a = e^w is, to first order, σ_a = a σ_w."""
+    plant = FlappingWing(horizon=0.03)
+    (segment,) = flown(plant, torch.Generator().manual_seed(0), (60,))
+    closure = QuasiSteadyPolar.true().requires_grad_(True)
+    noise = 1e-6 * torch.randn(61, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    sensors = state_sensors(plant)
+    record = sensor_record(plant, sensors, segment._replace(states=segment.states + noise, start=0.0))
+    task = Estimation(DigitalTwin(plant, closure), sensors, spread=torch.zeros(4).double())
+    found = Uncertainty(task.likelihood([record]), errors="robust")
+    expected = closure.coefficients.detach() * found.weights_covariance.diagonal().sqrt()
+    errors = found.standard_errors()
+    assert list(errors) == ["a", "b", "c"]
+    assert list(errors.values()) == pytest.approx(expected.tolist(), rel=1e-9)
+    assert list(named_values(LinearClosure(torch.zeros(2, 2)))) == [f"matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rt_torchrl.fit.units import converted
+from rt_torchrl.fit.log import converted
 
 pytest.importorskip("pint")
 

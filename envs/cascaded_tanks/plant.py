@@ -1,5 +1,6 @@
 r"""The Cascaded Tanks benchmark as a plant: a pump fills the upper tank, which drains into the lower one."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -132,11 +133,8 @@ class CascadedTanks(Plant):
         error = state[..., 1] - exogenous[..., 0]
         return error**2 + self.pump_weight * (applied[..., 0] - 3.0) ** 2
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch 2"], measured: Float[Tensor, "*#batch 2"]
-    ) -> Float[Tensor, "*batch"]:
-        """Half the squared error of the lower level [V²]."""
-        return 0.5 * (state[..., 1] - measured[..., 1]) ** 2
+    discrepancy_scales = (math.inf, 1.0)
+    """L_p is half the squared error of the lower level [V²]."""
 
     def merit(
         self,

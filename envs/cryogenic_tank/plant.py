@@ -265,11 +265,10 @@ class CryogenicTank(Plant):
         """The cost of the pressure at the end, see ``costs.py``."""
         return self.cost.terminal(self, state)
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch 3"], measured: Float[Tensor, "*#batch 3"]
-    ) -> Float[Tensor, "*batch"]:
-        r"""The sum of the squared errors of T_s, V_l and p over their natural sizes, over T_o (paper, eq. of J_p)."""
-        return (((state - measured) / self.error_sizes) ** 2).sum(-1) / self.horizon
+    @property
+    def discrepancy_scales(self) -> tuple[float, ...]:
+        r"""Scales in which J_p is the sum of the squared errors over their natural sizes, over T_o (eq. of J_p)."""
+        return tuple((math.sqrt(0.5 * self.horizon) * self.error_sizes).tolist())
 
     merit, setpoints, make_neural_closure = judgement.merit, judgement.setpoints, first_neural_guess
     suspects, further_suspects = suspects, further_suspects

@@ -245,11 +245,10 @@ class FlappingWing(Plant):
         """The cost of the task, see ``costs.py``."""
         return self.cost(self, t, state, applied, exogenous)
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
-    ) -> Float[Tensor, "*batch"]:
-        """The discrepancy ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
-        return 0.5 * ((state[..., :2] - measured[..., :2]) ** 2).sum(-1)
+    @property
+    def discrepancy_scales(self) -> tuple[float, ...]:
+        """Scales in which L_p is ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
+        return (1.0, 1.0, *(math.inf,) * (len(self.states) - 2))
 
     latch, controller_start, seen_velocity = memory.latch, memory.started, memory.seen_velocity
     merit, setpoints, categories, make_neural_closure, suspects, further_suspects = (

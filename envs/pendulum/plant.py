@@ -147,12 +147,8 @@ class Pendulum(Plant):
         theta, rate = state.unbind(-1)
         return wrapped(theta) ** 2 + 0.1 * rate**2 + 0.001 * applied[..., 0] ** 2
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch 2"], measured: Float[Tensor, "*#batch 2"]
-    ) -> Float[Tensor, "*batch"]:
-        """The discrepancy ½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² of a hanging rod."""
-        turn, rate = (state - measured).unbind(-1)
-        return 0.5 * (wrapped(turn) ** 2 + rate**2 / 15.0)
+    discrepancy_scales = (1.0, math.sqrt(15.0))
+    """L_p is ½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² of a hanging rod."""
 
     def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
         return merit(self, states, applied, exogenous)

@@ -253,11 +253,10 @@ class WindTurbine(Plant):
         """The cost of the task, see ``costs.py``."""
         return self.cost(self, t, state, applied, exogenous)
 
-    def discrepancy(
-        self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]
-    ) -> Float[Tensor, "*batch"]:
-        """The discrepancy ½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
-        return 0.5 * (self.gear_ratio * (state[..., 0] - measured[..., 0])) ** 2
+    @property
+    def discrepancy_scales(self) -> tuple[float, ...]:
+        """Scales in which L_p is ½(ω_g − ω̌_g)² [rad²/s²] (paper, eq. assimilation_functional)."""
+        return (1.0 / self.gear_ratio, *(math.inf,) * (len(self.states) - 1))
 
     merit, setpoints, controller_start = judgement.merit, judgement.setpoints, started
     suspects, further_suspects = suspects, further_suspects

@@ -5,12 +5,22 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from rt_torchrl.figures.style import REAL, SAMPLES, TWIN, array, caption, legend_below, panels, time_unit, with_unit
-from rt_torchrl.fit.curve import Band
-from rt_torchrl.fit.sensor_identification import SensorIdentified, SensorJudgement
-from rt_torchrl.fit.sensor_record import SensorRecord
+from rt_torchrl.figures.style import (
+    LIMITS,
+    REAL,
+    SAMPLES,
+    TWIN,
+    array,
+    caption,
+    legend_below,
+    panels,
+    time_unit,
+    with_unit,
+)
+from rt_torchrl.fit.least_squares import Estimate, Identified, Judgement
+from rt_torchrl.fit.record import SensorRecord
 from rt_torchrl.fit.sensors import Sensor
-from rt_torchrl.fit.uncertainty import Uncertainty
+from rt_torchrl.fit.uncertainty import Band, Uncertainty
 
 
 def twin_and_sensors(
@@ -18,7 +28,7 @@ def twin_and_sensors(
     sensors: Sequence[Sensor],
     training: Sequence[SensorRecord],
     held_out: Sequence[SensorRecord],
-    found: SensorIdentified,
+    found: Identified,
 ) -> Figure:
     """What every sensor has read over time, and what the twin says it reads, after the estimation; held out is shaded.
 
@@ -30,6 +40,8 @@ def twin_and_sensors(
     figure, axes = panels(len(sensors), title="Twin and sensors", size=size, sharex=True)
     parts = ((training, found.training[1]), (held_out, found.held_out[1]))
     for k, (ax, sensor) in enumerate(zip(axes.flat, sensors, strict=True)):
+        read = np.concatenate([array(record.readings[:, k]) for record in (*training, *held_out)])
+        margin = 0.1 * (np.nanmax(read) - np.nanmin(read)) or 1.0
         for records, judgement in parts:
             for record, replayed in zip(records, judgement.readings, strict=True):
                 t = (record.start + dt * np.arange(len(record.readings))) / length
@@ -38,6 +50,8 @@ def twin_and_sensors(
         for record in held_out:
             ends = record.start, record.start + dt * len(record.actions)
             ax.axvspan(*(t / length for t in ends), color="0.93", zorder=0, label="held out")
+        # A twin that is far off must not flatten what was read.
+        ax.set_ylim(np.nanmin(read) - margin, np.nanmax(read) + margin)
         before, after = (_rms(judged, k, sensor.measurement.unit) for judged in found.held_out)
         caption(ax, sensor.measurement.label, f"RMS held out {before} before, {after} after")
     axes.flat[-1].set_xlabel(f"time [{unit}]")
@@ -45,8 +59,28 @@ def twin_and_sensors(
     return figure
 
 
-def _rms(judged: SensorJudgement, k: int, unit: str) -> str:
+def _rms(judged: Judgement, k: int, unit: str) -> str:
     return with_unit(judged.rms[k].item(), unit)
+
+
+def weights(estimate: Estimate) -> Figure:
+    """Every weight before and after, divided by its size after, with a bar of two standard errors.
+
+    A weight of which the records say nothing has no bar.
+    """
+    names = list(estimate.after)
+    figure, ((ax,),) = panels(1, title="Weights", size=(max(5.0, 1.5 + 0.8 * len(names)), 4.2))
+    before, after = (np.array(list(values.values())) for values in (estimate.before, estimate.after))
+    errors = np.array(list(estimate.uncertainty.standard_errors().values()))
+    errors = np.where(np.isfinite(errors), errors, np.nan)
+    unit, place = np.where(after == 0.0, 1.0, np.abs(after)), np.arange(len(names))
+    ax.plot(place, before / unit, "o", color=LIMITS, markersize=5, label="before")
+    bar = {"fmt": "o", "color": TWIN, "markersize": 5, "capsize": 4}
+    ax.errorbar(place, after / unit, 2.0 * errors / unit, label="after, two standard errors", **bar)
+    ax.set_xticks(place, names, rotation=0 if len(names) < 6 else 60)
+    caption(ax, "weight over its size after [-]")
+    legend_below(figure, [ax])
+    return figure
 
 
 def correlations(uncertainty: Uncertainty) -> Figure:

@@ -17,10 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.covariance import inverse_information
-from rt_torchrl.fit.estimation import Estimation
+from rt_torchrl.fit.least_squares import Estimation
 from rt_torchrl.fit.likelihood import Likelihood
-from rt_torchrl.fit.sensor_record import SensorRecord, sensor_record
+from rt_torchrl.fit.record import SensorRecord, sensor_record
+from rt_torchrl.fit.uncertainty import inverse_information
 from rt_torchrl.trajectories.trajectory import Trajectory
 
 LEAST_INFORMATION = 1e-12

@@ -9,7 +9,7 @@ The first sum is over the samples that exist. The unknowns are the closure's wei
 records, of which no sensor needs to read any component, and the biases b. The second sum is over records with a start
 of their own, the third over records that follow another one, from whose end process noise q parts them (weak
 constraint). J is the negative logarithm of the posterior, so that its Gauss-Newton matrix is the Fisher information of
-the unknowns.
+the unknowns. With the sensors of :func:`rt_torchrl.fit.sensors.state_sensors` the first sum is the paper's J_p.
 """
 
 import math
@@ -17,18 +17,43 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from rt_torchrl.fit.output_error import REMEDY, InitialStates
-from rt_torchrl.fit.sensor_record import SensorRecord, held_to_the_end
-from rt_torchrl.fit.sensors import Sensor, read, read_slopes
-from rt_torchrl.fit.weight_prior import WeightPrior
+from rt_torchrl.fit.prior import WeightPrior
+from rt_torchrl.fit.record import SensorRecord, held_to_the_end
+from rt_torchrl.fit.sensors import Sensor, read, read_slopes, state_places
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Inputs
 from rt_torchrl.plants.signal import differences
 from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.twin import DigitalTwin
+
+REMEDY = "Check the units of what was recorded, use a smaller dt, or start from a closure nearer to the system."
+
+
+class InitialStates(nn.Module):
+    """Initial state s_0 of every record: a first guess plus trainable offsets.
+
+    Args:
+        guess: first guess of the initial state of every record.
+        free: indices of the states that have an offset.
+        scale: unit of the offset of each state, so that a step of 1 is neither long nor short.
+    """
+
+    guess: Tensor
+    unit: Tensor
+
+    def __init__(self, guess: Float[Tensor, "records n_s"], free: Sequence[int], scale: Float[Tensor, " n_s"]):
+        super().__init__()
+        self.register_buffer("guess", guess)
+        self.register_buffer("unit", torch.diag(scale)[list(free)])
+        self.free = tuple(free)
+        self.offsets = nn.Parameter(scale.new_zeros(len(guess), len(self.free)))
+
+    def forward(self) -> Float[Tensor, "records n_s"]:
+        return self.guess + self.offsets @ self.unit
 
 
 class Biases(nn.Module):
@@ -51,23 +76,40 @@ class Biases(nn.Module):
         return self.offsets @ self.unit
 
 
-class Residuals(NamedTuple):
-    """Residuals r of a record in units of the noise, with their derivatives; both are zero where a sample is missing.
+class Group(NamedTuple):
+    """Records of equal length, stacked, with their numbers among all records and the times of their samples.
 
-    ``jacobian`` holds derivatives by the unknowns of this record, whose places among all unknowns are ``places``.
+    ``places`` are those of the unknowns of each record among all unknowns.
     """
 
-    values: Float[Tensor, "samples n_r"]
-    jacobian: Float[Tensor, "samples n_r n_local"]
-    places: Int[Tensor, " n_local"]
+    numbers: list[int]
+    readings: Float[Tensor, "batch samples n_y"]
+    seen: Bool[Tensor, "batch samples n_y"]
+    actions: Actions
+    exogenous: Inputs
+    times: Float[Tensor, "batch samples"]
+    places: Int[Tensor, "batch n_local"]
 
 
 class Replays(NamedTuple):
-    """Records of equal length as the twin replays them, with the derivatives by weights and initial states."""
+    """A group as the twin replays it, with the derivatives of the states by weights and offsets of initial states."""
+
+    group: Group
+    states: Float[Tensor, "batch samples n_s"]
+    sensitivity: Float[Tensor, "batch samples n_s n_p"]
+
+
+class Residuals(NamedTuple):
+    """Residuals r of a group in units of the noise, with their derivatives; both are zero where a sample is missing.
+
+    ``jacobian`` holds derivatives by the unknowns of each record, whose places among all unknowns are ``places``.
+    """
 
     numbers: list[int]
-    states: Float[Tensor, "batch n+1 n_s"]
-    sensitivity: Float[Tensor, "batch n+1 n_s n_p"]
+    seen: Bool[Tensor, "batch samples n_r"]
+    values: Float[Tensor, "batch samples n_r"]
+    jacobian: Float[Tensor, "batch samples n_r n_local"]
+    places: Int[Tensor, "batch n_local"]
 
 
 class Likelihood:
@@ -103,13 +145,26 @@ class Likelihood:
     ):
         self.twin, self.records, self.sensors = twin, list(records), tuple(sensors)
         self.initial, self.noise, self.prior = initial, noise, prior
-        self.spread = torch.full_like(initial.measured[0], math.inf) if spread is None else spread
+        self.spread = torch.full_like(initial.guess[0], math.inf) if spread is None else spread
         self.biases, self.process = biases or Biases((), noise), process
         self.weight_count = sum(w.numel() for w in twin.closure.parameters() if w.requires_grad)
         self._shown = self.weight_count if weights else 0
         self.unknowns = nn.ModuleList([*([twin.closure] if weights else []), initial, self.biases])
+        self._states = state_places(twin.plant, self.sensors)
         lengths = [len(record.actions) for record in records]
-        self._groups = [[i for i, n in enumerate(lengths) if n == length] for length in dict.fromkeys(lengths)]
+        self._groups = [
+            self._group([i for i, n in enumerate(lengths) if n == length]) for length in dict.fromkeys(lengths)
+        ]
+
+    def _group(self, numbers: list[int]) -> Group:
+        readings, actions, exogenous = (
+            torch.stack([getattr(self.records[i], name) for i in numbers])
+            for name in ("readings", "actions", "exogenous")
+        )
+        start = readings.new_tensor([self.records[i].start for i in numbers])
+        clock = self.plant.dt * torch.arange(readings.shape[1], dtype=start.dtype, device=start.device)
+        times, places = start.unsqueeze(-1) + clock, torch.stack([self._places(i) for i in numbers])
+        return Group(numbers, readings, ~readings.isnan(), actions, exogenous, times, places)
 
     @property
     def plant(self) -> Plant:
@@ -119,6 +174,11 @@ class Likelihood:
     def count(self) -> int:
         """Number of unknowns."""
         return self._shown + self.initial.offsets.numel() + self.biases.offsets.numel()
+
+    @property
+    def samples(self) -> Int[Tensor, " n_y"]:
+        """Number of samples of each sensor."""
+        return torch.stack([group.seen.sum((0, 1)) for group in self._groups]).sum(0)
 
     @property
     def first_stiffness(self) -> Float[Tensor, "records n_free"]:
@@ -136,53 +196,57 @@ class Likelihood:
         """
         return [self._replay(group) for group in self._groups]
 
-    def _replay(self, group: list[int]) -> Replays:
-        records, first = [self.records[i] for i in group], self.initial()[group]
-        actions, exogenous = (torch.stack([getattr(r, name) for r in records]) for name in ("actions", "exogenous"))
-        start = first.new_tensor([record.start for record in records])
-        ends, S = self.twin.sensitivities(first, exogenous, actions, start=start, initial=True)
-        require_finite(self.plant, ends.transpose(0, 1), first, [self.twin.closure], start=start, remedy=REMEDY)
-        n_s = first.shape[-1]
-        at_start = torch.cat([S.new_zeros(n_s, self.weight_count), torch.eye(n_s, dtype=S.dtype, device=S.device)], -1)
-        S = torch.cat([at_start.expand(len(group), 1, -1, -1), S], 1)
-        by_offset = S[..., self.weight_count :] @ self.initial.unit.T
-        S = torch.cat([S[..., : self._shown], by_offset], -1)
-        return Replays(group, torch.cat([first.unsqueeze(1), ends], 1), S)
+    def _replay(self, group: Group) -> Replays:
+        first, start, closure = self.initial()[group.numbers], group.times[:, 0], self.twin.closure
+        free = bool(self.initial.free)
+        ends, S = self.twin.sensitivities(first, group.exogenous, group.actions, start=start, initial=free)
+        require_finite(self.plant, ends.transpose(0, 1), first, [closure], start=start, remedy=REMEDY)
+        by_weights, by_state = S.split([self.weight_count, S.shape[-1] - self.weight_count], -1)
+        S = by_weights[..., : self._shown]
+        at_start = S.new_zeros(len(first), 1, first.shape[-1], self._shown)
+        if free:
+            unit = self.initial.unit.T
+            S = torch.cat([S, by_state @ unit], -1)
+            at_start = torch.cat([at_start, unit.expand(*at_start.shape[:3], -1)], -1)
+        return Replays(group, torch.cat([first.unsqueeze(1), ends], 1), torch.cat([at_start, S], 1))
 
     @torch.no_grad()
     def residuals(self, replays: Sequence[Replays] | None = None) -> list[Residuals]:
-        """Residuals of all records, in their order.
+        """Residuals of all records, in groups of equal length.
 
         Args:
             replays: result of :meth:`replays` with the present unknowns; None computes it.
         """
-        found: dict[int, Residuals] = {}
-        for replay in self.replays() if replays is None else replays:
-            found |= dict(zip(replay.numbers, self._residuals(replay), strict=True))
-        return [found[number] for number in range(len(self.records))]
+        return [self._residuals(replay) for replay in (self.replays() if replays is None else replays)]
 
-    def _residuals(self, replay: Replays) -> list[Residuals]:
-        numbers, states, S = replay
-        records = [self.records[i] for i in numbers]
-        inputs = held_to_the_end(torch.stack([record.exogenous for record in records]))
-        start = states.new_tensor([[record.start] for record in records])
-        t = start + self.plant.dt * torch.arange(states.shape[1], dtype=states.dtype, device=states.device)
-        given = (self.sensors, self.plant, t, states, inputs)
-        readings, seen = (torch.stack([getattr(r, name) for r in records]) for name in ("readings", "seen"))
-        signals = [sensor.measurement for sensor in self.sensors]
-        values = differences(signals, read(*given) + self.biases(), readings) / self.noise
+    def _residuals(self, replay: Replays) -> Residuals:
+        group, states, S = replay
+        seen = group.seen
+        weights = seen / self.noise
+        values = differences([sensor.measurement for sensor in self.sensors], self._read(replay), group.readings)
+        values = torch.where(seen, values, 0.0) * weights
+        if None in self._states:
+            given = (self.sensors, self.plant, group.times, states, held_to_the_end(group.exogenous))
+            jacobian = read_slopes(*given) @ S
+        else:
+            jacobian = S[:, :, self._states]
         by_bias = self.biases.unit.T.expand(*values.shape, -1)
-        jacobian = torch.cat([read_slopes(*given) @ S, by_bias], -1) / self.noise.unsqueeze(-1)
-        values = torch.where(seen, values, 0.0)
-        jacobian = torch.where(seen.unsqueeze(-1), jacobian, 0.0)
-        return [Residuals(values[k], jacobian[k], self._places(i)) for k, i in enumerate(numbers)]
+        jacobian = torch.cat([jacobian, by_bias], -1) * weights.unsqueeze(-1)
+        return Residuals(group.numbers, seen, values, jacobian, group.places)
+
+    def _read(self, replay: Replays) -> Float[Tensor, "batch samples n_y"]:
+        """What the sensors read, bias included."""
+        group, states, _ = replay
+        inputs = held_to_the_end(group.exogenous)
+        return read(self.sensors, self.plant, group.times, states, inputs) + self.biases()
 
     @torch.no_grad()
-    def simulated(self) -> Float[Tensor, "samples n_y"]:
-        """What the sensors would read along the first record, bias included, whether there is a sample or not."""
-        (states, *_), record = self.replays()[0].states, self.records[0]
-        t = record.start + self.plant.dt * torch.arange(len(states), dtype=states.dtype, device=states.device)
-        return read(self.sensors, self.plant, t, states, held_to_the_end(record.exogenous)) + self.biases()
+    def simulated(self) -> list[Float[Tensor, "samples n_y"]]:
+        """What the sensors would read along every record, bias included, whether there is a sample or not."""
+        found: dict[int, Tensor] = {}
+        for replay in self.replays():
+            found |= dict(zip(replay.group.numbers, self._read(replay), strict=True))
+        return [found[number] for number in range(len(self.records))]
 
     @torch.no_grad()
     def normal_equations(self, residuals: Sequence[Residuals] | None = None) -> NormalEquations:
@@ -191,16 +255,18 @@ class Likelihood:
         Args:
             residuals: result of :meth:`residuals` with the present unknowns; None computes it.
         """
-        like = self.initial.measured
+        like = self.initial.guess
         gradient, matrix = like.new_zeros(self.count), like.new_zeros(self.count, self.count)
         cost = like.new_zeros(())
         replays = self.replays() if residuals is None or self.process is not None else []
         blocks = self.residuals(replays) if residuals is None else residuals
         for block in (*blocks, *self.pushes(replays)):
-            r, A = block.values.flatten(), block.jacobian.flatten(0, 1)
-            cost = cost + 0.5 * (r @ r)
-            gradient[block.places] += A.T @ r
-            matrix[block.places[:, None], block.places] += A.T @ A
+            r, A, places = block.values.flatten(1), block.jacobian.flatten(1, 2), block.places
+            if not self.initial.free:  # all records have the same unknowns
+                r, A, places = r.reshape(1, -1), A.reshape(1, -1, A.shape[-1]), places[:1]
+            cost = cost + 0.5 * r.square().sum()
+            gradient.index_put_((places,), (A.mT @ r.unsqueeze(-1)).squeeze(-1), accumulate=True)
+            matrix.index_put_((places.unsqueeze(-1), places.unsqueeze(-2)), A.mT @ A, accumulate=True)
         found = self._with_first_states(NormalEquations(cost, gradient, matrix))
         return self.prior.added(found) if self.prior is not None and self._shown else found
 
@@ -220,7 +286,7 @@ class Likelihood:
         states: dict[int, tuple[Tensor, Tensor]] = {}
         for replay in self.replays() if replays is None else replays:
             ends = zip(replay.states[:, [0, -1]], replay.sensitivity[:, [0, -1]], strict=True)
-            states |= dict(zip(replay.numbers, ends, strict=True))
+            states |= dict(zip(replay.group.numbers, ends, strict=True))
         found, biases = [], self.biases.offsets.numel()
         for number, record in enumerate(self.records):
             if not record.follows:
@@ -232,7 +298,15 @@ class Likelihood:
             jacobian = torch.cat([-S_before[1], own], -1) / self.process[:, None]
             kept = slice(len(rest) - biases)
             joined = torch.cat([rest[kept], places[self._shown : len(places) - biases]])
-            found.append(Residuals(values[None], jacobian[None], joined))
+            found.append(
+                Residuals(
+                    [number],
+                    torch.ones_like(values, dtype=torch.bool)[None, None],
+                    values[None, None],
+                    jacobian[None, None],
+                    joined[None],
+                )
+            )
         return found
 
     def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
@@ -241,7 +315,7 @@ class Likelihood:
         stiffness = self.first_stiffness.flatten()
         found = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
         for push in self.pushes():
-            A, places = push.jacobian[0], push.places
+            A, (places,) = push.jacobian[0, 0], push.places
             found = found + (A.T @ A * inverse[places[:, None], places]).sum()
         return float(found if self.prior is None else found + self.prior.determined(inverse))
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Input, Inputs, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Named, Preview, state_read
 
 
@@ -70,6 +71,26 @@ def known_sensors(plant: Plant) -> dict[str, Sensor]:
     return found | {name: sensor for name, sensor in states.items() if name not in own}
 
 
+def state_places(plant: Plant, sensors: Sequence[Sensor]) -> list[int | None]:
+    """Places of the states that sensors read as they are; None for a sensor of anything else."""
+    return [state_read(sensor.measurement.read, plant.states) for sensor in sensors]
+
+
+def state_sensors(plant: Plant) -> tuple[Sensor, ...]:
+    r"""Sensors of the states that J_p compares, with the noise that makes J_p their likelihood.
+
+    .. math:: \sigma_i = c_i / \sqrt{\Delta t}
+
+    With these noises J of :mod:`rt_torchrl.fit.likelihood` is the sum of J_p over all records, with the scales c of
+    :attr:`Plant.discrepancy_scales`.
+    """
+    return tuple(
+        Sensor(measurement=Measurement.of(signal), noise=scale / math.sqrt(plant.dt))
+        for signal, scale in zip(plant.states, plant.discrepancy_scales, strict=True)
+        if scale < math.inf
+    )
+
+
 def sensors_of(plant: Plant, names: Sequence[str]) -> tuple[Sensor, ...]:
     """The sensors of the named states and measurements of a plant, with unknown noise.
 
@@ -104,9 +125,9 @@ def with_biases(sensors: Sequence[Sensor], names: Sequence[str]) -> tuple[Sensor
 def read(
     sensors: Sequence[Sensor],
     plant: Plant,
-    t: Float[Tensor, "*batch"],
-    state: Float[Tensor, "*batch n_s"],
-    exogenous: Float[Tensor, "*batch n_z"],
+    t: Time,
+    state: State,
+    exogenous: Input,
 ) -> Float[Tensor, "*batch n_y"]:
     """What the sensors would read without noise and bias."""
     found = [sensor.measurement.read(plant, t, state, exogenous) for sensor in sensors]
@@ -114,22 +135,12 @@ def read(
 
 
 def read_slopes(
-    sensors: Sequence[Sensor],
-    plant: Plant,
-    t: Float[Tensor, "batch n"],
-    states: Float[Tensor, "batch n n_s"],
-    exogenous: Float[Tensor, "batch n n_z"],
+    sensors: Sequence[Sensor], plant: Plant, t: Float[Tensor, "batch n"], states: States, exogenous: Inputs
 ) -> Float[Tensor, "batch n n_y n_s"]:
     """Derivatives of the readings by the state, in every sample."""
 
-    places = [state_read(sensor.measurement.read, plant.states) for sensor in sensors]
-    rows = [place for place in places if place is not None]
-    if len(rows) == len(places):
-        unit = torch.eye(states.shape[-1], dtype=states.dtype, device=states.device)[rows]
-        return unit.expand(*states.shape[:2], -1, -1)
-
-    def one(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
+    def reading(t: Tensor, state: Tensor, z: Tensor) -> Tensor:
         return read(sensors, plant, t, state, z)
 
-    slopes: Tensor = torch.func.vmap(torch.func.vmap(torch.func.jacrev(one, argnums=1)))(t, states, exogenous)
+    slopes: Tensor = torch.func.vmap(torch.func.vmap(torch.func.jacrev(reading, argnums=1)))(t, states, exogenous)
     return slopes

@@ -4,31 +4,42 @@ At the minimum of J (:mod:`likelihood`) the Gauss-Newton matrix H is the Fisher 
 
 .. math:: \mathrm{Cov} = H^{-1}\ \text{(fisher)}, \qquad \mathrm{Cov} = H^{-1}MH^{-1}\ \text{(robust)}
 
-where M, the Newey-West sum of the scores, allows residuals that depend on their neighbours. Named values of the closure
-take their errors from those of the weights to first order.
+where M, the Newey-West sum of the scores :math:`g_k` of each record, allows residuals that depend on their neighbours,
+and noise that differs between samples:
+
+.. math::
+    M = \Gamma_0 + \sum_{l=1}^{L}\Big(1 - \frac l{L+1}\Big)(\Gamma_l + \Gamma_l^\top), \qquad
+    \Gamma_l = \sum_kg_kg_{k+l}^\top
+
+Named values of the closure, and points of its curve, take their errors from those of the weights to first order. Both
+formulas assume that the physics is right: an error that no weights can remove is bias, and no record shows its size.
+
+Source: Newey and West, Econometrica 55 (1987) 703; for L, Rev. Econ. Stud. 61 (1994) 631.
 """
 
 import math
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
-from rt_torchrl.fit.covariance import (
-    inverse_information,
-    named_slopes,
-    named_values,
-    newey_west,
-)
 from rt_torchrl.fit.likelihood import Likelihood
+from rt_torchrl.fit.prior import Belief
 
 Errors = Literal["fisher", "robust"]
 BAD_SHARE = 0.5
 """Standard error of a value, as a share of the value, above which the data hardly tell it."""
 HIGH_CORRELATION = 0.99
 """Correlation of two values above which the data tell only one combination of them."""
+
+
+LEAST_EIGENVALUE = 1e-12
+"""Eigenvalue of H, scaled to unit diagonal, below which the record says nothing of that direction of the weights."""
+UNKNOWN = 1e4
+"""Standard deviation of weights of which nothing is known, where a step of 1 is neither long nor short."""
 
 
 class Interval(NamedTuple):
@@ -61,9 +72,10 @@ class Uncertainty:
         self.covariance, self.null = self._inverse.matrix, self._inverse.null
         if errors == "robust":
             M = torch.zeros_like(self.information)
-            for block, record in zip(blocks, likelihood.records, strict=True):
-                scores = torch.einsum("kr,krp->kp", block.values, block.jacobian)[record.seen.any(-1)]
-                M[block.places[:, None], block.places] += newey_west(scores)
+            for block in blocks:
+                every = torch.einsum("bkr,bkrp->bkp", block.values, block.jacobian)
+                for scores, seen, places in zip(every, block.seen.any(-1), block.places, strict=True):
+                    M[places[:, None], places] += newey_west(scores[seen])
             self.covariance = self.covariance @ M @ self.covariance
         closure = likelihood.twin.closure
         self.names, self._slopes = named_slopes(closure)
@@ -84,6 +96,12 @@ class Uncertainty:
     def _free(self) -> Float[Tensor, "n_named n_null"]:
         """Changes of the named values in the directions of which nothing is known."""
         return self._slopes @ self.null[: self.likelihood.weight_count]
+
+    def belief(self) -> Belief:
+        """What the estimation has found of the weights; directions of which the data say nothing stay unknown."""
+        weights = [w.detach().flatten() for w in self.likelihood.twin.closure.parameters() if w.requires_grad]
+        null = self.null[: self.likelihood.weight_count] / self.null.norm(dim=0)
+        return Belief(torch.cat(weights), self.weights_covariance + UNKNOWN**2 * null @ null.T)
 
     def untold(self, slopes: Float[Tensor, "*quantities n_w"]) -> Bool[Tensor, "*quantities"]:
         """Whether quantities change in a direction of which the data say nothing.
@@ -145,7 +163,7 @@ class Uncertainty:
         variance = self.covariance.diagonal()[held].clone()
         each = torch.eye(len(self.covariance), dtype=variance.dtype, device=variance.device)[held]
         variance[self._inverse.unknown(each)] = math.inf
-        found = torch.zeros_like(initial.measured)
+        found = torch.zeros_like(initial.guess)
         found[:, list(initial.free)] = variance.sqrt().view(shape) * initial.unit.sum(-1)
         return found
 
@@ -199,3 +217,140 @@ def _level(level: float) -> float:
     if not 0.0 < level < 1.0:
         raise ValueError(f"level={level} of a confidence region must lie between 0 and 1.")
     return level
+
+
+class InverseInformation(NamedTuple):
+    """The pseudo-inverse of an information matrix, and the directions of which the matrix says nothing, in columns.
+
+    The pseudo-inverse is that of the matrix scaled to unit diagonal, so that it does not depend on the units of the
+    unknowns. A direction is one long in these scales. ``silent`` marks unknowns of which the matrix says nothing
+    whatever the others are; they have no scale.
+    """
+
+    matrix: Float[Tensor, "n n"]
+    null: Float[Tensor, "n n_null"]
+    silent: Bool[Tensor, " n"]
+
+    def unknown(self, slopes: Float[Tensor, "*quantities n"]) -> Bool[Tensor, "*quantities"]:
+        """Whether quantities change in a direction of which the matrix says nothing.
+
+        Along such a direction the unknowns scatter by more than LEAST_EIGENVALUE^(-1/2). A quantity is unknown if this
+        scatter is more, in the quantity, than that of all other directions. No unit has a part in this.
+
+        Args:
+            slopes: derivatives of each quantity by the unknowns.
+        """
+        told = ((slopes @ self.matrix) * slopes).sum(-1).clamp_min(0.0)
+        free = (slopes @ self.null).square().sum(-1)
+        return (free > LEAST_EIGENVALUE * told) | (slopes[..., self.silent] != 0.0).any(-1)
+
+
+def inverse_information(H: Float[Tensor, "n n"]) -> InverseInformation:
+    """The inverse of an information matrix in the directions that it shows."""
+    diagonal = H.diagonal()
+    seen = diagonal > 0.0
+    unit = diagonal[seen].sqrt()
+    values, vectors = torch.linalg.eigh(H[seen][:, seen] / unit / unit[:, None])
+    shown = values > LEAST_EIGENVALUE
+    every = torch.eye(len(H), dtype=H.dtype, device=H.device)
+    directions = every[:, seen] @ (vectors / unit[:, None])
+    inverse = (directions[:, shown] / values[shown]) @ directions[:, shown].T
+    return InverseInformation(inverse, torch.cat([directions[:, ~shown], every[:, ~seen]], -1), ~seen)
+
+
+def newey_west(scores: Float[Tensor, "samples n"]) -> Float[Tensor, "n n"]:
+    """The matrix M of one segment of n samples, with L = ⌈4 (n/100)^{2/9}⌉."""
+    lags = min(math.ceil(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0)), len(scores) - 1)
+    found = scores.T @ scores
+    for lag in range(1, lags + 1):
+        product = scores[:-lag].T @ scores[lag:]
+        found = found + (1.0 - lag / (lags + 1.0)) * (product + product.T)
+    return found
+
+
+def named_slopes(closure: nn.Module) -> tuple[list[str], Float[Tensor, "n_named n_w"]]:
+    """Names of the closure's values, and their derivatives by its trained weights."""
+    weights, rows = [w for w in closure.parameters() if w.requires_grad], []
+    with torch.enable_grad():
+        named = named_values(closure)
+        for value in named.values():
+            slopes = torch.autograd.grad(value, weights, retain_graph=True, allow_unused=True, materialize_grads=True)
+            rows.append(torch.cat([slope.flatten() for slope in slopes]))
+    count = sum(w.numel() for w in weights)
+    return list(named), torch.stack(rows) if rows else torch.empty(0, count, dtype=torch.float64)
+
+
+def named_values(closure: nn.Module) -> dict[str, Tensor]:
+    """``named_coefficients`` of a closure that has them; otherwise every trainable weight by parameter and place."""
+    named_coefficients = getattr(closure, "named_coefficients", None)
+    if named_coefficients is not None:
+        return named_coefficients()
+    return {
+        f"{name}[{','.join(map(str, place))}]": weight[place]
+        for name, weight in closure.named_parameters()
+        if weight.requires_grad
+        for place in np.ndindex(*weight.shape)
+    }
+
+
+class Band(NamedTuple):
+    """A curve and its pointwise interval at the abscissae x."""
+
+    x: Float[Tensor, " points"]
+    middle: Float[Tensor, " points"]
+    low: Float[Tensor, " points"]
+    high: Float[Tensor, " points"]
+
+    def covers(self, true: Float[Tensor, " points"]) -> float:
+        """Share of the points at which the interval holds the true curve."""
+        return ((true >= self.low) & (true <= self.high)).double().mean().item()
+
+
+def scatter(
+    closure: nn.Module, features: Float[Tensor, "points n_f"], uncertainty: Uncertainty
+) -> tuple[Float[Tensor, "points n_c"], Float[Tensor, "points n_c"]]:
+    """What a closure says of features, and the standard deviation of it; infinite where the data say nothing.
+
+    Args:
+        closure: the closure.
+        features: features at which it is asked.
+        uncertainty: uncertainty of the closure's trained weights, in the order of ``parameters()``.
+    """
+    trained = {name: w.detach() for name, w in closure.named_parameters() if w.requires_grad}
+
+    def said(weights: dict[str, Tensor], x: Tensor) -> Tensor:
+        found: Tensor = torch.func.functional_call(closure, weights, (x,))
+        return found
+
+    jacobians = torch.func.vmap(torch.func.jacrev(said), in_dims=(None, 0))(trained, features)
+    J = torch.cat([jacobian.flatten(2) for jacobian in jacobians.values()], -1)
+    variance = torch.einsum("pcw,wv,pcv->pc", J, uncertainty.weights_covariance, J)
+    with torch.no_grad():
+        return closure(features), torch.where(uncertainty.untold(J), torch.inf, variance.clamp_min(0.0).sqrt())
+
+
+def band(
+    uncertainty: Uncertainty,
+    x: Float[Tensor, " points"],
+    features: Float[Tensor, "points n_f"],
+    *,
+    output: int = 0,
+    level: float = 0.95,
+) -> Band:
+    """The interval of one output of the estimated closure along a line of features.
+
+    Args:
+        uncertainty: uncertainty of the estimate.
+        x: abscissae, one for each point.
+        features: features of the closure at these points.
+        output: number of the closure's output.
+        level: probability of each point's interval.
+
+    Raises:
+        ValueError: if the level does not lie between 0 and 1.
+    """
+    closure = uncertainty.likelihood.twin.closure
+    said, deviation = scatter(closure, features, uncertainty)
+    half = normal_factor(level) * deviation[:, output]
+    middle = said[:, output]
+    return Band(x, middle, middle - half, middle + half)

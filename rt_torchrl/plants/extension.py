@@ -1,6 +1,7 @@
 """A plant with additional dynamics, which no sensor reads, and real systems that are made of such plants by name."""
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -195,9 +196,10 @@ class Extension(Plant):
     def ended(self, state: State) -> Ended:
         return self.base.ended(self.true_state(state))
 
-    def discrepancy(self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]) -> Cost:
-        """The discrepancy of the plant; hidden states, which no sensor reads, are not compared."""
-        return self.base.discrepancy(self.split(state)[0], self.split(measured)[0])
+    @property
+    def discrepancy_scales(self) -> tuple[float, ...]:
+        """Those of the plant; hidden states, which no sensor reads, are not compared."""
+        return (*self.base.discrepancy_scales, *(math.inf,) * (len(self.states) - len(self.base.states)))
 
     def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
         acting = self.acting(self.split(states[:, :-1])[1], applied)

@@ -18,6 +18,7 @@ episode lasts, and the value of what comes after the end is known: a learner wit
 :math:`-L_e/(1 - \gamma)`.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -80,11 +81,19 @@ class Plant(nn.Module, ABC):
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
     state_sizes: tuple[float, ...] = ()
-    """Differences c_i of the states that count alike in the default discrepancy, in their units; by default ones."""
+    """Usual sizes of the states, in their units; by default ones."""
     end_cost: float | None = None
     """Cost L_e of each moment after an early end [unit of L_a]; None in a plant whose episodes never end early."""
     unread: int = 0
     """Number of states, the last ones, that no sensor reads; twins and policies do not know of them."""
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        if "discrepancy" in vars(cls):
+            raise ValueError(
+                f"{cls.__name__}.discrepancy: L_p is a sum of squares, so that least squares fit it; give the scales "
+                "of the states instead, discrepancy_scales, with math.inf for a state that is not compared."
+            )
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
@@ -203,22 +212,34 @@ class Plant(nn.Module, ABC):
         """
         return torch.zeros_like(state[..., 0], dtype=torch.bool)
 
+    @property
+    def discrepancy_scales(self) -> tuple[float, ...]:
+        """Differences c_i of the states that count alike in L_p, in their units; infinite for one not compared.
+
+        By default these are :attr:`state_sizes`; a plant may override them.
+        """
+        return self.state_sizes or (1.0,) * len(self.states)
+
     def discrepancy(self, state: Float[Tensor, "*#batch n_s"], measured: Float[Tensor, "*#batch n_s"]) -> Cost:
         r"""Lagrangian L_p of the identification problem; :math:`J_p = \int L_p(s, \check s)\,dt`.
 
-        By default it is half the sum of the squared differences in units of :attr:`state_sizes`, with a periodic state
-        the short way round:
-
         .. math:: L_p(s, \check s) = \tfrac12 \sum_i \Big(\frac{s_i - \check s_i}{c_i}\Big)^2
 
+        The scales c are :attr:`discrepancy_scales`; a periodic state differs the short way round.
+
         Raises:
-            ValueError: if ``state_sizes`` has not one entry for each state, or one that is not positive.
+            ValueError: if there is not one scale for each state, or one is not positive.
         """
-        sizes = self.state_sizes or (1.0,) * len(self.states)
-        if len(sizes) != len(self.states) or not all(size > 0.0 for size in sizes):
+        scales = self.discrepancy_scales
+        if len(scales) != len(self.states) or not all(scale > 0.0 for scale in scales):
             named = ", ".join(f"{signal.name} [{signal.unit}]" for signal in self.states)
-            raise ValueError(f"state_sizes={sizes} of plant {self.name!r} must have one positive number each: {named}.")
-        return 0.5 * ((differences(self.states, state, measured) / state.new_tensor(sizes)) ** 2).sum(-1)
+            raise ValueError(
+                f"state_sizes={scales} of plant {self.name!r} must have one positive number each: {named}."
+            )
+        compared = [k for k, scale in enumerate(scales) if scale < math.inf]
+        signals = [self.states[k] for k in compared]
+        difference = differences(signals, state[..., compared], measured[..., compared])
+        return 0.5 * ((difference / state.new_tensor([scales[k] for k in compared])) ** 2).sum(-1)
 
     def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
         """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""

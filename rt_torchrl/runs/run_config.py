@@ -12,7 +12,7 @@ from torch import nn
 
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.evaluation.limits import LimitConfig
-from rt_torchrl.fit.sensor_log import LogConfig
+from rt_torchrl.fit.log import LogConfig
 from rt_torchrl.options import check_options, choices, require_widths, with_paths
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP

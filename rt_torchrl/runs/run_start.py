@@ -11,9 +11,8 @@ from torch import nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.predictive_control import PredictiveControl
-from rt_torchrl.fit.column import Column
+from rt_torchrl.fit.log import READERS, Column, checked, read_log
 from rt_torchrl.fit.resampling import resample
-from rt_torchrl.fit.sensor_log import READERS, checked, read_log
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs import checkpoint

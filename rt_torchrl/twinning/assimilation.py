@@ -3,29 +3,27 @@
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from rt_torchrl.fit.first_values import move
-from rt_torchrl.fit.output_error import (
-    NOISE_TOLERANCE,
-    InitialStates,
-    OutputError,
-    compared,
-    discrepancy_derivatives,
-)
-from rt_torchrl.fit.weight_prior import WeightPrior
+from rt_torchrl.fit.least_squares import NOISE_TOLERANCE, Estimation, multi_start
+from rt_torchrl.fit.likelihood import Likelihood
+from rt_torchrl.fit.prior import WeightPrior
+from rt_torchrl.fit.record import SensorRecord, sensor_records
+from rt_torchrl.fit.sensors import state_places, state_sensors
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
-from rt_torchrl.trajectories.rollout import require_finite
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.exogenous import ExogenousProcess
+
+DAMPING = 1e-3
+"""Damping μ of the first fit by Levenberg-Marquardt."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +144,13 @@ class Assimilation:
             )
         self.twin, self.config = twin, config
         self.descent = Descent(twin.closure, config.descent)
-        self.second_order = LevenbergMarquardt(twin.closure)
+        self.damping = DAMPING
+        """Damping μ with which the next fit by Levenberg-Marquardt begins."""
+        sensors = state_sensors(twin.plant)
+        spread = torch.zeros(len(twin.plant.states), dtype=torch.float64)
+        if config.initial == "estimated":
+            spread[[k for k in state_places(twin.plant, sensors) if k is not None]] = math.inf
+        self._problem = Estimation(twin, sensors, spread=spread)
         self.begin()
 
     def begin(self) -> None:
@@ -208,41 +212,36 @@ class Assimilation:
         return Descended(math.inf, math.inf, math.inf, self.config.iterations)
 
     def _descend(self, replayed: Trajectory) -> Descended:
-        def equations() -> NormalEquations:
-            return self.prior.added(self.normal_equations(replayed))
-
-        def cost() -> Tensor:
-            return self._identification_cost(replayed) + self.prior.cost()
-
-        before, iterations, stop_below = self.prior.cost().item(), self.config.iterations, self.config.stop_ratio
-        if self.config.initial == "estimated":
-            output_error = self._output_error(replayed)
-            method = LevenbergMarquardt(output_error.unknowns, tolerance=NOISE_TOLERANCE)
-            found = method.run(lambda: self._mean_equations(output_error), iterations, stop_below=stop_below)
-        elif self.config.method == "levenberg_marquardt":
-            found = self._from_starts(equations)
+        before, config = self.prior.cost().item(), self.config
+        if config.method == "levenberg_marquardt":
+            found = self._least_squares(replayed)
         else:
-            found = self.descent.run(cost, iterations, stop_below=stop_below)
+            found = self.descent.run(
+                lambda: self._identification_cost(replayed) + self.prior.cost(),
+                config.iterations,
+                stop_below=config.stop_ratio,
+            )
         if math.isinf(found.start):
             raise FloatingPointError("J_p of finite states overflows")
         return found._replace(start=found.start - before, best=found.best - self.prior.cost().item())
 
-    def _from_starts(self, equations: Callable[[], NormalEquations]) -> Descended:
-        """Descend from each of the first weights; the best weights stay."""
-        closure, iterations, stop_below = self.twin.closure, self.config.iterations, self.config.stop_ratio
-        found = self.second_order.run(equations, iterations, stop_below=stop_below)
-        generator = torch.Generator().manual_seed(0)
-        least, best = found.best, copy.deepcopy(closure.state_dict())
-        for number in range(1, self.config.starts):
-            closure.load_state_dict(self.first if number % 2 else best)
-            if number > 1:
-                move(closure, generator)
-            with contextlib.suppress(FloatingPointError):  # weights drawn at random may be nonsense
-                other = LevenbergMarquardt(closure).run(equations, iterations)
-                if other.best < least:
-                    least, best = other.best, copy.deepcopy(closure.state_dict())
-        closure.load_state_dict(best)
-        return found._replace(best=least)
+    def _least_squares(self, replayed: Trajectory) -> Descended:
+        """Descend by Levenberg-Marquardt from each of the first weights; the best weights stay."""
+        config, tolerance = self.config, 1e-4 if self.config.initial == "measured" else NOISE_TOLERANCE
+
+        def descend(number: int) -> Descended:
+            likelihood = self.likelihood(replayed, prior=self.prior)
+            method = LevenbergMarquardt(
+                likelihood.unknowns, damping=DAMPING if number else self.damping, tolerance=tolerance
+            )
+            stop_below = 0.0 if number else config.stop_ratio
+            found = method.run(likelihood.normal_equations, config.iterations, stop_below=stop_below)
+            if not number:
+                self.damping = method.damping
+            return found
+
+        found = multi_start(self.twin.closure, config.starts, descend, first=self.first)
+        return found[0]._replace(best=min((one.best for one in found), default=math.nan))
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
         measured, actions, exogenous, start = replayed
@@ -255,37 +254,27 @@ class Assimilation:
         with contextlib.suppress(FloatingPointError):
             if self.config.initial == "measured":
                 return self._identification_cost(whole).item()
-            output_error = self._output_error(whole, weights=False)
-            output_error.fit_initial_states()
-            return output_error.normal_equations().cost.item() / len(whole.states)
+            return self._problem.fit_initial_states(*self._compared(whole)).normal_equations().cost.item()
         return math.inf
 
-    def _output_error(self, replayed: Trajectory, *, weights: bool = True) -> OutputError:
-        """The output error J_p with the first states among its unknowns."""
-        segments, measured, twin = replayed.each(), replayed.states, self.twin
-        free = compared(discrepancy_derivatives(twin.plant, measured, measured)[1]).nonzero().flatten().tolist()
-        initial = InitialStates.estimated(twin, segments, free, twin.sensitivities)
-        return OutputError(twin, segments, initial, weights=weights)
+    def likelihood(self, replayed: Trajectory, *, prior: WeightPrior | None = None) -> Likelihood:
+        """The likelihood whose J is the mean J_p of records; their first states are unknowns if these are estimated.
 
-    def _mean_equations(self, output_error: OutputError) -> NormalEquations:
-        found = output_error.normal_equations()
-        return self.prior.added(NormalEquations(*(part / len(output_error.segments) for part in found)))
+        Args:
+            replayed: records of equal length, as one batch.
+            prior: prior of the closure's weights.
+        """
+        return self._problem.likelihood(*self._compared(replayed), prior=prior)
+
+    def _compared(self, replayed: Trajectory) -> tuple[list[SensorRecord], Tensor]:
+        """What J_p compares of records, and the noise with which the likelihood is the mean over them."""
+        sensors, count = self._problem.sensors, len(replayed.states)
+        noise = replayed.states.new_tensor([math.sqrt(count) * (sensor.noise or 1.0) for sensor in sensors])
+        return sensor_records(self.twin.plant, sensors, replayed), noise
 
     def normal_equations(self, replayed: Trajectory) -> NormalEquations:
-        """J_p, gradient and Gauss-Newton matrix by the closure's weights; DivergenceError if a state is not finite."""
-        (measured, actions, exogenous, start), plant = replayed, self.twin.plant
-        states, S = self.twin.sensitivities(measured[:, 0], exogenous, actions, start=start)
-        require_finite(plant, states.transpose(0, 1), measured[:, 0], [self.twin.closure], start=start)
-        share, target = plant.dt / len(measured), measured[:, 1:]
-        g, H = discrepancy_derivatives(plant, states, target)
-        # For a closure of many weights the products below are most of the work; they skip states that L_p ignores.
-        seen = compared(H)
-        H, S_seen = H[..., seen, :][..., seen], S[:, :, seen]
-        return NormalEquations(
-            share * plant.discrepancy(states, target).sum(),
-            share * torch.einsum("bki,bkiw->w", g, S),
-            share * (H @ S_seen).flatten(0, 2).T @ S_seen.flatten(0, 2),
-        )
+        """J_p, gradient and Gauss-Newton matrix by all unknowns; DivergenceError if a state is not finite."""
+        return self.likelihood(replayed).normal_equations()
 
     def explain(self, difference: float, generator: torch.Generator) -> bool:
         """Seek in the records of the last update why real episodes cost other than the twin says.
@@ -301,11 +290,11 @@ class Assimilation:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on, except the closure."""
-        return {"descent": self.descent.state_dict(), "damping": self.second_order.damping, "first": self.first}
+        return {"descent": self.descent.state_dict(), "damping": self.damping, "first": self.first}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.descent.load_state_dict(state["descent"])
-        self.second_order.damping = state["damping"]
+        self.damping = state["damping"]
         if "first" in state:  # earlier versions did not save it
             closure = self.twin.closure
             present = copy.deepcopy(closure.state_dict())

@@ -6,15 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.fit.estimation import Estimate, Estimation, EstimationConfig
-from rt_torchrl.fit.first_values import state_sizes
-from rt_torchrl.fit.sensor_record import SensorRecord, chained, sensor_record
-from rt_torchrl.fit.sensors import Sensor, sensors_of, with_biases
-from rt_torchrl.fit.weight_prior import Belief, BeliefPrior
+from rt_torchrl.fit.least_squares import Estimate, Estimation, EstimationConfig, usual_sizes
+from rt_torchrl.fit.prior import Belief, BeliefPrior
+from rt_torchrl.fit.record import SensorRecord, chained, sensor_records
+from rt_torchrl.fit.sensors import Sensor, sensors_of, state_places, with_biases
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.signal import state_read
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
@@ -49,7 +47,7 @@ class SensorAssimilation(Assimilation):
 
     def _descend(self, replayed: Trajectory) -> Descended:
         plant, config = self.twin.plant, self.config
-        records = [sensor_record(plant, self.sensors, record) for record in replayed.each()]
+        records = sensor_records(plant, self.sensors, replayed)
         first = FirstStates(plant, self.sensors)
         records = [record._replace(guess=first.guess(record)) for record in records]
         estimation, records = self._task(records, first.spread)
@@ -59,7 +57,7 @@ class SensorAssimilation(Assimilation):
         closure, drift = self.twin.closure, config.drift
         believed = BeliefPrior(closure, self.belief, drift) if drift and self.belief is not None else None
         self.estimate = estimation.run(records, believed)
-        self.begun, self.belief = True, Belief.of(self.estimate.uncertainty) if drift else None
+        self.begun, self.belief = True, self.estimate.uncertainty.belief() if drift else None
         found = [w.detach().clone() for w in self.twin.closure.parameters()]
         noise, samples = self.estimate.likelihood.noise, sum(int(record.seen.sum()) for record in records)
         costs = [self._misfit(estimation, records, noise, weights) for weights in (start, found)]
@@ -72,7 +70,7 @@ class SensorAssimilation(Assimilation):
         """The estimation, and the records in the parts between which something may push."""
         plant, config, process = self.twin.plant, self.config, None
         if config.pushes > 1:
-            sizes = state_sizes(plant, torch.stack([record.guess for record in records]), self.sensors, records)
+            sizes = usual_sizes(plant, torch.stack([record.guess for record in records]), self.sensors, records)
             process, spread = config.push * sizes, torch.maximum(spread, KNOWN * sizes)
             length = -(-len(records[0].actions) // config.pushes)
             records = [part for record in records for part in chained(record, length, plant.dt)]
@@ -130,7 +128,7 @@ class FirstStates:
 
     def __init__(self, plant: Plant, sensors: tuple[Sensor, ...]):
         drawn = plant.draw_initial_state(DRAWS, torch.Generator().manual_seed(0))
-        own = [state_read(sensor.measurement.read, plant.states) for sensor in sensors]
+        own = state_places(plant, sensors)
         self._columns = [column for column, k in enumerate(own) if k is not None]
         self._read = [k for k in own if k is not None]
         self._mean = drawn.mean(0)

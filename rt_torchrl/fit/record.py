@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rt_torchrl.fit.sensors import Sensor, read
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 
 DRAWS = 100
 """Number of initial states of a plant whose mean is the guess of a hidden one."""
@@ -39,12 +39,6 @@ class SensorRecord(NamedTuple):
         """Whether there is a sample."""
         return ~self.readings.isnan()
 
-    def masked(self, first: int, last: int) -> "SensorRecord":
-        """The record with the samples ``first`` to ``last`` − 1 alone; the others count as missing."""
-        kept = torch.full_like(self.readings, torch.nan)
-        kept[first:last] = self.readings[first:last]
-        return self._replace(readings=kept)
-
     def part(self, first: int, last: int, dt: float, guess: Float[Tensor, " n_s"] | None = None) -> "SensorRecord":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the samples around them.
 
@@ -65,11 +59,18 @@ class SensorRecord(NamedTuple):
 
 def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -> SensorRecord:
     """What sensors read along a trajectory; its first state is the guess."""
-    t = float(record.start) + plant.dt * torch.arange(len(record.states), dtype=torch.float64)
-    inputs = held_to_the_end(record.exogenous)
-    with torch.no_grad():
-        readings = read(sensors, plant, t.to(inputs.device), record.states, inputs)
-    return SensorRecord(readings, record.actions, record.exogenous, record.states[0], float(record.start))
+    return sensor_records(plant, sensors, batch_of([record]))[0]
+
+
+@torch.no_grad()
+def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -> list[SensorRecord]:
+    """What sensors read along each trajectory of a batch; the first states are the guesses."""
+    states, actions, exogenous, start = batch
+    first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(len(states))
+    t = first.unsqueeze(-1) + plant.dt * torch.arange(states.shape[1], dtype=torch.float64, device=states.device)
+    readings = read(sensors, plant, t, states, held_to_the_end(exogenous))
+    each = zip(readings, actions, exogenous, states[:, 0], first.tolist(), strict=True)
+    return [SensorRecord(*parts) for parts in each]
 
 
 def chained(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:

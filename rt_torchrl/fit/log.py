@@ -1,8 +1,10 @@
 """Recorded logs of a real system's sensors and actuators, in CSV or Parquet files."""
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rt_torchrl.bounded_file import require_bounded
-from rt_torchrl.fit.column import Column
 from rt_torchrl.fit.sensors import known_sensors
-from rt_torchrl.fit.units import converted
 from rt_torchrl.options import array_of, check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
@@ -20,8 +20,12 @@ from rt_torchrl.plants.signal import Signal
 TIME = "time"
 READERS = (".csv", ".parquet")
 """Ends of the names of files that are read, in small letters."""
-MOST_ENTRIES = 500_000_000
-"""Greatest number of entries of a log, which take 4 GB."""
+NUMBER = r"(?:[0-9.]+(?:[eE][+-]?[0-9]+)?|inf|nan)"
+COLUMN = re.compile(
+    rf"(?P<header>.+)=(?P<signal>\w+)(?:\[(?P<unit>[^][=]+)\]|(?:\*(?P<factor>[+-]?{NUMBER}))?(?P<offset>[+-]{NUMBER})?)",
+    re.DOTALL,
+)
+EXAMPLES = "write it as in rpm, m/s^2, kN m, degC."
 WITH_OFFSET = r"\d[Tt ].*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
 """A date whose time of day says by how much it is ahead of UTC."""
 
@@ -45,6 +49,62 @@ class LogConfig:
         check_options(self)
         if self.gap is not None and not self.gap > 0.0:
             raise ValueError(f"gap={self.gap} s must be positive: the longest time between two rows that is bridged.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    r"""A column of a file, the signal that it holds, and its unit: a name, or value = factor·number + offset.
+
+    Args:
+        header: header of the column in the file.
+        signal: name of the plant's signal, or ``time``.
+        factor: factor from the column's numbers to the signal's unit.
+        offset: value of the signal where the column holds zero, in the signal's unit.
+        unit: unit of the column's numbers, see :func:`converted`; None if they have the unit of the signal, or if
+            factor and offset convert them.
+
+    Raises:
+        ValueError: if the factor is zero, factor or offset is not finite, or there is a unit beside them.
+    """
+
+    header: str
+    signal: str
+    factor: float = 1.0
+    offset: float = 0.0
+    unit: str | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.unit is not None and (self.factor, self.offset) != (1.0, 0.0):
+            raise ValueError(
+                f"column {self.header!r} has unit={self.unit!r}, and factor={self.factor} and offset={self.offset} "
+                "beside it; give one or the other."
+            )
+        if not (np.isfinite(self.factor) and self.factor != 0.0 and np.isfinite(self.offset)):
+            raise ValueError(
+                f"column {self.header!r} has factor={self.factor} and offset={self.offset}; both must be finite and "
+                "the factor not zero."
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> "Column":
+        """The column that ``HEADER=SIGNAL``, ``HEADER=SIGNAL[UNIT]`` or ``HEADER=SIGNAL*FACTOR+OFFSET`` describes.
+
+        Raises:
+            ValueError: if the text has another form.
+        """
+        match = COLUMN.fullmatch(text.strip())
+        found = match.groupdict() if match else {}
+        try:
+            factor, offset = (float(found[key] or default) for key, default in (("factor", 1.0), ("offset", 0.0)))
+        except (KeyError, ValueError):
+            raise ValueError(
+                f"column {text!r} is not understood; write HEADER=SIGNAL, HEADER=SIGNAL[UNIT] or "
+                "HEADER=SIGNAL*FACTOR+OFFSET, such as n=rotor_speed[rpm] or T=wall_temperature*0.5556+255.37."
+            ) from None
+        return cls(
+            header=found["header"], signal=found["signal"], factor=factor, offset=offset, unit=found["unit"] or None
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,20 +326,9 @@ def _headers(path: Path) -> list[str]:
 
 
 def _read_parquet(path: Path) -> Any:
-    _require_entries(path)
     frame = pandas().read_parquet(path)
     # An index with a name is a column of the file.
     return frame.reset_index() if any(name is not None for name in frame.index.names) else frame
-
-
-def _require_entries(path: Path) -> None:
-    """Refuse a Parquet file that would become far larger in memory, because its columns are compressed."""
-    from pyarrow.parquet import ParquetFile
-
-    with ParquetFile(path) as file:
-        rows, columns = file.metadata.num_rows, file.metadata.num_columns
-    if rows * columns > MOST_ENTRIES:
-        raise ValueError(f"it has {rows} rows of {columns} columns, more than {MOST_ENTRIES} entries")
 
 
 def _values(series: Any, column: Column, unit: str, path: Path) -> Float[np.ndarray, " rows"]:
@@ -341,6 +390,43 @@ def _wrong_entry(series: Any, wrong: Any, column: Column, path: Path, what: str)
         f"column {column.header!r} of {path} holds an entry that is not {what}: {series.iloc[k]!r} in row {k} (counted "
         f"from 0), {int(wrong.sum())} such rows."
     )
+
+
+def converted(values: Float[np.ndarray, " rows"], unit: str, to: str) -> Float[np.ndarray, " rows"]:
+    """The values in another unit, converted by the library pint.
+
+    To pint an angle is a pure number; here it is not. Hz and rad/s, which differ by 2π, therefore measure different
+    quantities.
+
+    Args:
+        values: numbers in ``unit``.
+        unit: unit of the values, such as ``rpm``, ``kN m``, ``degF`` or ``%``. Temperatures are absolute;
+            ``delta_degF`` is the unit of a difference.
+        to: unit of the result; ``-`` is the unit of a pure number.
+
+    Raises:
+        ValueError: if a unit is unknown, the two measure different things, or pint is not installed.
+    """
+    registry, pint = _registry()
+    try:
+        have, want = (registry.Unit("" if name.strip() == "-" else name) for name in (unit, to))
+        base, wanted = (str(registry.get_base_units(each)[1]) for each in (have, want))
+        if base == wanted:
+            return registry.Quantity(values, have).to(want).magnitude
+    except pint.UndefinedUnitError as error:
+        raise ValueError(f"unit {unit!r} is not known ({error}); {EXAMPLES}") from error
+    except Exception as error:  # pint's parser lets errors of Python's own parser through
+        raise ValueError(f"unit {unit!r} is not understood; {EXAMPLES}") from error
+    raise ValueError(f"{unit!r} (base units {base}) and {to!r} ({wanted}) do not measure the same quantity.")
+
+
+@cache
+def _registry() -> tuple[Any, Any]:
+    try:
+        import pint
+    except ImportError as error:
+        raise ValueError("units need pint: install the extra, pip install 'rt_torchrl[logs]'.") from error
+    return pint.UnitRegistry(), pint
 
 
 def pandas() -> Any:

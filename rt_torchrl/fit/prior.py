@@ -3,7 +3,7 @@ r"""A Gaussian prior of a closure's weights, which holds what no record shows at
 .. math:: \tfrac12\sum_i\Lambda_i(w_i - w_i^0)^2
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -12,12 +12,6 @@ from torch.nn.functional import pad
 
 from rt_torchrl.optimisers.levenberg_marquardt import NormalEquations
 from rt_torchrl.plants.closures import BoundedPerceptron
-
-if TYPE_CHECKING:
-    from rt_torchrl.fit.uncertainty import Uncertainty
-
-UNKNOWN = 1e4
-"""Standard deviation of weights of which nothing is known, where a step of 1 is neither long nor short."""
 
 
 class WeightPrior:
@@ -69,14 +63,6 @@ class Belief(NamedTuple):
 
     mean: Float[Tensor, " n_w"]
     covariance: Float[Tensor, "n_w n_w"]
-
-    @classmethod
-    def of(cls, uncertainty: "Uncertainty") -> "Belief":
-        """What an estimation has found of the weights; directions of which the data say nothing stay unknown."""
-        closure, n = uncertainty.likelihood.twin.closure, uncertainty.likelihood.weight_count
-        mean = torch.cat([w.detach().flatten() for w in closure.parameters() if w.requires_grad])
-        null = uncertainty.null[:n] / uncertainty.null.norm(dim=0)
-        return cls(mean, uncertainty.weights_covariance + UNKNOWN**2 * null @ null.T)
 
 
 class BeliefPrior(WeightPrior):

@@ -1,24 +1,39 @@
-"""How often intervals hold the truth: an estimation from many simulated records with noise."""
+"""How often intervals hold the truth: estimations from many simulated records with noise, on each plant."""
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.fit.covariance import named_values
-from rt_torchrl.fit.curve import band
-from rt_torchrl.fit.estimation import Estimation, EstimationConfig
-from rt_torchrl.fit.sensor_record import SensorRecord, sensor_record
-from rt_torchrl.fit.sensors import Sensor
-from rt_torchrl.interruption import safe_point
-from rt_torchrl.plants.plant import Plant
+from rt_torchrl import (
+    DigitalTwin,
+    Estimation,
+    EstimationConfig,
+    Plant,
+    Rollout,
+    Sensor,
+    SensorRecord,
+    Trajectory,
+    sensor_record,
+    sensors_of,
+)
+from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
+from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
+from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.neural import NeuralPolar
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.evaluation.closure_error import visited_features
+from rt_torchrl.fit.uncertainty import band, named_values
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.rollout import Rollout
-from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.trajectories.twin import DigitalTwin
 
 Flights = Callable[[Plant, nn.Module, torch.Generator], list[Trajectory]]
 """Flies the episodes whose records are one simulation, of a plant with a closure."""
@@ -39,9 +54,9 @@ class Coverage(NamedTuple):
     """
 
     names: list[str]
-    inside: Float[Tensor, " n"]
-    told: Float[Tensor, " n"]
-    error_over_bound: Float[Tensor, " n"]
+    inside: Tensor
+    told: Tensor
+    error_over_bound: Tensor
 
     @property
     def mean(self) -> float:
@@ -84,7 +99,6 @@ def coverage(
     twin = DigitalTwin(plant, copy.deepcopy(closure).requires_grad_(True))
     start = copy.deepcopy(twin.closure.state_dict())
     for _ in range(simulations):
-        safe_point()
         flown = fly(plant, closure, generator, flights)
         records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
         twin.closure.load_state_dict(start)
@@ -94,9 +108,7 @@ def coverage(
     return _counted(list(named_values(closure)), torch.stack(errors), torch.stack(bounds_found))
 
 
-def _counted(
-    names: list[str], errors: Float[Tensor, "simulations n"], scatter: Float[Tensor, "simulations n"]
-) -> Coverage:
+def _counted(names: list[str], errors: Tensor, scatter: Tensor) -> Coverage:
     z, known = errors / scatter, scatter.isfinite() & (scatter > 0.0)  # without scatter it is a constant
     inside = torch.where(known, (z.abs() <= 1.959964).double(), torch.nan).nanmean(0)
     ratio = torch.where(known, z, torch.nan).square().nanmean(0).sqrt()
@@ -115,7 +127,7 @@ def curve_coverage(
     generator: torch.Generator,
     config: EstimationConfig | None = None,
     flights: Flights | None = None,
-) -> Float[Tensor, " {simulations}"]:
+) -> Tensor:
     """How often the bands of a neural closure hold the true curve, where the system has been.
 
     Args:
@@ -135,7 +147,6 @@ def curve_coverage(
     """
     found = []
     for _ in range(simulations):
-        safe_point()
         flown = fly(plant, plant.closure, generator, flights)
         records = with_noise([sensor_record(plant, sensors, one) for one in flown], share, generator)
         estimate = Estimation(DigitalTwin(plant, start(generator)), sensors, config=config).run(records)
@@ -186,3 +197,137 @@ def random_flight(
     drawn = torch.rand(1, -(-plant.n_steps // HELD), len(least), generator=generator, dtype=torch.float64)
     share = low + (high - low) * drawn.repeat_interleave(HELD, 1)[:, : plant.n_steps]
     return Rollout(plant, closure)(start, inputs, least + share * (greatest - least)).each()[0]
+
+
+class Case(NamedTuple):
+    """What is simulated: plant, closure of the real system, sensors, and episodes of one simulation."""
+
+    plant: Callable[[], Plant]
+    closure: Callable[[Any], nn.Module]
+    sensors: tuple[str, ...]
+    flights: Flights | None = None
+
+
+@torch.no_grad()
+def turbine_flights(plant: Plant, closure: nn.Module, generator: torch.Generator) -> list[Trajectory]:
+    """An episode of the classical controller, and two under random commands in their whole ranges.
+
+    In the middle of the ranges the blades are never flat, and nothing tells the weights of what they do there.
+    """
+    start, wind = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    (usual,) = JonkmanController(plant).fly(start, wind, closure).each()
+    return [usual, *(random_flight(plant, closure, generator, low=0.0, high=1.0) for _ in range(2))]
+
+
+CASES: dict[str, Case] = {
+    # The law that fits the rotor's own table: sets with c_5 = 0 say nothing of x, its exponent.
+    "wind_turbine": Case(
+        lambda: WindTurbine(closure=SaintDrenan.from_set("BestFitToROSCOTable")),
+        lambda plant: plant.closure,
+        ("rotor_speed",),
+        turbine_flights,
+    ),
+    "flapping_wing": Case(
+        lambda: FlappingWing(horizon=1.0),
+        lambda plant: QuasiSteadyPolar.true(),
+        ("forward_position", "height", "forward_speed", "climb_speed"),
+    ),
+    "cryogenic_tank": Case(
+        lambda: CryogenicTank(horizon=43200.0),
+        lambda plant: ConstantCoefficients.true(),
+        ("wall_temperature", "liquid_volume", "pressure"),
+    ),
+    "cascaded_tanks": Case(CascadedTanks, lambda plant: plant.closure, ("sensed_level",)),
+    "pendulum": Case(lambda: Pendulum(horizon=5.0), lambda plant: plant.closure, ("angle", "angular_speed")),
+}
+"""The simulations, by the plant's name."""
+
+
+class CurveCase(NamedTuple):
+    """What is simulated for a curve: a true law that the closure's own law does not hold, and a neural closure."""
+
+    plant: Callable[[], Plant]
+    start: Callable[[torch.Generator], nn.Module]
+    sensors: tuple[str, ...]
+    prior: float
+    curve: str
+    flights: Flights | None = None
+
+
+class Bent(nn.Module):
+    """A law beside which something is that only a perceptron can learn.
+
+    Args:
+        law: the law.
+        bend: function of the features that is added.
+    """
+
+    def __init__(self, law: nn.Module, bend: Callable[[Tensor], Tensor]):
+        super().__init__()
+        self.law, self.bend = law, bend
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.law(features) + self.bend(features)
+
+
+def swollen(features: Tensor) -> Tensor:
+    """More power where the blades are flat, by 0.03 of C_p at λ = 7."""
+    lam, beta = features.unbind(-1)
+    return 0.03 * torch.exp(-(((lam - 7.0) / 2.0) ** 2) - (beta / 8.0) ** 2).unsqueeze(-1)
+
+
+def late_stall(features: Tensor) -> Tensor:
+    """More lift and drag at small angles of attack."""
+    sine, cosine = features.unbind(-1)
+    return torch.stack([0.2 * sine * cosine**3, 0.1 * sine**2 * cosine**2], -1)
+
+
+def wavy_outlet(features: Tensor) -> Tensor:
+    """An upper outlet whose flow is not in proportion to its level."""
+    flow = 0.015 * torch.sin(features[..., 0] / 6.0)
+    return torch.stack([-flow, flow], -1)
+
+
+HIDDEN = (8,)
+"""Width of the perceptrons' hidden layers; more weights are told less by one record."""
+CURVES: dict[str, CurveCase] = {
+    "wind_turbine": CurveCase(
+        lambda: WindTurbine(closure=Bent(SaintDrenan.from_set("BestFitToROSCOTable"), swollen)),
+        lambda g: NeuralPowerCoefficient(SaintDrenan.from_set("BestFitToROSCOTable"), hidden=HIDDEN, generator=g),
+        ("rotor_speed",),
+        0.1,
+        "C_p",
+        turbine_flights,
+    ),
+    "flapping_wing": CurveCase(
+        lambda: FlappingWing(horizon=0.5, closure=Bent(QuasiSteadyPolar.true(), late_stall)),
+        lambda g: NeuralPolar(QuasiSteadyPolar.draw(g, spread=0.1), hidden=HIDDEN, generator=g),
+        ("forward_position", "height", "forward_speed", "climb_speed"),
+        3.0,
+        "C_L",
+    ),
+    "cascaded_tanks": CurveCase(
+        lambda: CascadedTanks(closure=Bent(Hydraulics.true(), wavy_outlet)),
+        lambda g: NeuralHydraulics(Hydraulics.true().requires_grad_(True), hidden=HIDDEN, generator=g),
+        ("upper_level", "lower_level"),
+        3.0,
+        "the upper tank's rate",
+    ),
+}
+"""The simulations of curves, by the plant's name; each prior lets the weights of a perceptron be of order one."""
+
+
+def curves_of(case: CurveCase, simulations: int, noise: float, seed: int) -> Tensor:
+    """Share of the visited points whose band holds the true curve, in each simulation."""
+    plant = case.plant()
+    return curve_coverage(
+        plant,
+        case.start,
+        sensors_of(plant, case.sensors),
+        visited_features,
+        simulations=simulations,
+        share=noise,
+        generator=torch.Generator().manual_seed(seed),
+        config=EstimationConfig(iterations=60, rounds=4, prior=case.prior),
+        flights=case.flights,
+    )

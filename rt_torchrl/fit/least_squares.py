@@ -1,0 +1,468 @@
+r"""The least-squares fit of a twin: weights, initial states, biases and noise levels by maximum likelihood.
+
+The descent over all unknowns and the levels take turns, until the levels rest:
+
+.. math::
+    \sigma_j^2 = \frac{\sum_kr_{kj}^2}{N_j\,(1 - p/N)}, \qquad \Lambda = \frac{\gamma}{\|w - w^0\|^2}, \qquad
+    \gamma = \sum_i\big(1 - \Lambda H^{-1}_{ii}\big)
+
+with N_j samples of sensor j out of N, p unknowns that the data determine, and γ of them among the weights of
+perceptrons (MacKay, Neural Computation 4 (1992) 415). Step 4 of a training takes the same residuals, with the known
+noise of :func:`rt_torchrl.fit.sensors.state_sensors`.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rt_torchrl.fit.likelihood import Biases, InitialStates, Likelihood
+from rt_torchrl.fit.prior import BeliefPrior, WeightPrior
+from rt_torchrl.fit.record import SensorRecord
+from rt_torchrl.fit.sensors import Sensor, state_places
+from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
+from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
+from rt_torchrl.options import check_options
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import differences
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+NOISE_TOLERANCE = 1e-8
+"""A descent ends where a step promises to lower J by less than this share. One standard error of a weight changes J by
+about one part in the number of samples, so the default for noise-free records would end too early."""
+INITIAL_ITERATIONS = 20
+"""Number of trial steps for initial states alone; it is small because J is nearly quadratic in them."""
+SETTLED = 0.01
+"""Relative change of the noise levels below which they rest."""
+FIRST_NOISE = 0.1
+"""First guess of an unknown noise level, as a share of the scatter of the readings."""
+LEAST_NOISE = 1e-9
+"""Least noise level, as a share of its first guess; less is rounding."""
+STIFFNESS = (1e-6, 1e8)
+"""Range of the prior's stiffness Λ where the data choose it."""
+
+
+class Fitted(Protocol):
+    """Result of one descent."""
+
+    @property
+    def best(self) -> float:
+        """The least cost."""
+
+
+F = TypeVar("F", bound=Fitted)
+
+
+def multi_start(
+    closure: nn.Module, count: int, descend: Callable[[int], F], *, first: dict[str, Tensor] | None = None
+) -> list[F]:
+    """Descend from several first weights; the best weights stay.
+
+    The first descent begins with the present weights, the second with ``first`` if these are given. The others begin
+    with the first weights and with the best ones so far in turns, moved at random: the best may have run to where
+    nothing shows them.
+
+    Args:
+        closure: closure with the weights.
+        count: number of descents.
+        descend: function of the number of the descent, which moves the weights and returns the result.
+        first: other first weights; by default the present ones.
+
+    Returns:
+        The results of all descents that have not diverged, beginning with that from the present weights.
+
+    Raises:
+        FloatingPointError: if the descent from the present weights diverges.
+    """
+    generator = torch.Generator().manual_seed(0)
+    origin = copy.deepcopy(closure.state_dict()) if first is None else first
+    found = [descend(0)]
+    least, best = found[0].best, copy.deepcopy(closure.state_dict())
+    for number in range(1, count):
+        closure.load_state_dict(origin if number % 2 else best)
+        if number > 1 or first is None:
+            move(closure, generator)
+        try:
+            found.append(descend(number))
+        except FloatingPointError:  # weights drawn at random may be nonsense
+            continue
+        if found[-1].best < least:
+            least, best = found[-1].best, copy.deepcopy(closure.state_dict())
+    closure.load_state_dict(best)
+    return found
+
+
+@torch.no_grad()
+def move(closure: nn.Module, generator: torch.Generator) -> None:
+    """Move the weights at random, each by a normal number of some units; a unit is a factor of e for a logarithm."""
+    far = 3.0 * torch.rand(1, generator=generator, dtype=torch.float64).item()
+    for w in closure.parameters():
+        if w.requires_grad:
+            w.add_(far * torch.randn(w.shape, generator=generator, dtype=torch.float64).to(w.device))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimationConfig:
+    """Parameters of an estimation.
+
+    Args:
+        iterations: trial steps of each descent.
+        rounds: greatest number of rounds in which noise levels and prior follow the residuals.
+        prior: stiffness Λ of the weights of the closure's perceptrons; None lets the data choose it. Other weights
+            have no prior.
+        starts: number of first weights that the descent begins with. Beside the present ones these are the present ones
+            and the best ones so far in turns, moved at random: one sensor may leave several local minima.
+        errors: formula of the standard errors: ``fisher`` for white noise, or ``robust`` for residuals with memory.
+    """
+
+    iterations: int = 30
+    rounds: int = 10
+    prior: float | None = 0.0
+    starts: int = 1
+    errors: Errors = "fisher"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument in ("iterations", "rounds", "starts"):
+            if getattr(self, argument) < 1:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the estimation must be at least 1.")
+        if self.prior is not None and not self.prior >= 0.0:
+            raise ValueError(f"prior={self.prior} of the estimation must not be negative; None lets the data choose.")
+
+
+class Estimate(NamedTuple):
+    """Result of an estimation; the closure itself is trained in place.
+
+    Args:
+        before, after: named values of the closure.
+        noise: noise level of each sensor, by name, in its unit.
+        biases: bias of each sensor, by name; zero for one without.
+        initial: initial states of the records.
+        stiffness: stiffness Λ of the prior.
+        likelihood: the likelihood at its minimum.
+        uncertainty: standard errors, intervals and warnings.
+        iterations: number of trial steps.
+    """
+
+    before: dict[str, float]
+    after: dict[str, float]
+    noise: dict[str, float]
+    biases: dict[str, float]
+    initial: Float[Tensor, "records n_s"]
+    stiffness: float
+    likelihood: Likelihood
+    uncertainty: Uncertainty
+    iterations: int
+
+
+class _Minimum(NamedTuple):
+    """A likelihood at its minimum, its cost, and the number of trial steps."""
+
+    likelihood: Likelihood
+    best: float
+    iterations: int
+
+
+class Estimation:
+    """Estimates a twin's closure from what sensors read.
+
+    The descent is taken in two ways: over all unknowns together, and over the weights alone before all unknowns. The
+    lower cost stays. The first way can make up for wrong weights by initial states; the second can drive weights away
+    to make up for wrong initial states.
+
+    Args:
+        twin: the twin, whose closure is trained in place.
+        sensors: the sensors of all records.
+        spread: standard deviation of the initial states about their guess: zero for a state that is known, infinite for
+            one of which only the readings tell. None lets all be unknown.
+        process: standard deviation of what process noise does to every state from a record to one that follows it, see
+            :func:`chained`; None if there is none. No state is known then, so that no ``spread`` may be zero.
+        config: parameters of the estimation.
+    """
+
+    def __init__(
+        self,
+        twin: DigitalTwin,
+        sensors: Sequence[Sensor],
+        *,
+        spread: Float[Tensor, " n_s"] | None = None,
+        process: Float[Tensor, " n_s"] | None = None,
+        config: EstimationConfig | None = None,
+    ):
+        self.twin, self.sensors, self.config = twin, tuple(sensors), config or EstimationConfig()
+        unknown = torch.full((len(twin.plant.states),), math.inf, dtype=torch.float64)
+        self.spread = unknown if spread is None else spread
+        names = ", ".join(state.name for state in twin.plant.states)
+        if self.spread.shape != unknown.shape or not (self.spread >= 0.0).all():
+            raise ValueError(
+                f"spread={self.spread.tolist()} of the initial states must hold one number for each of {names}: 0 for "
+                "a state that is known, or inf."
+            )
+        self.process = process
+        fits = process is None or (process.shape == unknown.shape and bool((process > 0.0).all()))
+        if process is not None and not (fits and bool((self.spread > 0.0).all())):
+            raise ValueError(
+                f"process={process.tolist()} must hold a positive number for each of {names}, and no "
+                f"spread={self.spread.tolist()} may be zero beside it."
+            )
+
+    def run(self, records: Sequence[SensorRecord], belief: BeliefPrior | None = None) -> Estimate:
+        """Estimate all unknowns from the records.
+
+        Args:
+            records: the records.
+            belief: what was believed of the weights before; None for the prior of the configuration.
+
+        Raises:
+            ValueError: if there is no record, a sensor has no sample, or a record follows one without process noise.
+            DivergenceError: if the twin diverges under the weights that it starts from.
+        """
+        closure = self.twin.closure
+        before = {name: value.item() for name, value in named_values(closure).items()}
+        self._require_process(records)
+        prior = WeightPrior(closure, 1.0 if self.config.prior is None else self.config.prior)
+        prior = prior if belief is None else belief
+        tried = multi_start(closure, self.config.starts, lambda number: self._both_ways(records, prior, number))
+        likelihood, iterations = min(tried, key=lambda one: one.best).likelihood, sum(one.iterations for one in tried)
+        for _ in range(self.config.rounds):
+            rest = self._follow_residuals(likelihood)
+            iterations += self._descended(likelihood).iterations
+            if rest:
+                break
+        names = [sensor.name for sensor in self.sensors]
+        return Estimate(
+            before,
+            {name: value.item() for name, value in named_values(closure).items()},
+            dict(zip(names, likelihood.noise.tolist(), strict=True)),
+            dict(zip(names, likelihood.biases().tolist(), strict=True)),
+            likelihood.initial().detach(),
+            prior.stiffness,
+            likelihood,
+            Uncertainty(likelihood, errors=self.config.errors),
+            iterations,
+        )
+
+    def likelihood(
+        self,
+        records: Sequence[SensorRecord],
+        noise: Float[Tensor, " n_y"] | None = None,
+        *,
+        prior: WeightPrior | None = None,
+        weights: bool = True,
+        known: bool = False,
+    ) -> Likelihood:
+        """The likelihood of records, with initial states at their guess.
+
+        Args:
+            records: the records.
+            noise: noise levels; by default those that are given, and a share of the readings' scatter for others.
+            prior: prior of the weights.
+            weights: whether the weights are unknowns.
+            known: whether to take the initial states as known.
+        """
+        noise = first_noise(self.sensors, records) if noise is None else noise
+        first = self._guesses(records)
+        free = [] if known else (self.spread > 0.0).nonzero().flatten().tolist()
+        sizes = usual_sizes(self.twin.plant, first, self.sensors, records) if free else torch.ones_like(first[0])
+        return Likelihood(
+            self.twin,
+            records,
+            self.sensors,
+            InitialStates(first, free, sizes),
+            noise,
+            spread=self.spread.to(first.device),
+            process=None if known else self.process,
+            biases=None if known else Biases(self.sensors, noise),
+            prior=prior,
+            weights=weights,
+        )
+
+    @torch.no_grad()
+    def _guesses(self, records: Sequence[SensorRecord]) -> Float[Tensor, "records n_s"]:
+        """First guesses of the initial states; a record that follows begins where the twin ends the one before."""
+        found: list[Tensor] = []
+        for number, record in enumerate(records):
+            if record.follows and number:
+                before = records[number - 1]
+                given = (found[-1][None], before.exogenous[None], before.actions[None])
+                found.append(self.twin.replay(*given, start=before.start).states[0, -1])
+            else:
+                found.append(record.guess)
+        return torch.stack(found)
+
+    def _require_process(self, records: Sequence[SensorRecord]) -> None:
+        follows = [record.follows for record in records]
+        if any(follows) and (self.process is None or follows[0]):
+            raise ValueError(
+                "a record follows the one before it: give the estimation its process noise, process=..., and begin "
+                "with a record that follows nothing."
+            )
+
+    def fit_initial_states(self, records: Sequence[SensorRecord], noise: Float[Tensor, " n_y"]) -> Likelihood:
+        """The likelihood of other records under the present weights, at the initial states that suit them best."""
+        likelihood = self.likelihood(records, noise, weights=False)
+        method = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
+        method.run(likelihood.normal_equations, INITIAL_ITERATIONS)
+        return likelihood
+
+    def _both_ways(self, records: Sequence[SensorRecord], prior: WeightPrior, number: int) -> _Minimum:
+        """The minimum under the first noise levels by the better way; weights moved at random go the second one."""
+        closure = self.twin.closure
+        start = copy.deepcopy(closure.state_dict())
+        if number:
+            return self._staged(records, prior)
+        together = self._descended(self.likelihood(records, prior=prior))
+        found = copy.deepcopy(closure.state_dict())
+        closure.load_state_dict(start)
+        try:
+            staged = self._staged(records, prior)
+        except FloatingPointError:
+            staged = together._replace(iterations=0)
+        done = together.iterations + staged.iterations
+        if staged.best < together.best:
+            return staged._replace(iterations=done)
+        closure.load_state_dict(found)
+        return together._replace(iterations=done)
+
+    def _staged(self, records: Sequence[SensorRecord], prior: WeightPrior) -> _Minimum:
+        done = 0
+        if self.process is None:
+            done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations
+        found = self._descended(self.likelihood(records, prior=prior))
+        return found._replace(iterations=done + found.iterations)
+
+    def _descended(self, likelihood: Likelihood) -> _Minimum:
+        optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
+        found = optimiser.run(likelihood.normal_equations, self.config.iterations)
+        return _Minimum(likelihood, found.best, found.iterations)
+
+    def _follow_residuals(self, likelihood: Likelihood) -> bool:
+        """Set noise levels and prior by the residuals; whether they rest."""
+        blocks = likelihood.residuals()
+        equations = likelihood.normal_equations(blocks)
+        inverse = inverse_information(equations.matrix).matrix
+        rest, n, prior = True, likelihood.weight_count, likelihood.prior
+        determined = likelihood.count - likelihood.held_back(inverse)
+        if self.config.prior is None and prior is not None and prior.held.any():
+            gamma = (prior.held * (1.0 - prior.stiffness * inverse.diagonal()[:n])).sum()
+            moved = (prior.held * (prior.weights() - prior.start).square()).sum()
+            new = (gamma / moved.clamp_min(1e-300)).clamp(*STIFFNESS).item()
+            rest = abs(math.log(new / prior.stiffness)) < SETTLED
+            prior.stiffness = new
+        given = torch.tensor([sensor.noise is not None for sensor in self.sensors], device=likelihood.noise.device)
+        squares = torch.stack([block.values.square().sum((0, 1)) for block in blocks]).sum(0)
+        total = int(likelihood.samples.sum())
+        freedom = likelihood.samples * max(1.0 - determined / total, 1.0 / total)
+        floor = LEAST_NOISE * first_noise(self.sensors, likelihood.records)
+        levels = torch.maximum(likelihood.noise * (squares / freedom).sqrt(), floor)
+        levels = torch.where(given, likelihood.noise, levels)
+        rest &= bool(((levels / likelihood.noise).log().abs() < SETTLED).all())
+        likelihood.noise = levels
+        return rest
+
+
+def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """Noise levels that are given; for others a share of the scatter of the readings.
+
+    Raises:
+        ValueError: if there is no record, or a sensor has no sample.
+    """
+    if not records:
+        raise ValueError("records=[] of the estimation must hold at least one record.")
+    readings = torch.cat([record.readings for record in records])
+    levels = []
+    for sensor, values in zip(sensors, readings.T, strict=True):
+        seen = values[~values.isnan()]
+        if not len(seen):
+            raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
+        origin = seen[:1].expand_as(seen)
+        scatter = differences([sensor.measurement], (seen - 0.0)[:, None], origin[:, None]).square().mean().sqrt()
+        guess = FIRST_NOISE * scatter.item() or 1e-6 * max(abs(origin[0].item()), 1.0)
+        levels.append(guess if sensor.noise is None else sensor.noise)
+    return readings.new_tensor(levels)
+
+
+def usual_sizes(
+    plant: Plant, first: Float[Tensor, "records n_s"], sensors: Sequence[Sensor], records: Sequence[SensorRecord]
+) -> Float[Tensor, " n_s"]:
+    """Usual size of each state, in which changes of initial states are measured; 1 where nothing tells it.
+
+    It is the greatest of the scatter of the states that the plant draws, that of what a sensor reads of it, and a tenth
+    of the guess.
+    """
+    drawn = plant.draw_initial_state(100, torch.Generator(device=first.device).manual_seed(0))
+    sizes = torch.maximum(drawn.std(0), 0.1 * first.abs().amax(0))
+    for column, k in enumerate(state_places(plant, sensors)):
+        if k is not None:
+            values = torch.cat([record.readings[:, column] for record in records])
+            values = values[~values.isnan()]
+            scatter = (values - values.mean()).square().mean().sqrt()
+            sizes[k] = torch.maximum(sizes[k], scatter)
+    return torch.where(sizes > 0.0, sizes, 1.0)
+
+
+class Judgement(NamedTuple):
+    """Result of a twin on records: RMS errors of the sensors, and the readings that it replays."""
+
+    rms: Float[Tensor, " n_y"]
+    readings: list[Tensor]
+
+
+class Identified(NamedTuple):
+    """Result of an identification: the estimate, and how well the twin replays both kinds of records.
+
+    ``autocorrelation`` holds the correlation of neighbouring residuals of each sensor, near 0 for white noise.
+    """
+
+    estimate: Estimate
+    training: tuple[Judgement, Judgement]  # before and after
+    held_out: tuple[Judgement, Judgement]
+    autocorrelation: Float[Tensor, " n_y"]
+
+
+def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out: Sequence[SensorRecord]) -> Identified:
+    """Estimate on some records and judge on both kinds, each with the initial states that suit it best.
+
+    Raises:
+        ValueError: if a sensor has no sample in the training records.
+        DivergenceError: if the twin diverges under the weights that it starts from.
+    """
+    first = first_noise(estimation.sensors, training)
+    before = [judged(estimation.fit_initial_states(records, first)) for records in (training, held_out)]
+    estimate = estimation.run(training)
+    after = [
+        judged(estimate.likelihood),
+        judged(estimation.fit_initial_states(held_out, estimate.likelihood.noise)),
+    ]
+    on_training, on_held_out = zip(before, after, strict=True)
+    return Identified(estimate, on_training, on_held_out, autocorrelation(estimate.likelihood))
+
+
+def judged(likelihood: Likelihood) -> Judgement:
+    """The twin's errors in the samples that exist; unknown if it diverges."""
+    try:
+        blocks = likelihood.residuals()
+    except DivergenceError:
+        return Judgement(
+            torch.full_like(likelihood.noise, torch.inf), [r.readings * torch.nan for r in likelihood.records]
+        )
+    squares = torch.stack([(block.values * likelihood.noise).square().sum((0, 1)) for block in blocks]).sum(0)
+    return Judgement((squares / likelihood.samples).sqrt(), likelihood.simulated())
+
+
+def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:
+    """Correlation of the residuals of neighbouring samples that exist, for each sensor."""
+    products, squares = torch.zeros_like(likelihood.noise), torch.zeros_like(likelihood.noise)
+    for block in likelihood.residuals():
+        for values, seen in zip(block.values, block.seen, strict=True):
+            for k in range(len(products)):
+                r = values[seen[:, k], k]
+                products[k] += r[1:] @ r[:-1]
+                squares[k] += r @ r
+    return products / squares
