@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.extension import Extension
+from rt_torchrl.plants.extension import Extension, own_coefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
 
@@ -55,7 +55,7 @@ class LaggedPower(Extension):
         missing = hidden[..., 0] * MEGA / speed - torque
         field = plant.vector_field(t, base, action, exogenous, inner)
         accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
-        rate = -(missing * speed).unsqueeze(-1) / (MEGA * closure.get_submodule("own")()[0])
+        rate = -(missing * speed).unsqueeze(-1) / (MEGA * own_coefficients(closure)[0])
         return torch.cat([accelerated, field[..., 1:], rate], -1)
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 1"]:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import (
     Action,
@@ -60,6 +61,18 @@ class ExtendedClosure(nn.Module):
 
     def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch n"]:
         return self.base(features)
+
+
+def own_coefficients(closure: nn.Module) -> Float[Tensor, " n"]:
+    """The parameters of an extension, where they are a few positive numbers.
+
+    Raises:
+        TypeError: if the closure is not extended by :class:`PositiveCoefficients`.
+    """
+    own = closure.get_submodule("own")
+    if not isinstance(own, PositiveCoefficients):
+        raise TypeError(f"closure.own={type(own).__name__} must be PositiveCoefficients.")
+    return own.coefficients
 
 
 class Extension(Plant):
