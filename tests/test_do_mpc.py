@@ -14,7 +14,7 @@ import torch
 
 from rt_torchrl.control.receding_horizon import RecedingHorizon
 from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
-from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
 HORIZON = 20.0

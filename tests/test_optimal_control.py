@@ -13,7 +13,7 @@ from rt_torchrl.control.clairvoyant import clairvoyant, constant_starts, random_
 from rt_torchrl.control.forecasts import Foreseen
 from rt_torchrl.control.receding_horizon import RecedingHorizon
 from rt_torchrl.control.receding_horizon_config import RecedingHorizonConfig
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
