@@ -40,20 +40,17 @@ def grid(lam, beta) -> torch.Tensor:
 
 def test_optimum_at_fine_pitch(table):
     # The published figures have three digits, and C_p is flat there: within 2.1e-4 of its top from λ = 7.5 to 7.8.
-    power, lam, beta = table.maximum()
+    power, lam = table.optimum()
     assert power == pytest.approx(0.466, abs=5e-4)
     assert lam == pytest.approx(7.64, abs=0.02)
-    assert beta == 0.0
 
 
-@pytest.mark.parametrize("pitch", [0.0, None])
-def test_maximum_is_stationary(table, pitch):
-    power, lam, beta = table.maximum(pitch)
-    slope_lam, slope_beta = torch.func.jacrev(table)(features(lam, beta))[0].tolist()
+def test_optimum_is_stationary(table):
+    power, lam = table.optimum()
+    slope = torch.func.jacrev(table)(features(lam, 0.0))[0, 0].item()
     # An error of 1e-7 in the location times a curvature of order 0.01…0.1.
-    assert abs(slope_lam) < 1e-7
-    assert pitch is not None or abs(slope_beta) < 1e-7
-    assert power >= table.values[:, 5 if pitch == 0.0 else slice(None)].max().item()
+    assert abs(slope) < 1e-7
+    assert power >= table.values[:, 5].max().item()
 
 
 @pytest.mark.parametrize("make", [PowerCoefficientTable.nrel5mw, uneven])
@@ -203,11 +200,6 @@ def test_refuses_bad_files(tmp_path, text, message):
         PowerCoefficientTable.from_csv(path)
 
 
-def test_maximum_refuses_a_pitch_outside(table):
-    with pytest.raises(ValueError, match=r"pitch=31.0 deg lies outside.*-5.0…30.0"):
-        table.maximum(31.0)
-
-
 @pytest.fixture(scope="module")
 def rotor() -> Rotor:
     return Rotor.nrel5mw()
@@ -319,12 +311,12 @@ def test_the_shipped_table_of_the_worn_rotor_is_what_the_theory_makes():
 
 
 def test_a_worn_rotor_takes_less_from_the_wind(table):
-    worn, (best, _, _) = PowerCoefficientTable.nrel5mw(worn=True), table.maximum()
+    worn, (best, _) = PowerCoefficientTable.nrel5mw(worn=True), table.optimum()
     # Half again the drag costs a section of glide ratio 100 some λ_section/200 of its power, the lift is made up for by
     # induction: some hundredths of C_p in all, most at high tip-speed ratios.
-    assert 0.01 < best - worn.maximum()[0] < 0.08
+    assert 0.01 < best - worn.optimum()[0] < 0.08
     row, column = int((table.tip_speed_ratio - 11.0).abs().argmin()), int(table.pitch.abs().argmin())
-    assert table.values[row, column] - worn.values[row, column] > best - worn.maximum()[0]
+    assert table.values[row, column] - worn.values[row, column] > best - worn.optimum()[0]
 
 
 def test_polar_goes_through_its_data(rotor):

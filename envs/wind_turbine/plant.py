@@ -230,7 +230,7 @@ class WindTurbine(Plant):
         self.wind = KaimalWind() if wind is None else wind
         self.inertia, self.cost = inertia, PaperCost() if cost is None else cost
         table = closure if isinstance(closure, PowerCoefficientTable) else PowerCoefficientTable.nrel5mw()
-        self.best_power_coefficient, self.best_tip_speed_ratio, _ = table.maximum()
+        self.best_power_coefficient, self.best_tip_speed_ratio = table.optimum()
         # Gain K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared).
         power = 0.5 * self.air_density * math.pi * self.radius**5 * self.best_power_coefficient
         self.optimal_gain = power / (self.best_tip_speed_ratio * self.gear_ratio) ** 3

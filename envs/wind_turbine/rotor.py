@@ -130,38 +130,18 @@ class PowerCoefficientTable(nn.Module):
         return ((c3 * x + c2) * x + c1) * x + c0
 
     @torch.no_grad()
-    def maximum(self, pitch: float | None = 0.0) -> tuple[float, float, float]:
-        """The highest C_p in the table's range, and its place.
+    def optimum(self) -> tuple[float, float]:
+        """The highest C_p [-] at fine pitch in the table's range, and its λ* [-].
 
-        Args:
-            pitch: pitch angle of the search [deg], by default fine pitch; None searches all pitch angles.
-
-        Returns:
-            C_p,max [-], λ* [-], β* [deg]; λ* and β* err by about 1e-7, the square root of the rounding error.
-
-        Raises:
-            ValueError: if ``pitch`` lies outside the table.
+        λ* errs by about 1e-7, the square root of the rounding error.
         """
-        beta_range = (self.pitch[0].item(), self.pitch[-1].item())
-        if pitch is not None and not beta_range[0] <= pitch <= beta_range[1]:
-            raise ValueError(
-                f"pitch={pitch} deg lies outside the table; choose {beta_range[0]}…{beta_range[1]} deg, or None."
-            )
-        lam, beta = self.tip_speed_ratio, self.pitch if pitch is None else self.pitch.new_tensor([pitch])
-        lam_axis, beta_axis = _subdivided(lam, 8), _subdivided(beta, 8)
-        for _ in range(9):  # each pass narrows the box to a tenth, in the end to 1e-8 of a table cell
-            grid = torch.cartesian_prod(lam_axis, beta_axis).reshape(-1, 2)
-            values = self(grid).squeeze(-1)
-            best = values.argmax()
-            lam_axis, beta_axis = (
-                _subdivided(_neighbours(axis, at), 10)
-                for axis, at in ((lam_axis, grid[best, 0]), (beta_axis, grid[best, 1]))
-            )
-        return values[best].item(), grid[best, 0].item(), grid[best, 1].item()
-
-    def extra_repr(self) -> str:
-        lam, beta = self.tip_speed_ratio, self.pitch
-        return f"λ={lam[0]:g}…{lam[-1]:g} ({len(lam)} rows), β={beta[0]:g}…{beta[-1]:g} deg ({len(beta)} columns)"
+        axis = _subdivided(self.tip_speed_ratio, 8)
+        for _ in range(9):  # each pass narrows the axis to a tenth, in the end to 1e-8 of a table cell
+            values = self(torch.stack([axis, torch.zeros_like(axis)], -1)).squeeze(-1)
+            best = int(values.argmax())
+            power, lam = values[best].item(), axis[best].item()
+            axis = _subdivided(axis[max(best - 3, 0) : best + 4], 10)
+        return power, lam
 
 
 def csv_rows(path: str | Path) -> list[list[str]]:
@@ -217,12 +197,6 @@ def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
     """The axis with each interval cut into equal parts."""
     steps = torch.arange(parts, dtype=axis.dtype, device=axis.device) / parts
     return torch.cat([(axis[:-1, None] + steps * axis.diff()[:, None]).flatten(), axis[-1:]])
-
-
-def _neighbours(axis: Float[Tensor, " n"], at: Float[Tensor, ""]) -> Float[Tensor, " m"]:
-    """The three points of an axis on either side of one of them: a slanting ridge moves the best point."""
-    index = int(torch.searchsorted(axis, at))
-    return axis[max(index - 3, 0) : index + 4]
 
 
 def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:

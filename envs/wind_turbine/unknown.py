@@ -5,6 +5,7 @@ Parameters without a source are engineering guesses.
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -166,29 +167,6 @@ def further_suspects(plant: Plant) -> Mapping[str, Plant]:
     return {"unknown torque": torque}
 
 
-def low_anemometer(plant: Plant) -> Plant:
-    """An anemometer that reads 10 % too little, as in the wake of the blades; engineering guess."""
-    return MisreadWind(plant, 0.9)
-
-
-def high_anemometer(plant: Plant) -> Plant:
-    """An anemometer that reads 10 % too much; engineering guess."""
-    return MisreadWind(plant, 1.1)
-
-
-def torque_loss(plant: Plant) -> Plant:
-    """A shaft whose bearings and gears lose 8 % of the torque; engineering guess.
-
-    NREL/TP-500-38060 has no loss in the gearbox, and 5.6 % in the generator.
-    """
-    return ScaledCoefficients(plant, 0.92)
-
-
-def inflow(plant: Plant) -> Plant:
-    """A wake that takes 10 s: D/u at rated wind speed, 126 m/11.4 m/s = 11 s, rounded; D, u of NREL/TP-500-38060."""
-    return LaggedInflow(plant, 10.0, of="torque")
-
-
 def slow_pitch(plant: Plant) -> Plant:
     """A weak pitch drive of second order (1.5 rad/s, damping 0.7) behind a slow link (1 s); engineering guesses."""
     return DelayedActuator(ResonantActuator(plant, "blade_pitch", 1.5, 0.7), "blade_pitch", 1.0)
@@ -196,20 +174,18 @@ def slow_pitch(plant: Plant) -> Plant:
 
 PARTS = ("inflow", "shaft", "anemometer", "pitch drive")
 """Parts of the turbine, in the order in which they are changed: what is next to the rotor comes first."""
-SYSTEMS: Mapping[str, System] = {
-    "anemometer_low": {"anemometer": low_anemometer},
-    "anemometer_high": {"anemometer": high_anemometer},
-    "torque_loss": {"shaft": torque_loss},
-    "inflow": {"inflow": inflow},
+SYSTEMS: dict[str, System] = {
+    # Engineering guesses; anemometers on a nacelle stand in the wake of the blades.
+    "anemometer_low": {"anemometer": partial(MisreadWind, gain=0.9)},
+    "anemometer_high": {"anemometer": partial(MisreadWind, gain=1.1)},
+    # Losses in bearings and gears; engineering guess: NREL/TP-500-38060 has none there, and 5.6 % in the generator.
+    "torque_loss": {"shaft": partial(ScaledCoefficients, gain=0.92)},
+    # D/u at rated wind speed, 126 m/11.4 m/s = 11 s, rounded; D and u of NREL/TP-500-38060.
+    "inflow": {"inflow": partial(LaggedInflow, time_constant=10.0, of="torque")},
     "pitch": {"pitch drive": slow_pitch},
-    "all": {
-        "inflow": inflow,
-        "shaft": torque_loss,
-        "anemometer": low_anemometer,
-        "pitch drive": slow_pitch,
-    },
 }
 """What the real turbine has beside its twin, by the names of ``--unknown``."""
+SYSTEMS["all"] = {**SYSTEMS["inflow"], **SYSTEMS["torque_loss"], **SYSTEMS["anemometer_low"], **SYSTEMS["pitch"]}
 
 
 def require_unknown(names: Sequence[str]) -> None:
