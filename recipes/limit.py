@@ -28,7 +28,7 @@ from rt_torchrl import (
 from rt_torchrl.control.receding_horizon import BoundedDescentConfig
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.limits import (
     Contender,
     classical,

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from rt_torchrl import ClassicalController, Plant, check_options, main_of, rk4_step
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.fit.log import SensorLog, logged_states
 from rt_torchrl.runs.shipped_plants import plant_class
 from rt_torchrl.runs.tensor_file import load_tensors

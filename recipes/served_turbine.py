@@ -15,7 +15,7 @@ from wind_turbine import Config as Turbine
 from wind_turbine import plant_figures
 
 from rt_torchrl import OperationConfig, main_of
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 
 SAFE = (2e4, 20.0)
 """Torque [N m] and pitch [deg] that slow the rotor down in any wind, and do not stop it."""

@@ -23,7 +23,7 @@ from served_turbine import SAFE, server_of
 from served_turbine import Config as Served
 
 from rt_torchrl import check_options, main_of
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.runs.results_file import make_folder, write_results
 
 SEEN = 1.0

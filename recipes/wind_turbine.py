@@ -31,14 +31,12 @@ from rt_torchrl import (
     main_of,
     require_device,
 )
-from rt_torchrl.envs.wind_turbine.costs import EngineeringCost, PaperCost
+from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
 from rt_torchrl.envs.wind_turbine.disturbances import STORM, KaimalWind, RecordedWind
-from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
+from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_wind
 from rt_torchrl.envs.wind_turbine.unknown import require_unknown, unknown
-from rt_torchrl.envs.wind_turbine.wear import worn_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -208,7 +206,7 @@ class Config(RunConfig):
     def wear(self, plant: WindTurbine) -> Callable[[int], nn.Module] | None:
         if not self.model_error:
             return None
-        worn, middle = worn_table(plant.closure), self.effective().episodes // 2
+        worn, middle = PowerCoefficientTable.nrel5mw(worn=True), self.effective().episodes // 2
         return lambda episode: plant.closure if episode < middle else worn
 
 
@@ -219,7 +217,7 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 
 
 def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.wind_turbine.animation import save_animation
+    from rt_torchrl.envs.wind_turbine.figures import save_animation
 
     save_animation(snapshot, path)
 

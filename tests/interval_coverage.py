@@ -27,9 +27,8 @@ from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.neural import NeuralPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.envs.wind_turbine.models import SaintDrenan
-from rt_torchrl.envs.wind_turbine.neural import NeuralPowerCoefficient
+from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.closure_error import visited_features
 from rt_torchrl.fit.uncertainty import band, named_values

@@ -17,10 +17,8 @@ import torch
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.envs.wind_turbine.polars import Blade, Polar
-from rt_torchrl.envs.wind_turbine.power_coefficient import DATA, PowerCoefficientTable
-from rt_torchrl.envs.wind_turbine.turbsim import read_wind
-from rt_torchrl.envs.wind_turbine.wind_record import GREATEST_SPEED
+from rt_torchrl.envs.wind_turbine.rotor import DATA, PowerCoefficientTable
+from rt_torchrl.envs.wind_turbine.turbsim import GREATEST_SPEED, read_wind
 from rt_torchrl.fit.log import SensorLog, checked, read_log
 from rt_torchrl.fit.resampling import INTERVALS_PER_ROW, resample
 from rt_torchrl.runs import checkpoint
@@ -92,15 +90,6 @@ def read_table(path: Path) -> None:
     assert table(probe).isfinite().all() and table.values.max() <= 16 / 27
 
 
-def read_polar(path: Path) -> None:
-    assert all(np.isfinite(part).all() for part in Polar.from_csv(path)(np.linspace(-180.0, 180.0, 50)))
-
-
-def read_blade(path: Path) -> None:
-    blade = Blade.from_csv(path)
-    assert np.isfinite(blade.chord).all() and (np.diff(blade.r) > 0).all()
-
-
 @cache
 def weights() -> dict:
     generator = torch.Generator().manual_seed(0)
@@ -146,8 +135,6 @@ READERS = {
     "wind.hh": Reader("wind.hh", wind_text, read_wind_file),
     "wind.bts": Reader("wind.bts", wind_field, read_wind_file),
     "C_p table": Reader("table.csv", (DATA / "nrel5mw_Cp_table_rosco.csv").read_bytes, read_table),
-    "polar": Reader("polar.csv", (DATA / "nrel5mw_polar_DU21_A17.csv").read_bytes, read_polar),
-    "blade": Reader("blade.csv", (DATA / "nrel5mw_blade_17nodes.csv").read_bytes, read_blade),
     "weights.pt": Reader(
         "weights.pt", lambda: written("weights.pt", lambda p: save_tensors(p, weights())), read_weights
     ),

@@ -27,8 +27,8 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.envs.wind_turbine.power_coefficient import PowerCoefficientTable
-from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
+from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.fit.log import Column, SensorLog
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.action_limits import ActionLimits

@@ -12,7 +12,7 @@ from PIL import Image
 from rt_torchrl.envs.cryogenic_tank import animation as tank
 from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.wind_turbine import animation as turbine
+from rt_torchrl.envs.wind_turbine import figures as turbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures.animation import RATE, Trace, save_scene, shown_samples
 
@@ -39,7 +39,7 @@ def test_it_has_a_frame_for_each_interval(scene, snapshot, tmp_path, request):
 
 
 def test_the_rotor_shows_wind_and_pitch_and_turns_with_its_speed(blowing):
-    scene, record = turbine._Scene(blowing), blowing.record
+    scene, record = turbine.TurbineScene(blowing), blowing.record
     angles = []
     for k in (7, 8):
         scene.show(k)
@@ -77,4 +77,4 @@ def test_a_trace_keeps_its_axes_and_another_format_is_refused(blowing, tmp_path)
     trace.show(0)
     assert ax.get_ylim() == limits and trace.moving[0].get_ydata().tolist() == [0.0]
     with pytest.raises(ValueError, match=r"must end in '\.gif'"):
-        save_scene(turbine._Scene(blowing), 20, tmp_path / "last.mp4")
+        save_scene(turbine.TurbineScene(blowing), 20, tmp_path / "last.mp4")

@@ -8,9 +8,8 @@ import torch
 
 from rt_torchrl import SaturatedMLP
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.wind_turbine.costs import EngineeringCost
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
 from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
 from rt_torchrl.plants.policies import SaturatedAffine
 

@@ -12,8 +12,7 @@ from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
 from rt_torchrl.envs.flapping_wing.costs import TrackingCost
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-from rt_torchrl.envs.wind_turbine.costs import EngineeringCost, PaperCost
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 

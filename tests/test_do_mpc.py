@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
-from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
 HORIZON = 20.0

@@ -11,7 +11,7 @@ from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.linalg import expm
 
 from rt_torchrl import export_controller, shipped_plants
-from rt_torchrl.envs.wind_turbine.gain_scheduled import GainScheduled
+from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP

@@ -7,7 +7,7 @@ import torch
 from c_build import needs_compiler
 from test_fmu import environment
 
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.export.fmu import export_twin_fmu
 from rt_torchrl.runs.command_line import from_command_line, load_recipe

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.fit.least_squares import EstimationConfig
 
 pd = pytest.importorskip("pandas")

@@ -8,7 +8,7 @@ import torch
 from handwritten_study import RECIPES
 
 from rt_torchrl.envs.cryogenic_tank.valves import PIValve
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.runs.shipped_plants import shipped_plants
 from rt_torchrl.study import yardsticks

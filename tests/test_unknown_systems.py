@@ -15,10 +15,8 @@ from rt_torchrl.envs.cryogenic_tank.two_zones import TwoZones
 from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import unknown as turbines
-from rt_torchrl.envs.wind_turbine.lagged_power import LaggedPower
-from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
-from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow, MisreadWind
 from rt_torchrl.plants.actuators import LaggedActuator, ScaledActuator
 from rt_torchrl.plants.coefficients import LaggedCoefficients, ScaledCoefficients
 from rt_torchrl.plants.sensors import UnreadInput
@@ -91,7 +89,7 @@ def test_the_lift_of_fast_blade_elements_is_that_of_the_drone():
 
 def test_the_torque_of_a_rotor_that_keeps_its_speed_follows_exponentially():
     base = WindTurbine(inertia=1e15)
-    plant = LaggedTorque(base, 10.0)
+    plant = LaggedInflow(base, 10.0, of="torque")
     state = plant.draw_initial_state(1, torch.Generator().manual_seed(0))
     n, wind = 60, 13.0
     exogenous = torch.full((1, n, 1), wind, dtype=torch.float64)
@@ -105,8 +103,8 @@ def test_the_torque_of_a_rotor_that_keeps_its_speed_follows_exponentially():
 
 def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
     base = WindTurbine(inertia=1e15, observe=("scheduled",))
-    plant = LaggedPower(base, 10.0)
-    check_plant(LaggedPower(WindTurbine(horizon=20.0), 10.0), steps=5, traced=False, trained=False)
+    plant = LaggedInflow(base, 10.0)
+    check_plant(LaggedInflow(WindTurbine(horizon=20.0), 10.0), steps=5, traced=False, trained=False)
     read, n, wind = base.draw_initial_state(1, torch.Generator().manual_seed(0)), 60, 13.0
     state, exogenous = plant.at_rest(read), torch.full((1, n, 1), wind, dtype=torch.float64)
     power = 1e6 * flown(plant, state, exogenous, read[:, None, 4:6].expand(1, n, 2))[0, :, -1]
@@ -119,7 +117,7 @@ def test_the_power_of_a_rotor_that_keeps_its_speed_follows_exponentially():
 
 def test_a_fast_lag_of_the_power_is_none():
     base = WindTurbine()
-    plant = LaggedPower(base, 0.2)
+    plant = LaggedInflow(base, 0.2)
     generator = torch.Generator().manual_seed(0)
     read, exogenous = base.draw_initial_state(2, generator), torch.full((2, 40, 1), 9.0, dtype=torch.float64)
     command = read[:, None, 4:6].expand(2, 40, 2)
@@ -129,7 +127,7 @@ def test_a_fast_lag_of_the_power_is_none():
 
 def test_a_rotor_turns_in_the_wind_and_its_filter_in_what_the_anemometer_reads():
     base = WindTurbine()
-    plant = MisreadWind(base, 0.9, cutoff=2.0 * math.pi * base.filter_frequency)
+    plant = MisreadWind(base, 0.9)
     generators = [torch.Generator().manual_seed(2) for _ in range(2)]
     state, true = plant.draw_initial_state(2, generators[0]), base.draw_initial_state(2, generators[1])
     read, wind = plant.draw_exogenous(2, generators[0])[:, :40], base.draw_exogenous(2, generators[1])[:, :40]
@@ -170,8 +168,8 @@ def test_the_surface_of_a_tank_follows_the_stirred_pressure_faster_and_then_mixe
         (lambda: ScaledCoefficients(LinearQuadratic(), 0.0), "gain=0.0 of the coefficients"),
         (lambda: ScaledCoefficients(LaggedActuator(LinearQuadratic(), "force", 1.0), 0.5), "closure of the plant"),
         (lambda: LaggedCoefficients(LinearQuadratic(), 1.0, (0.0,), elements=(2,)), "each of 2 places"),
-        (lambda: LaggedTorque(WindTurbine(), 0.0), "time_constant=0.0 s of the torque"),
-        (lambda: MisreadWind(WindTurbine(), 0.0, cutoff=0.25), "gain=0.0 of the anemometer"),
+        (lambda: LaggedInflow(WindTurbine(), 0.0, of="torque"), "time_constant=0.0 s of the torque"),
+        (lambda: MisreadWind(WindTurbine(), 0.0), "gain=0.0 of the anemometer"),
         (lambda: TwoZones(CryogenicTank(), 0.5, 1.0), "ratio=0.5 of the zones must be at least 1"),
         (lambda: turbines.unknown(WindTurbine(), ("ptich",)), "ptich does not exist; choose anemometer_low"),
         (lambda: tanks.unknown(CryogenicTank(), ("bias_5", "drift_10")), "bias_5 and drift_10 both change the press"),

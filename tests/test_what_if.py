@@ -7,7 +7,7 @@ import torch
 from test_documentation import leave_finished_run
 
 from rt_torchrl import load_run
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 
 
 @pytest.fixture(scope="module")

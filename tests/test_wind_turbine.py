@@ -12,10 +12,10 @@ from scipy.optimize import brentq
 from torch import nn
 
 from rt_torchrl.envs.wind_turbine import plant as module
-from rt_torchrl.envs.wind_turbine.costs import PaperCost
+from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
-from rt_torchrl.envs.wind_turbine.models import SaintDrenan
-from rt_torchrl.envs.wind_turbine.plant import HUB_INERTIA, WindTurbine
+from rt_torchrl.envs.wind_turbine.plant import HUB_INERTIA, PaperCost, WindTurbine
+from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
 from rt_torchrl.plants.policies import SmoothClip
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -257,6 +257,19 @@ def test_exponent_stays_above_one_whatever_the_weight():
         SaintDrenan(torch.ones(11, dtype=torch.float64))
     with pytest.raises(ValueError, match="set 'Nobody2000' of coefficients does not exist; choose one of Slootweg2003"):
         SaintDrenan.from_set("Nobody2000")
+
+
+def test_a_rotor_given_by_its_table_is_judged_by_its_own_optimum():
+    """A rotor with 3 % less power, whose optimum lies at 1.25 times the tip-speed ratio."""
+    nominal = WindTurbine()
+    table = nominal.closure
+    own = PowerCoefficientTable(1.25 * table.tip_speed_ratio.numpy(), table.pitch.numpy(), 0.97 * table.values.numpy())
+    plant = WindTurbine(closure=own)
+    assert plant.best_tip_speed_ratio == pytest.approx(1.25 * nominal.best_tip_speed_ratio, rel=1e-6)
+    assert plant.optimal_gain == pytest.approx(nominal.optimal_gain * 0.97 / 1.25**3, rel=1e-6)
+    # A law that has no optimum to look up is judged by the NREL rotor's.
+    law = WindTurbine(closure=SaintDrenan.from_set("Heier2014"))
+    assert (law.optimal_gain, law.best_tip_speed_ratio) == (nominal.optimal_gain, nominal.best_tip_speed_ratio)
 
 
 @pytest.mark.parametrize("change", [{"inertia": 0.0}, {"rate_limits": (15e3, -1.0)}, {"observe": ("rotor",)}])

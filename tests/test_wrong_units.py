@@ -15,7 +15,7 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.faulty_system import FaultySystem
 from rt_torchrl.systems.operating_limits import OperatingLimits

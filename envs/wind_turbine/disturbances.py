@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
+from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.sampling import require_request
 
-CUT_IN_SPEED = 3.0
+CUT_IN_WIND = 3.0
 """Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""
 STORM = 120.0
 """Wind speed above all that has been measured at the height of a rotor [m/s]."""
@@ -67,21 +67,13 @@ class KaimalWind:
     mean: float = 11.0
     intensity: float = 0.16
     length_scale: float = 340.2
-    floor: float = CUT_IN_SPEED
+    floor: float = CUT_IN_WIND
     scale_to_target: bool = True
 
     def __post_init__(self) -> None:
-        for argument, value, unit in (("mean", self.mean, "m/s"), ("length_scale", self.length_scale, "m")):
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{argument}={value} {unit} of KaimalWind must be positive and finite.")
-        if not (math.isfinite(self.intensity) and self.intensity >= 0):
-            raise ValueError(
-                f"intensity={self.intensity} of KaimalWind must be a fraction such as 0.16, zero or above."
-            )
-        of = "KaimalWind"
-        require_range("mean", self.mean, 0.0, STORM, unit="m/s", of=of)
-        require_range("intensity", self.intensity, 0.0, 1.0, unit="-", of=of)
-        require_range("length_scale", self.length_scale, 1.0, 1e4, unit="m", of=of)
+        require_range("mean", self.mean, 1e-3, STORM, unit="m/s", of="KaimalWind")
+        require_range("intensity", self.intensity, 0.0, 1.0, unit="-", of="KaimalWind")
+        require_range("length_scale", self.length_scale, 1.0, 1e4, unit="m", of="KaimalWind")
         if not self.floor < self.mean:
             raise ValueError(
                 f"floor={self.floor} m/s of KaimalWind must be below the mean wind {self.mean} m/s; "
@@ -104,7 +96,7 @@ class KaimalWind:
     def draw(
         self, batch: int, n_steps: int, dt: float, generator: torch.Generator
     ) -> Float[Tensor, "{batch} {n_steps}"]:
-        """Longitudinal wind speed u [m/s] of ``batch`` independent episodes, in float64 on the generator's device.
+        """Wind speed u [m/s] of independent episodes, in float64 on the generator's device, by an inverse real FFT.
 
         Args:
             batch: number of episodes.
@@ -116,19 +108,10 @@ class KaimalWind:
             ValueError: if ``batch``, ``n_steps`` or ``dt`` is out of its range.
         """
         require_request(batch, n_steps, dt, least_steps=2)
-        # The fluctuation has unit variance, so that a wind without turbulence is not scaled by 0/0.
-        fluctuation = self._draw_unit_fluctuation(batch, n_steps, dt, generator)
-        if self.scale_to_target:
-            fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
-        return (self.mean + self.sigma * fluctuation).clamp_min(self.floor)
-
-    def _draw_unit_fluctuation(
-        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
-    ) -> Float[Tensor, "{batch} {n_steps}"]:
-        """The sum of cosines for σ = 1, by an inverse real FFT."""
         like: dict[str, Any] = {"dtype": torch.float64, "device": generator.device}
         f = torch.arange(1, n_steps // 2 + 1, **like) / (n_steps * dt)
         phase = 2.0 * math.pi * torch.rand(batch, len(f), generator=generator, **like)
+        # The fluctuation has unit variance, so that a wind without turbulence is not scaled by 0/0.
         amplitude = torch.sqrt(2.0 * self._unit_spectrum(f) / (n_steps * dt))
         coefficients = torch.polar((0.5 * n_steps * amplitude).expand_as(phase), phase)
         if n_steps % 2 == 0:
@@ -136,7 +119,10 @@ class KaimalWind:
             # part. The samples of a·cos(πk + φ) = a·cos φ·(−1)^k need n·a·cos φ in that bin. Without this line it would
             # carry a quarter of its power.
             coefficients[:, -1] = 2.0 * coefficients[:, -1].real
-        return torch.fft.irfft(torch.nn.functional.pad(coefficients, (1, 0)), n=n_steps)
+        fluctuation = torch.fft.irfft(torch.nn.functional.pad(coefficients, (1, 0)), n=n_steps)
+        if self.scale_to_target:
+            fluctuation = fluctuation / fluctuation.std(dim=-1, correction=0, keepdim=True)
+        return (self.mean + self.sigma * fluctuation).clamp_min(self.floor)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +134,7 @@ class RecordedWind:
     then held. Content above the new Nyquist frequency is folded, not filtered out.
 
     Args:
-        records: at least one :class:`~rt_torchrl.envs.wind_turbine.wind_record.WindRecord`.
+        records: at least one :class:`~rt_torchrl.envs.wind_turbine.turbsim.WindRecord`.
         floor: least wind speed [m/s], to which slower wind is raised; ``-math.inf`` means no floor.
 
     Raises:
@@ -156,7 +142,7 @@ class RecordedWind:
     """
 
     records: Sequence[WindRecord]
-    floor: float = CUT_IN_SPEED
+    floor: float = CUT_IN_WIND
 
     def __post_init__(self) -> None:
         if len(self.records) == 0:

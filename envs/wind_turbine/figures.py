@@ -1,21 +1,24 @@
-"""Figures of the wind turbine: its set-points, its power coefficient, the agreement of its twin."""
+"""Figures of the wind turbine: its set-points, its power coefficient, the agreement of its twin, and an animation."""
 
-from typing import Any, NamedTuple, cast
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
-from torch import Tensor, nn
+from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.figures.animation import Trace, TracedScene, save_scene, shown_samples
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
     FILTERED,
     LIMITS,
     REAL,
+    REFERENCE,
     REFERENCE_LINE,
+    SAMPLES,
     TWIN,
     array,
     caption,
@@ -28,12 +31,13 @@ from rt_torchrl.figures.style import (
     time_axis,
 )
 
-LEAST_RATIO = 2.0
-"""Least tip-speed ratio at which C_p is drawn."""
 CONTOURS = (0.1, 0.2, 0.3, 0.4, 0.45)
 GREATEST_SHOWN = 0.1
 """Difference of C_p at which its colours end."""
-VISITED = "#D55E00"
+WIND_LABEL = r"wind speed $u$ [m/s]"
+SPEED_LABEL = r"generator speed $\omega_g$ [rad/s]"
+PITCH_LABEL = r"blade pitch $\beta$ [deg]"
+RATIO_LABEL = r"tip-speed ratio $\lambda$ [-]"
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -69,13 +73,8 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     draw(pitch, record.actions[:, 1], "applied", drawstyle="steps-post")
     limits(torque, plant.actions[0], 1e-3)
     limits(pitch, plant.actions[1])
-    names = (
-        r"wind speed $u$ [m/s]",
-        r"generator speed $\omega_g$ [rad/s]",
-        r"generator power $\tau_g\omega_g$ [MW]",
-        r"generator torque $\tau_g$ [kN m]",
-        r"blade pitch $\beta$ [deg]",
-    )
+    power_label, torque_label = r"generator power $\tau_g\omega_g$ [MW]", r"generator torque $\tau_g$ [kN m]"
+    names = (WIND_LABEL, SPEED_LABEL, power_label, torque_label, PITCH_LABEL)
     for ax, name in zip(axes.flat, names, strict=True):
         caption(ax, name)
         legend_above(ax)
@@ -84,35 +83,42 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     return figure
 
 
+@torch.no_grad()
 def power_coefficient(snapshot: Snapshot) -> Figure:
     """C_p over λ and β: the true table, the learned law beside it, and their difference (paper, fig. 14b).
 
     Dots are operating points of the last episode, because a twin can only know what was visited. The colours of the
     difference end at ``GREATEST_SHOWN``, which they reach far from the dots.
     """
-    visited, grid = _Visited.of(snapshot), _Grid.of(snapshot)
-    true, learned, initial = visited.C_p.values()
-    rms, rms_initial = (np.sqrt(np.mean((C_p - true) ** 2)) for C_p in (learned, initial))
+    record = snapshot.record
+    lam, beta = record.states[:-1, 0] * WindTurbine.radius / record.exogenous[:, 0], record.actions[:, 1]
+    grid: dict[str, Any] = {"dtype": lam.dtype, "device": lam.device}
+    lams = torch.linspace(2.0, max(13.0, lam.max().item()), 89, **grid)
+    betas = torch.linspace(0.0, max(20.0, beta.max().item()), 81, **grid)
+    everywhere, visited = torch.stack(torch.meshgrid(lams, betas, indexing="xy"), -1), torch.stack([lam, beta], -1)
+    C_p = {name: array(closure(everywhere).squeeze(-1)) for name, closure in closures(snapshot).items()}
+    true, *others = (closure(visited).squeeze(-1) for closure in closures(snapshot).values())
+    rms, rms_initial = ((C_p - true).square().mean().sqrt().item() for C_p in others)
     title = f"Power coefficient, RMS error where visited: {rms:.2g}, initial twin {rms_initial:.2g}"
     figure, axes = panels(1, 3, title=title, size=(12.0, 4.8), sharex=True, sharey=True)
     table, law, error = axes.flat
     for ax, name in ((table, "true"), (law, "twin")):
-        drawn = grid.draw(ax, grid.C_p[name], cmap="viridis", vmin=0.0, vmax=0.5)
-        lines = ax.contour(grid.lam, grid.beta, grid.C_p[name], CONTOURS, colors="white", linewidths=0.8)
+        drawn = ax.pcolormesh(array(lams), array(betas), C_p[name], shading="gouraud", vmin=0.0, vmax=0.5)
+        lines = ax.contour(array(lams), array(betas), C_p[name], CONTOURS, colors="white", linewidths=0.8)
         ax.clabel(lines, fontsize=8)
     caption(table, "true $C_p$ [-]" if snapshot.known else "$C_p$ of the plant's own table [-]")
     caption(law, "$C_p$ of the twin [-]")
     figure.colorbar(drawn, ax=[table, law], extend="both", pad=0.01)
-    ends = {"cmap": "RdBu", "vmin": -GREATEST_SHOWN, "vmax": GREATEST_SHOWN}
-    drawn = grid.draw(error, grid.C_p["twin"] - grid.C_p["true"], **ends)
+    ends: dict[str, Any] = {"cmap": "RdBu", "vmin": -GREATEST_SHOWN, "vmax": GREATEST_SHOWN}
+    drawn = error.pcolormesh(array(lams), array(betas), C_p["twin"] - C_p["true"], shading="gouraud", **ends)
     figure.colorbar(drawn, ax=error, extend="both", pad=0.02)
     caption(error, "twin less true [-]")
     for ax in axes.flat:
-        ax.plot(visited.lam, visited.beta, ".", color=VISITED, markersize=2.5, alpha=0.6, label="visited")
-        ax.set_xlabel(r"tip-speed ratio $\lambda$ [-]")
-    table.set_ylabel(r"blade pitch $\beta$ [deg]")
-    table.set_xlim(grid.lam[0], grid.lam[-1])
-    table.set_ylim(grid.beta[0], grid.beta[-1])
+        ax.plot(array(lam), array(beta), ".", color=TWIN, markersize=2.5, alpha=0.6, label="visited")
+        ax.set_xlabel(RATIO_LABEL)
+    table.set_ylabel(PITCH_LABEL)
+    table.set_xlim(lams[0].item(), lams[-1].item())
+    table.set_ylim(betas[0].item(), betas[-1].item())
     legend_below(figure, [table])
     return figure
 
@@ -133,45 +139,87 @@ def scatter(snapshot: Snapshot) -> Figure:
     return figure
 
 
-class _Visited(NamedTuple):
-    """Operating points of the last episode, and their C_p under each closure."""
-
-    lam: np.ndarray
-    beta: np.ndarray
-    wind: np.ndarray
-    C_p: dict[str, np.ndarray]
-
-    @classmethod
-    def of(cls, snapshot: Snapshot) -> "_Visited":
-        record = snapshot.record
-        wind, beta = record.exogenous[:, 0], record.actions[:, 1]
-        lam = record.states[:-1, 0] * WindTurbine.radius / wind
-        C_p = {name: _evaluate(closure, lam, beta) for name, closure in closures(snapshot).items()}
-        return cls(array(lam), array(beta), array(wind), C_p)
+TURN = 25.0
+"""Angle by which the rotor turns between two frames at rated speed [deg]; its true angle would seem to jump."""
+HUB, TIP = 90.0, 63.0
+"""Height of the hub and radius of the rotor [m]."""
+CHORD = 6.0
+"""Width of a drawn blade at zero pitch [m]; it shrinks by the cosine of the pitch."""
+ARROW = 3.0
+"""Length of the wind's arrow for each m/s [m]."""
 
 
-class _Grid(NamedTuple):
-    """C_p under each closure over λ and β, ``n_beta n_lambda``, in a range that holds all visited points."""
+def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
+    """Write the last real episode as a GIF of five seconds.
 
-    lam: np.ndarray
-    beta: np.ndarray
-    C_p: dict[str, np.ndarray]
+    The rotor is seen from the front. Its blades turn as much slower than the real ones as the episode is quicker, and
+    narrow with the pitch; the arrow is the wind. Beside it stand wind, generator speed, power and pitch up to the
+    present, with the references that the paper's cost follows.
 
-    @classmethod
-    def of(cls, snapshot: Snapshot) -> "_Grid":
-        visited = _Visited.of(snapshot)
-        like: dict[str, Any] = {"dtype": torch.float64, "device": snapshot.record.states.device}
-        lam = torch.linspace(LEAST_RATIO, max(13.0, visited.lam.max()), 89, **like)
-        beta = torch.linspace(0.0, max(20.0, visited.beta.max()), 81, **like)
-        pitch, ratio = torch.meshgrid(beta, lam, indexing="ij")
-        C_p = {name: _evaluate(closure, ratio, pitch) for name, closure in closures(snapshot).items()}
-        return cls(array(lam), array(beta), C_p)
+    Args:
+        snapshot: snapshot with the episode.
+        path: path of the file, which ends in ``.gif``.
 
-    def draw(self, ax: Axes, values: np.ndarray, **colours: Any) -> QuadMesh:
-        """Values over the grid as colours, which end where ``colours`` says."""
-        return ax.pcolormesh(self.lam, self.beta, values, shading="gouraud", **colours)
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: if the file has another suffix.
+    """
+    return save_scene(TurbineScene(snapshot), len(snapshot.record.actions), path)
 
 
-@torch.no_grad()
-def _evaluate(closure: nn.Module, lam: Tensor, beta: Tensor) -> np.ndarray:
-    return array(closure(torch.stack([lam, beta], -1)).squeeze(-1))
+class TurbineScene(TracedScene):
+    """The picture at the start of any interval of the record.
+
+    Args:
+        snapshot: snapshot with the episode.
+    """
+
+    @torch.no_grad()
+    def __init__(self, snapshot: Snapshot):
+        plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
+        state = record.states[:-1]
+        super().__init__(snapshot, 4, title="Wind turbine", size=(9.0, 5.6), width_ratios=(1.15, 1.0))
+        self.wind, self.pitch = array(record.exogenous[:, 0]), array(record.actions[:, 1])
+        # The angle of a frame is the sum of what the frames before it have turned.
+        shown = shown_samples(len(state))
+        turned = np.cumsum(TURN * array(state[:, 0])[shown] / plant.rated_rotor_speed)
+        self.angle = dict(zip(shown, np.radians(turned), strict=True))
+        self._draw_tower()
+        omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
+        speed_wanted, power_wanted = plant.reference_speed(state[:, 2]), 1e-6 * plant.reference_power(omega_g)
+        wind, rotor, generator, pitch = self.beside
+        self.traces = [
+            Trace(wind, self.time, self.wind, WIND_LABEL, style={"linewidth": 0.8, "color": SAMPLES}),
+            Trace(rotor, self.time, array(omega_g), SPEED_LABEL, setpoint=array(speed_wanted)),
+            Trace(generator, self.time, array(power), "generator power [MW]", setpoint=array(power_wanted)),
+            Trace(pitch, self.time, self.pitch, PITCH_LABEL),
+        ]
+
+    def _draw_tower(self) -> None:
+        ax = self.ax
+        ax.set(xlim=(-95.0, 95.0), ylim=(-5.0, 165.0), aspect="equal")
+        ax.axis("off")
+        ax.axhline(0.0, color="0.6", linewidth=1.0)
+        ax.fill([-3.0, -2.0, 2.0, 3.0], [0.0, HUB, HUB, 0.0], color="0.75")
+        self.blades = [ax.fill([0.0], [0.0], color=REAL)[0] for _ in range(3)]
+        (self.hub,) = ax.plot([0.0], [HUB], "o", color=REFERENCE, markersize=7)
+        units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+        self.arrow = ax.quiver([-90.0], [150.0], [0.0], [0.0], color=SAMPLES, width=0.012, **units)
+        self.note = ax.text(-90.0, 156.0, "", fontsize=9)
+        self.own += [*self.blades, self.hub, self.arrow, self.note]
+
+    def show(self, k: int) -> None:
+        """Move everything to sample ``k``."""
+        width = 0.5 * CHORD * np.cos(np.radians(self.pitch[k]))
+        outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
+        for number, blade in enumerate(self.blades):
+            angle = self.angle[k] + 2.0 * np.pi * number / 3.0
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            blade.set_xy(outline @ turn + [0.0, HUB])
+        self.arrow.set_UVC([ARROW * self.wind[k]], [0.0])
+        self.note.set_text(f"wind {self.wind[k]:.1f} m/s")
+        for trace in self.traces:
+            trace.show(k)
+        self.caption.show(f"time {self.time[k]:.0f} {self.unit}", f"pitch {self.pitch[k]:.1f} deg")

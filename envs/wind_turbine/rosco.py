@@ -27,6 +27,9 @@ from rt_torchrl.systems.reading import Reading
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
 from rt_torchrl.trajectories.trajectory import Trajectory
 
+Report = Mapping[str, Any]
+"""What ROSCO's simulator tells its controller at a step."""
+Decide = Callable[[Tensor, float, Report], Tensor]
 STEP = 0.1
 """Time step of ROSCO's simulator, which integrates the rotor by Euler's method [s]."""
 
@@ -87,22 +90,42 @@ def silenced() -> Iterator[None]:
             os.close(kept)
 
 
-class Instruments:
-    """The measured state of the plant: reported rotor speed and actuators, and filters that run along.
+class Answer:
+    """Takes the place of the compiled controller's interface in ROSCO's simulator.
+
+    It holds the measured state of the plant: the reported rotor speed, the actuators, and filters that run along.
 
     Args:
-        plant: plant with the filters.
-        state: state at the start of the episode, from which filters and actuators begin.
+        plant: the twin's physics, with signals, filters and actuators.
+        start: state at the start of the episode, from which filters and actuators begin.
+        wind: wind speeds of all control intervals [m/s].
+        decide: function that returns the action (torque [N m], pitch [deg]) for a state, the wind of the interval to
+            come, and the simulator's report. It is called every ``every`` steps; in between the action is held.
+        every: number of steps of the simulator between two decisions.
     """
 
-    def __init__(self, plant: WindTurbine, state: Tensor):
-        self.plant, self.state = plant, state.clone()
-        self._filters = [k for k, s in enumerate(plant.states) if s.name not in ("rotor_speed", *MEASURED)]
+    def __init__(self, plant: WindTurbine, start: Tensor, wind: np.ndarray, decide: Decide, every: int):
+        self.plant, self.state, self._wind = plant, start.clone(), wind
+        self._decide, self._every, self._step = decide, every, 0
+        computed = ("generator_torque", "blade_pitch", "rotor_speed")
+        self._filters = [k for k, signal in enumerate(plant.states) if signal.name not in computed]
 
-    def start(self, rotor_speed: float) -> None:
-        self.state[0] = rotor_speed
+    def call_controller(self, report: Report) -> tuple[float, float, float]:
+        """Torque [N m], pitch [rad] and yaw rate [rad/s], as ROSCO's interface returns them."""
+        speed = float(report["rot_speed"])
+        if self._step == 0:
+            self.state[0] = speed
+        else:
+            self._follow(speed, float(report["ws"]))
+        if self._step % self._every == 0:
+            k = min(self._step // self._every, len(self._wind) - 1)
+            self.state = self.plant.latch(self.state, self._decide(self.state, float(self._wind[k]), report))
+        self._step += 1
+        torque, pitch = self.state[4:6].tolist()
+        share = self.plant.cut_in(torch.tensor(self.plant.gear_ratio * speed, dtype=torch.float64)).item()
+        return torque * share, math.radians(pitch), 0.0
 
-    def advance(self, rotor_speed: float, wind: float) -> None:
+    def _follow(self, rotor_speed: float, wind: float) -> None:
         """Take the filters over one step of the simulator by Heun's method, under the wind that acted in it."""
         before, after = self.state, self.state.clone()
         after[0] = rotor_speed
@@ -115,53 +138,6 @@ class Instruments:
         exogenous = state.new_tensor([wind])
         rate = self.plant.vector_field(state.new_zeros(()), state, state[4:6], exogenous, self.plant.closure)
         return rate[self._filters]
-
-    def latch(self, applied: Tensor) -> None:
-        """Remember the action that the actuators receive."""
-        self.state = self.plant.latch(self.state, applied)
-
-
-MEASURED = ("generator_torque", "blade_pitch")
-"""States of the plant that belong to the actuators."""
-
-
-class Answer:
-    """Takes the place of the compiled controller's interface in ROSCO's simulator.
-
-    Args:
-        plant: the twin's physics, with signals and actuators.
-        start: state at the start of the episode.
-        wind: wind speeds of all control intervals [m/s].
-        decide: function that returns the action (torque [N m], pitch [deg]) for a state, the wind of the interval to
-            come, and the simulator's report. It is called every ``every`` steps; in between the action is held.
-        every: number of steps of the simulator between two decisions.
-    """
-
-    def __init__(
-        self,
-        plant: WindTurbine,
-        start: Tensor,
-        wind: np.ndarray,
-        decide: Callable[[Tensor, float, Mapping[str, Any]], Tensor],
-        every: int,
-    ):
-        self.plant, self._instruments, self._wind = plant, Instruments(plant, start), wind
-        self._decide, self._every, self._step = decide, every, 0
-
-    def call_controller(self, told: Mapping[str, Any]) -> tuple[float, float, float]:
-        """Torque [N m], pitch [rad] and yaw rate [rad/s], as ROSCO's interface returns them."""
-        speed = float(told["rot_speed"])
-        if self._step == 0:
-            self._instruments.start(speed)
-        else:
-            self._instruments.advance(speed, float(told["ws"]))
-        if self._step % self._every == 0:
-            k = min(self._step // self._every, len(self._wind) - 1)
-            self._instruments.latch(self._decide(self._instruments.state, float(self._wind[k]), told))
-        self._step += 1
-        torque, pitch = self._instruments.state[4:6].tolist()
-        share = self.plant.cut_in(torch.tensor(self.plant.gear_ratio * speed, dtype=torch.float64)).item()
-        return torque * share, math.radians(pitch), 0.0
 
     def kill_discon(self) -> None:
         """Do nothing, because there is no library to unload."""
@@ -220,7 +196,7 @@ def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | s
     machine = copy.deepcopy(plant).cpu()  # the simulator's side, wherever the twin's is
 
     def run(seed: int, controller: Controller) -> None:
-        def decide(state: Tensor, wind: float, told: Mapping[str, Any]) -> Tensor:
+        def decide(state: Tensor, wind: float, report: Report) -> Tensor:
             command = controller({"state": state.numpy(), "wind": [wind]})
             return machine.actuate(state, torch.from_numpy(command))
 
@@ -242,9 +218,9 @@ class RoscoController(RealController):
 
     def fly_real(self, count: int, *, seed: int) -> Trajectory:
         """The episodes that :func:`rosco_turbine` runs from the same seed."""
-        found = [self._episode(episode_seed(seed, number)) for number in range(count)]
+        episodes = [self._episode(episode_seed(seed, number)) for number in range(count)]
         device = self.plant.greatest_increment.device
-        states, applied, wind = (torch.stack(part).to(device) for part in zip(*found, strict=True))
+        states, applied, wind = (torch.stack(part).to(device) for part in zip(*episodes, strict=True))
         return Trajectory(states, applied, wind.unsqueeze(-1))
 
     def _episode(self, seed: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -255,8 +231,8 @@ class RoscoController(RealController):
         with tempfile.TemporaryDirectory() as folder:
             interface = controller_interface(Path(folder))
 
-            def decide(state: Tensor, wind: float, told: Mapping[str, Any]) -> Tensor:
-                torque, pitch, _ = interface.call_controller(told)
+            def decide(state: Tensor, wind: float, report: Report) -> Tensor:
+                torque, pitch, _ = interface.call_controller(report)
                 states.append(state)
                 applied.append(torch.tensor([torque, math.degrees(pitch)], dtype=torch.float64))
                 winds.append(wind)

@@ -1,15 +1,110 @@
-"""Readers of TurbSim's wind files: hub-height text (``.hh``) and binary full field (``.bts``)."""
+"""Wind at the hub over time, and readers of TurbSim's files: hub-height text (``.hh``) and full fields (``.bts``)."""
 
 import math
 import os
+import re
 import struct
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 
 from rt_torchrl.bounded_file import require_bounded
-from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
+from rt_torchrl.options import array_of
+
+PRINTED_TIME_RESOLUTION = 1e-3
+"""Resolution of the times in a ``.hh`` file [s]; TurbSim prints them as F8.3."""
+GREATEST_SPEED = 200.0
+"""Speed above which a record cannot be of wind [m/s]; tornadoes, the strongest winds on Earth, reach about 140 m/s."""
+COLUMNS = "Time HorSpd WndDir VerSpd HorShr VerShr LnVShr GstSpd"
+
+
+@dataclass(frozen=True, eq=False)
+class WindRecord:
+    """Longitudinal wind at the hub at evenly spaced times; the arrays are copied and made read-only.
+
+    Args:
+        time: sample times [s], a vector of n, which increase by equal steps to within the 1 ms that TurbSim prints.
+        speed: longitudinal wind speed u [m/s], a vector of n, from 0 to ``GREATEST_SPEED``.
+        source: origin of the record, such as the path of the file; every error names it.
+
+    Raises:
+        ValueError: if there are fewer than two samples, the lengths differ, a value is NaN or infinite, a time does not
+            increase, samples are missing, steps are unequal, or a speed is out of its range.
+    """
+
+    time: np.ndarray
+    speed: np.ndarray
+    source: str
+
+    def __post_init__(self) -> None:
+        for field in ("time", "speed"):
+            array = array_of(f"{self.source}: {field}", getattr(self, field))
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
+        if self.time.ndim != 1 or self.time.shape != self.speed.shape:
+            raise ValueError(
+                f"{self.source}: time has shape {self.time.shape} and speed {self.speed.shape}; "
+                "pass two vectors of equal length."
+            )
+        if len(self.time) < 2:
+            raise ValueError(
+                f"{self.source}: holds {len(self.time)} wind samples, at least 2 are needed; "
+                "check that the file was written to its end."
+            )
+        self._check_speed()
+        self._check_time()
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def step(self) -> float:
+        """Mean sampling interval [s], which averages out the rounding of printed times."""
+        return self.duration / (len(self.time) - 1)
+
+    def _check_speed(self) -> None:
+        if not np.isfinite(self.time).all():
+            at = int(np.argmin(np.isfinite(self.time)))
+            raise ValueError(
+                f"{self.source}: time of sample {at} is {self.time[at]}; all must be finite. Write the file again."
+            )
+        gap = "must be finite. Fill the gap by interpolation or cut the record there."
+        sign = "must not be negative. Check its sign and the wind direction, which is 0 deg along the rotor axis."
+        unit = f"must not exceed {GREATEST_SPEED:g} m/s. Check its unit, and that the file is whole."
+        faults = (~np.isfinite(self.speed), gap), (self.speed < 0, sign), (self.speed > GREATEST_SPEED, unit)
+        for bad, remedy in faults:
+            if bad.any():
+                at = int(np.argmax(bad))
+                where, speed = self.time[at], self.speed[at]
+                raise ValueError(f"{self.source}: wind speed at t = {where:g} s is {speed:g} m/s; it {remedy}")
+
+    def _check_time(self) -> None:
+        steps = np.diff(self.time)
+        if (steps <= 0).any():
+            at = int(np.argmax(steps <= 0))
+            raise ValueError(
+                f"{self.source}: time goes from {self.time[at]:g} s to {self.time[at + 1]:g} s; it must "
+                "increase. Sort the samples and drop repeated ones."
+            )
+        step = float(np.median(steps))
+        # Two times rounded to 1 ms give a step that is off by up to 1 ms; below 2 ms this would hide a missing sample.
+        uneven = np.abs(steps - step) > min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
+        if not uneven.any():
+            return
+        where, odd = self.time[np.argmax(uneven)], steps[np.argmax(uneven)]
+        if odd > 1.5 * step:
+            raise ValueError(
+                f"{self.source}: gap after t = {where:g} s, where {round(odd / step) - 1} samples are missing (step "
+                f"{odd:g} s instead of {step:g} s). Fill it by interpolation or cut the record there."
+            )
+        raise ValueError(
+            f"{self.source}: unequal time step after t = {where:g} s, {odd:g} s instead of {step:g} s. "
+            "Resample the record to equal steps."
+        )
 
 
 def read_wind(path: str | os.PathLike[str]) -> WindRecord:
@@ -37,7 +132,7 @@ def read_wind(path: str | os.PathLike[str]) -> WindRecord:
 def read_hh(path: str | os.PathLike[str]) -> WindRecord:
     r"""Longitudinal wind at the hub from hub-height text, TurbSim's ``.hh`` (``WrADHH``).
 
-    Comment lines hold ``!``, ``#`` or ``%``; every other line holds Time [s], HorSpd [m/s], WndDir [deg], VerSpd
+    A comment begins with ``!``, ``#`` or ``%``; every other line holds Time [s], HorSpd [m/s], WndDir [deg], VerSpd
     [m/s], HorShr [-], VerShr [-], LnVShr [-], GstSpd [m/s] and, in later versions of the format, Upflow [deg]. At the
     hub the shears vanish, and the component along the rotor axis is
 
@@ -45,9 +140,6 @@ def read_hh(path: str | os.PathLike[str]) -> WindRecord:
 
     The horizontal speed alone contains the lateral turbulence and exceeds u by 1 % at 16 % turbulence. With the
     direction, u agrees with the ``.bts`` file of the same run.
-
-    Args:
-        path: path of the file.
 
     Raises:
         ValueError: if a line has too few columns or a value that is no finite number; the message names the line.
@@ -59,27 +151,23 @@ def read_hh(path: str | os.PathLike[str]) -> WindRecord:
     rows = []
     with open(path, encoding="utf-8", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
-            if line.strip() and not any(mark in line for mark in "!#%"):
-                rows.append(_parse_hh_line(line, f"{path}, line {number}"))
+            # Fortran's list-directed input separates by blanks or commas.
+            fields = re.split("[!#%]", line)[0].replace(",", " ").split()
+            if fields:
+                rows.append(_numbers(fields, f"{path}, line {number}"))
     columns = np.array(rows, dtype=np.float64).reshape(-1, 8)
     speed = (columns[:, 1] + columns[:, 7]) * np.cos(np.deg2rad(columns[:, 2]))
     return WindRecord(columns[:, 0], speed, str(path))
 
 
-def _parse_hh_line(line: str, where: str) -> list[float]:
-    # Fortran's list-directed input separates by blanks or commas.
-    fields = line.replace(",", " ").split()
+def _numbers(fields: list[str], where: str) -> list[float]:
+    remedy = "Correct the line, or begin it with '!' if it is a comment."
     if len(fields) < 8:
-        raise ValueError(
-            f"{where}: {len(fields)} columns, but 8 are needed: Time HorSpd WndDir VerSpd HorShr VerShr LnVShr GstSpd. "
-            "Complete the line, or begin it with '!' if it is a comment."
-        )
+        raise ValueError(f"{where}: {len(fields)} columns, but 8 are needed: {COLUMNS}. {remedy}")
     try:
         values = [float(field) for field in fields[:8]]
     except ValueError as error:
-        raise ValueError(
-            f"{where}: {error}; 8 numbers are needed. Correct the line, or begin it with '!' if it is a comment."
-        ) from None
+        raise ValueError(f"{where}: {error}; 8 numbers are needed. {remedy}") from None
     for field, value in zip(fields, values, strict=False):
         if not math.isfinite(value):
             raise ValueError(
@@ -88,42 +176,21 @@ def _parse_hh_line(line: str, where: str) -> list[float]:
     return values
 
 
-class _FieldHeader(NamedTuple):
-    """The fixed part of a ``.bts`` file, in the order in which it is written."""
-
-    identifier: int
-    n_z: int
-    n_y: int
-    n_tower: int
-    n_t: int
-    dz: float
-    dy: float
-    dt: float
-    mean_speed: float
-    hub_height: float
-    bottom: float
-    u_slope: float
-    u_offset: float
-    v_slope: float
-    v_offset: float
-    w_slope: float
-    w_offset: float
-    n_description: int
-
-
-_HEADER = struct.Struct("<h4i12fi")
+HEADER = (
+    *("identifier", "n_z", "n_y", "n_tower", "n_t", "dz", "dy", "dt", "mean_speed", "hub_height", "bottom"),
+    *("u_slope", "u_offset", "v_slope", "v_offset", "w_slope", "w_offset", "n_description"),
+)
+"""The fixed part of a ``.bts`` file, in the order in which it is written."""
+LAYOUT = struct.Struct("<h4i12fi")
 
 
 def read_bts(path: str | os.PathLike[str]) -> WindRecord:
     r"""Longitudinal wind at the hub from a binary full field, TurbSim's ``.bts`` (``WrADFF``).
 
-    The file is little endian. It holds a header (:class:`_FieldHeader`), a description, and 16-bit integers for every
-    time step: those of the grid, with the components u, v, w fastest, y next and z slowest, then those of the tower. A
-    velocity is :math:`v = (\mathrm{raw} - \mathrm{offset})/\mathrm{slope}`. The hub is at the middle of the grid's
-    width and need not be a grid point: u is interpolated bilinearly between the four points around it.
-
-    Args:
-        path: path of the file.
+    The file is little endian. It holds a header, a description, and 16-bit integers for every time step: those of the
+    grid, with the components u, v, w fastest, y next and z slowest, then those of the tower. A velocity is
+    :math:`v = (\mathrm{raw} - \mathrm{offset})/\mathrm{slope}`. The hub is at the middle of the grid's width and need
+    not be a grid point: u is interpolated bilinearly between the four points around it.
 
     Raises:
         ValueError: if the file is not of this format, its length is not the one that its header implies, or the hub
@@ -132,14 +199,13 @@ def read_bts(path: str | os.PathLike[str]) -> WindRecord:
     Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198, appendix on binary full-field files.
     """
     header = _read_header(path)
-    n_grid = header.n_z * header.n_y
-    start = _HEADER.size + header.n_description
-    shape = (header.n_t, n_grid + header.n_tower, 3)
-    expected, found = start + 2 * math.prod(shape), os.path.getsize(path)
-    if found != expected:
-        state = "is truncated" if found < expected else "is too long"
+    start = LAYOUT.size + header.n_description
+    shape = (header.n_t, header.n_z * header.n_y + header.n_tower, 3)
+    expected, size = start + 2 * math.prod(shape), os.path.getsize(path)
+    if size != expected:
+        state = "is truncated" if size < expected else "is too long"
         raise ValueError(
-            f"{path}: {state}, it holds {found} bytes, but its header ({header.n_t} steps of "
+            f"{path}: {state}, it holds {size} bytes, but its header ({header.n_t} steps of "
             f"{header.n_z}x{header.n_y} grid and {header.n_tower} tower points) implies {expected} bytes. "
             "Copy the file again, in binary mode, or run TurbSim again."
         )
@@ -149,21 +215,20 @@ def read_bts(path: str | os.PathLike[str]) -> WindRecord:
     z = _interpolation(path, (header.hub_height - header.bottom) / header.dz, header.n_z, "height")
     y = _interpolation(path, 0.5 * (header.n_y - 1), header.n_y, "width")
     corners = [a * b * raw[:, i * header.n_y + j, 0].astype(np.float64) for i, a in z for j, b in y]
-    hub = np.sum(corners, axis=0)
     # The interval is stored in single precision; its shortest decimal is the number that TurbSim was given.
-    dt = float(str(np.float32(header.dt)))
-    return WindRecord(dt * np.arange(header.n_t), (hub - header.u_offset) / header.u_slope, str(path))
+    time = float(str(np.float32(header.dt))) * np.arange(header.n_t)
+    return WindRecord(time, (np.sum(corners, axis=0) - header.u_offset) / header.u_slope, str(path))
 
 
-def _read_header(path: str | os.PathLike[str]) -> _FieldHeader:
+def _read_header(path: str | os.PathLike[str]) -> SimpleNamespace:
     with open(path, "rb") as file:
-        head = file.read(_HEADER.size)
-    if len(head) < _HEADER.size:
+        head = file.read(LAYOUT.size)
+    if len(head) < LAYOUT.size:
         raise ValueError(
-            f"{path}: is truncated, it holds {len(head)} bytes, but the header alone takes {_HEADER.size} bytes. "
+            f"{path}: is truncated, it holds {len(head)} bytes, but the header alone takes {LAYOUT.size} bytes. "
             "Copy the file again or run TurbSim again."
         )
-    header = _FieldHeader._make(_HEADER.unpack(head))
+    header = SimpleNamespace(**dict(zip(HEADER, LAYOUT.unpack(head), strict=True)))
     if header.identifier not in (7, 8):
         raise ValueError(
             f"{path}: begins with the number {header.identifier}, but a TurbSim full field begins with 7 or 8 "
@@ -171,7 +236,7 @@ def _read_header(path: str | os.PathLike[str]) -> _FieldHeader:
         )
     counts_right = min(header.n_z, header.n_y, header.n_t) >= 1 and min(header.n_tower, header.n_description) >= 0
     scales = (header.dz, header.dy, header.dt, header.u_slope)
-    if not (counts_right and min(scales) > 0 and all(math.isfinite(value) for value in header)):
+    if not (counts_right and min(scales) > 0 and all(math.isfinite(value) for value in vars(header).values())):
         raise ValueError(
             f"{path}: header is corrupt, {header}; counts and spacings must be positive and all values finite. "
             "Copy the file again, in binary mode, or run TurbSim again."

@@ -1,74 +1,185 @@
-"""Real turbines that their twin does not know, by name; parameters without a source are engineering guesses."""
+"""What a real turbine has, or may have, beside the plant: unknown systems by name, suspects, and what they are made of.
+
+Parameters without a source are engineering guesses.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, Literal
 
-from rt_torchrl.envs.wind_turbine.lagged_torque import LaggedTorque
-from rt_torchrl.envs.wind_turbine.misread_wind import MisreadWind
-from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.plants.actuators import DelayedActuator, ResonantActuator
+import torch
+from torch import nn
+
+from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
+from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
 from rt_torchrl.plants.coefficients import ScaledCoefficients
-from rt_torchrl.plants.extension import System, combined, require_systems
+from rt_torchrl.plants.extension import Extension, System, combined, own_coefficients, replaced, require_systems
+from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Input, Inputs, State, Time
+from rt_torchrl.plants.signal import Signal
+
+PITCH_LAG = 0.7
+"""Lag of the pitch drive with which an identification begins [s]."""
+INFLOW_LAG = 6.0
+"""Lag of the inflow with which an identification begins [s]; D/u at rated wind speed is 126 m/11.4 m/s = 11 s."""
+UNKNOWN_ACCELERATION = 0.02
+"""About a fifth of what the rated torque gives the rotor [rad/s²]."""
+USUAL_POWER_COEFFICIENT = 0.4
+MEGA = 1e6
 
 
-def low_anemometer(plant: Plant) -> Plant:
-    """An anemometer that reads 10 % too little.
+class LaggedInflow(Extension):
+    r"""A turbine whose rotor feels a torque τ, or takes a power P, that follows the quasi-steady one with a lag T.
 
-    Gain 0.9: engineering guess; anemometers on a nacelle stand in the wake of the blades.
+    .. math:: T\dot\tau = \tau_a - \tau \quad\text{or}\quad T\dot P = \tau_a\omega_r - P,\; \tau = P/\omega_r, \qquad
+        J\dot\omega_r = \tau - N_g\tau_g
+
+    This is the crudest model of dynamic inflow: the wake takes the time D/u to change. The torque begins with the
+    quasi-steady one of the true rotor, the power, which a twin identifies, with a usual C_p, both in the filtered wind.
+    ``LaggedCoefficients`` would let C_p lag alone, while the torque follows u² at once.
+
+    Args:
+        base: the turbine.
+        time_constant: T [s], of the true system or with which the identification begins.
+        of: what lags. The time constant of the torque is no coefficient of the closure.
+
+    Raises:
+        ValueError: if the time constant is not positive and finite.
     """
-    return MisreadWind(plant, 0.9, cutoff=2.0 * math.pi * WindTurbine.filter_frequency)
+
+    advance = Plant.advance
+
+    def __init__(self, base: Plant, time_constant: float, of: Literal["torque", "power"] = "power"):
+        if not 0.0 < time_constant < math.inf:
+            raise ValueError(f"time_constant={time_constant} s of the {of} must be positive and finite.")
+        if of == "torque":
+            super().__init__(base, [Signal(symbol=r"\tau", name="lagged_torque", unit="N m")])
+        else:
+            meanings = {"force_lag": "time constant of the rotor's power"}
+            own = PositiveCoefficients([time_constant], names={"force_lag": "s"}, meanings=meanings, factor=FACTOR)
+            super().__init__(base, [Signal(symbol="P", name="lagged_power", unit="MW")], own.requires_grad_(False))
+        self.of, self.time_constant = of, time_constant
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+        plant: Any = self.base
+        (base, hidden), inner, u = self.split(state), self.of_base(closure), exogenous[..., 0]
+        torque = plant.aerodynamic_torque(base[..., 0], action[..., 1], u, inner)
+        field = plant.vector_field(t, base, action, exogenous, inner)
+        if self.of == "torque":
+            missing = hidden[..., 0] - torque
+            rate = -missing / self.time_constant
+        else:
+            # The floor is that of the torque, where the rotor hardly turns.
+            speed = torch.maximum(base[..., 0], plant.least_tip_speed_ratio * u / plant.radius)
+            missing = hidden[..., 0] * MEGA / speed - torque
+            rate = -(missing * speed) / (MEGA * own_coefficients(closure)[0])
+        accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
+        return torch.cat([accelerated, field[..., 1:], rate.unsqueeze(-1)], -1)
+
+    def rest(self, base: State) -> State:
+        plant: Any = self.base
+        speed, wind, pitch = base[..., 0], base[..., 2], base[..., 5]
+        if self.of == "torque":
+            return plant.aerodynamic_torque(speed, pitch, wind, plant.closure).unsqueeze(-1)
+        power = 0.5 * plant.air_density * torch.pi * plant.radius**2 * USUAL_POWER_COEFFICIENT * wind**3
+        return (power / MEGA).unsqueeze(-1)
 
 
-def high_anemometer(plant: Plant) -> Plant:
-    """An anemometer that reads 10 % too much.
+class MisreadWind(Extension):
+    r"""A turbine in a wind u of which the anemometer reads gu.
 
-    Gain 1.1: engineering guess.
+    The exogenous input of the extended plant is what the anemometer *reads*: records, previews and the filtered wind
+    speed, which the controller computes, and with it the reference speed of the cost, hold the reading. The rotor turns
+    in u.
+
+    Args:
+        base: the turbine, perhaps extended, whose state 2 is the filtered wind speed.
+        gain: gain g of the anemometer.
+
+    Raises:
+        ValueError: if the gain is not positive and finite, or the turbine does not step by its vector field.
     """
-    return MisreadWind(plant, 1.1, cutoff=2.0 * math.pi * WindTurbine.filter_frequency)
+
+    advance = Plant.advance
+
+    def __init__(self, base: Plant, gain: float):
+        if not 0.0 < gain < math.inf:
+            raise ValueError(f"gain={gain} of the anemometer must be positive and finite.")
+        if base.own_scheme:
+            raise ValueError("MisreadWind integrates the vector field; extend its result by actuators, not its base.")
+        super().__init__(base, [])
+        turbine: Any = base.innermost
+        self.gain, self.cutoff = gain, 2.0 * math.pi * turbine.filter_frequency
+
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
+        read = exogenous[..., 0]
+        true = read / self.gain
+        field = self.base.vector_field(t, state, action, replaced(exogenous, 0, true), closure)
+        return replaced(field, 2, field[..., 2] + self.cutoff * (read - true))
+
+    def draw_initial_state(self, batch: int, generator: torch.Generator) -> State:
+        """The filtered wind speed starts at what the anemometer reads of the mean wind."""
+        state = self.base.draw_initial_state(batch, generator)
+        return replaced(state, 2, self.gain * state[..., 2])
+
+    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Inputs:
+        """What the anemometer reads, which is never below its least reading, and the lidar with the same gain."""
+        read = self.gain * self.base.draw_exogenous(batch, generator)
+        return read.clamp(min=self.inputs[0].low)
 
 
-def torque_loss(plant: Plant) -> Plant:
-    """A shaft whose bearings and gears lose some of the rotor's torque.
+def suspects(plant: Plant) -> Mapping[str, Plant]:
+    """What a twin of the turbine suspects: dead times of one to three intervals and a lag of the pitch, and inflow."""
 
-    Loss 8 %: engineering guess; NREL/TP-500-38060 has none in the gearbox, and 5.6 % in the generator.
-    """
-    return ScaledCoefficients(plant, 0.92)
+    def late(base: Plant, intervals: int) -> Plant:
+        return DelayedActuator(base, "blade_pitch", intervals * plant.dt)
+
+    def lagging(base: Plant) -> Plant:
+        return LaggedActuator(base, "blade_pitch", PITCH_LAG)
+
+    return {
+        "pitch lag": lagging(plant),
+        "pitch late by 1": late(plant, 1),
+        "pitch late by 3": late(plant, 3),
+        "pitch lag, late by 1": late(lagging(plant), 1),
+        "pitch lag, late by 3": late(lagging(plant), 3),
+        "inflow": LaggedInflow(plant, INFLOW_LAG),
+        "inflow, pitch lag, late by 2": late(lagging(LaggedInflow(plant, INFLOW_LAG)), 2),
+    }
 
 
-def inflow(plant: WindTurbine) -> Plant:
-    """A wake that takes its time.
-
-    Time constant 10 s: D/u at rated wind speed, 126 m/11.4 m/s = 11 s, rounded; D and u of NREL/TP-500-38060.
-    """
-    return LaggedTorque(plant, 10.0)
+def further_suspects(plant: Plant) -> Mapping[str, Plant]:
+    """What a twin suspects by name only: a torque that depends in an unknown way on rotor speed, pitch and wind."""
+    torque = NeuralResidual(
+        plant,
+        {"rotor_speed": UNKNOWN_ACCELERATION},
+        inputs=("rotor_speed", "blade_pitch", "wind_speed"),
+        ranges={"rotor_speed": (0.0, 1.6), "wind_speed": (3.0, 25.0)},
+    )
+    return {"unknown torque": torque}
 
 
 def slow_pitch(plant: Plant) -> Plant:
-    """A pitch drive of second order behind a slow link.
-
-    Frequency 1.5 rad/s: engineering guess, a weak drive. Damping 0.7: engineering guess, the usual tuning of a drive.
-    Dead time 1 s: engineering guess, a link and a valve of a hydraulic drive.
-    """
+    """A weak pitch drive of second order (1.5 rad/s, damping 0.7) behind a slow link (1 s); engineering guesses."""
     return DelayedActuator(ResonantActuator(plant, "blade_pitch", 1.5, 0.7), "blade_pitch", 1.0)
 
 
 PARTS = ("inflow", "shaft", "anemometer", "pitch drive")
 """Parts of the turbine, in the order in which they are changed: what is next to the rotor comes first."""
-SYSTEMS: Mapping[str, System] = {
-    "anemometer_low": {"anemometer": low_anemometer},
-    "anemometer_high": {"anemometer": high_anemometer},
-    "torque_loss": {"shaft": torque_loss},
-    "inflow": {"inflow": inflow},
+SYSTEMS: dict[str, System] = {
+    # Engineering guesses; anemometers on a nacelle stand in the wake of the blades.
+    "anemometer_low": {"anemometer": partial(MisreadWind, gain=0.9)},
+    "anemometer_high": {"anemometer": partial(MisreadWind, gain=1.1)},
+    # Losses in bearings and gears; engineering guess: NREL/TP-500-38060 has none there, and 5.6 % in the generator.
+    "torque_loss": {"shaft": partial(ScaledCoefficients, gain=0.92)},
+    # D/u at rated wind speed, 126 m/11.4 m/s = 11 s, rounded; D and u of NREL/TP-500-38060.
+    "inflow": {"inflow": partial(LaggedInflow, time_constant=10.0, of="torque")},
     "pitch": {"pitch drive": slow_pitch},
-    "all": {
-        "inflow": inflow,
-        "shaft": torque_loss,
-        "anemometer": low_anemometer,
-        "pitch drive": slow_pitch,
-    },
 }
 """What the real turbine has beside its twin, by the names of ``--unknown``."""
+SYSTEMS["all"] = {**SYSTEMS["inflow"], **SYSTEMS["torque_loss"], **SYSTEMS["anemometer_low"], **SYSTEMS["pitch"]}
 
 
 def require_unknown(names: Sequence[str]) -> None:
@@ -80,7 +191,7 @@ def require_unknown(names: Sequence[str]) -> None:
     require_systems(names, SYSTEMS)
 
 
-def unknown(plant: WindTurbine, names: Sequence[str]) -> Plant:
+def unknown(plant: Plant, names: Sequence[str]) -> Plant:
     """The real turbine that has all that the names say; its twin is ``plant``.
 
     Raises:

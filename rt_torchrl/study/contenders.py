@@ -3,7 +3,7 @@
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
 from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
-from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.study.training import CHANGED
 
 ARMS = ("twinning", "model_free", "model_based")

@@ -7,7 +7,7 @@ from torch import nn
 
 from benchmarking.jax_plants.jax_plant import Array, JaxPlant, Weights
 from benchmarking.jax_plants.networks import bounded_perceptron, column, saturated, smooth_clip
-from rt_torchrl.envs.wind_turbine.models import SaintDrenan
+from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
 

@@ -1,4 +1,4 @@
-r"""Power coefficient C_p(λ, β) of a rotor, from a table: the closure of the real wind turbine."""
+"""The power coefficient C_p(λ, β) of a rotor from a table: the closure of the real wind turbine."""
 
 import csv
 from collections.abc import Sequence
@@ -62,15 +62,9 @@ class PowerCoefficientTable(nn.Module):
     _beta_origins: Tensor
     _coefficients: Tensor
 
-    def __init__(
-        self,
-        tip_speed_ratio: Axis,
-        pitch: Axis,
-        values: Rows,
-    ):
+    def __init__(self, tip_speed_ratio: Axis, pitch: Axis, values: Rows):
         super().__init__()
-        lam = _checked_axis("tip_speed_ratio", "-", tip_speed_ratio)
-        beta = _checked_axis("pitch", "deg", pitch)
+        lam, beta = _checked_axis("tip_speed_ratio", "-", tip_speed_ratio), _checked_axis("pitch", "deg", pitch)
         if lam[0] <= 0:
             raise ValueError(
                 f"tip_speed_ratio starts at {lam[0]}; it must be positive, because the stall element covers λ from 0 "
@@ -79,15 +73,17 @@ class PowerCoefficientTable(nn.Module):
         cp = _checked_values(values, len(lam), len(beta))
         rows, lam_knots = _add_stall(_spline_cells(lam, cp), lam)
         cells = _spline_cells(beta, np.moveaxis(rows, -1, 0))  # [cell of β, power of β, cell of λ, power of λ]
-        for name, array in (
-            ("tip_speed_ratio", lam),
-            ("pitch", beta),
-            ("values", cp),
-            ("_lam_knots", lam_knots),
-            ("_lam_origins", _origins(lam_knots)),
-            ("_beta_origins", _origins(beta)),
-            ("_coefficients", cells.transpose(2, 0, 3, 1)),
-        ):
+        arrays = {
+            "tip_speed_ratio": lam,
+            "pitch": beta,
+            "values": cp,
+            "_lam_knots": lam_knots,
+            # Origin of the local coordinate in each cell, including the outer cells.
+            "_lam_origins": np.concatenate([lam_knots[:1], lam_knots]),
+            "_beta_origins": np.concatenate([beta[:1], beta]),
+            "_coefficients": cells.transpose(2, 0, 3, 1),
+        }
+        for name, array in arrays.items():
             self.register_buffer(name, torch.tensor(array, dtype=torch.float64))
 
     @classmethod
@@ -98,23 +94,27 @@ class PowerCoefficientTable(nn.Module):
             ValueError: if an entry is no number or the rows differ in length; the message names the path.
         """
         header, *rows = csv_rows(path)
-        try:
-            pitch = [float(entry) for entry in header[1:]]
-            body = [[float(entry) for entry in row] for row in rows]
-        except ValueError as error:
-            raise ValueError(f"path={str(path)!r}: {error}; after its header every row must hold numbers.") from error
-        lengths = {len(row) for row in body}
+        lengths = {len(row) for row in rows}
         if lengths != {len(header)}:
             raise ValueError(
                 f"path={str(path)!r} has rows of {sorted(lengths)} entries under a header of {len(header)}; every row "
                 "must hold λ and one C_p per pitch angle. Complete or remove the others."
             )
-        return cls([row[0] for row in body], pitch, [row[1:] for row in body])
+        try:
+            pitch = np.array(header[1:], dtype=np.float64)
+            body = np.array(rows, dtype=np.float64)
+        except ValueError as error:
+            raise ValueError(f"path={str(path)!r}: {error}; after its header every row must hold numbers.") from error
+        return cls(body[:, 0], pitch, body[:, 1:])
 
     @classmethod
-    def nrel5mw(cls) -> "PowerCoefficientTable":
-        """The NREL 5-MW rotor by blade-element momentum, λ 2…14.5, β -5…30 deg; ``data/NOTICE.md`` names the source."""
-        return cls.from_csv(DATA / "nrel5mw_Cp_table_rosco.csv")
+    def nrel5mw(cls, *, worn: bool = False) -> "PowerCoefficientTable":
+        """The NREL 5-MW rotor by blade-element momentum, λ 2…14.5, β -5…30 deg; ``data/NOTICE.md`` names the source.
+
+        Args:
+            worn: whether the blades have lost 10 % of their lift and gained 50 % of drag.
+        """
+        return cls.from_csv(DATA / ("nrel5mw_Cp_table_worn.csv" if worn else "nrel5mw_Cp_table_rosco.csv"))
 
     def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
         """C_p [-] at the features, tip-speed ratio λ [-] and pitch β [deg], in the module's dtype (float64)."""
@@ -130,38 +130,18 @@ class PowerCoefficientTable(nn.Module):
         return ((c3 * x + c2) * x + c1) * x + c0
 
     @torch.no_grad()
-    def maximum(self, pitch: float | None = 0.0) -> tuple[float, float, float]:
-        """The highest C_p in the table's range, and its place.
+    def optimum(self) -> tuple[float, float]:
+        """The highest C_p [-] at fine pitch in the table's range, and its λ* [-].
 
-        Args:
-            pitch: pitch angle of the search [deg], by default fine pitch; None searches all pitch angles.
-
-        Returns:
-            C_p,max [-], λ* [-], β* [deg]; λ* and β* err by about 1e-7, the square root of the rounding error.
-
-        Raises:
-            ValueError: if ``pitch`` lies outside the table.
+        λ* errs by about 1e-7, the square root of the rounding error.
         """
-        beta_range = (self.pitch[0].item(), self.pitch[-1].item())
-        if pitch is not None and not beta_range[0] <= pitch <= beta_range[1]:
-            raise ValueError(
-                f"pitch={pitch} deg lies outside the table; choose {beta_range[0]}…{beta_range[1]} deg, or None."
-            )
-        lam, beta = self.tip_speed_ratio, self.pitch if pitch is None else self.pitch.new_tensor([pitch])
-        lam_axis, beta_axis = _subdivided(lam, 8), _subdivided(beta, 8)
-        for _ in range(9):  # each pass narrows the box to a tenth, in the end to 1e-8 of a table cell
-            grid = torch.cartesian_prod(lam_axis, beta_axis).reshape(-1, 2)
-            values = self(grid).squeeze(-1)
-            best = values.argmax()
-            lam_axis, beta_axis = (
-                _subdivided(_neighbours(axis, at), 10)
-                for axis, at in ((lam_axis, grid[best, 0]), (beta_axis, grid[best, 1]))
-            )
-        return values[best].item(), grid[best, 0].item(), grid[best, 1].item()
-
-    def extra_repr(self) -> str:
-        lam, beta = self.tip_speed_ratio, self.pitch
-        return f"λ={lam[0]:g}…{lam[-1]:g} ({len(lam)} rows), β={beta[0]:g}…{beta[-1]:g} deg ({len(beta)} columns)"
+        axis = _subdivided(self.tip_speed_ratio, 8)
+        for _ in range(9):  # each pass narrows the axis to a tenth, in the end to 1e-8 of a table cell
+            values = self(torch.stack([axis, torch.zeros_like(axis)], -1)).squeeze(-1)
+            best = int(values.argmax())
+            power, lam = values[best].item(), axis[best].item()
+            axis = _subdivided(axis[max(best - 3, 0) : best + 4], 10)
+        return power, lam
 
 
 def csv_rows(path: str | Path) -> list[list[str]]:
@@ -213,21 +193,10 @@ def _add_stall(
     return np.concatenate([np.array(stall), rows[1:]]), np.concatenate([[0.0, lam_0], lam])
 
 
-def _origins(knots: Float[np.ndarray, " n"]) -> Float[np.ndarray, " cells"]:
-    """Origin of the local coordinate in each cell, including the outer cells."""
-    return np.concatenate([knots[:1], knots])
-
-
 def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
     """The axis with each interval cut into equal parts."""
     steps = torch.arange(parts, dtype=axis.dtype, device=axis.device) / parts
     return torch.cat([(axis[:-1, None] + steps * axis.diff()[:, None]).flatten(), axis[-1:]])
-
-
-def _neighbours(axis: Float[Tensor, " n"], at: Float[Tensor, ""]) -> Float[Tensor, " m"]:
-    """The three points of an axis on either side of one of them: a slanting ridge moves the best point."""
-    index = int(torch.searchsorted(axis, at))
-    return axis[max(index - 3, 0) : index + 4]
 
 
 def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:
@@ -236,9 +205,7 @@ def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:
         raise ValueError(
             f"{name} has shape {array.shape}; a cubic spline needs one dimension with at least 4 entries. Add points."
         )
-    if not np.isfinite(array).all():
-        at = int(np.argmin(np.isfinite(array)))
-        raise ValueError(f"{name}[{at}]={array[at]} {unit} must be finite; correct or remove the entry.")
+    _require_finite(name, f" {unit}", array)
     if (np.diff(array) <= 0).any():
         at = int(np.argmax(np.diff(array) <= 0))
         raise ValueError(
@@ -256,11 +223,15 @@ def _checked_values(values: Rows, n_lam: int, n_beta: int) -> Float[np.ndarray, 
             f"values has shape {array.shape}, the axes ask for ({n_lam}, {n_beta}): a row per tip-speed ratio, a "
             f"column per pitch angle{hint}."
         )
-    if not np.isfinite(array).all():
-        i, j = (int(k) for k in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"values[{i}, {j}]={array[i, j]} must be finite; replace it or drop its row.")
+    _require_finite("values", "", array)
     if array.max() > 16 / 27:
         raise ValueError(
             f"values reaches {array.max()}, but C_p cannot exceed Betz's 16/27; if it is in per cent, divide it by 100."
         )
     return array
+
+
+def _require_finite(name: str, unit: str, array: np.ndarray) -> None:
+    if not np.isfinite(array).all():
+        at = [int(k) for k in np.argwhere(~np.isfinite(array))[0]]
+        raise ValueError(f"{name}{at}={array[tuple(at)]}{unit} must be finite; correct or remove the entry.")

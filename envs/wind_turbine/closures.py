@@ -1,13 +1,14 @@
-r"""Closure of the turbine's twin: a law for the power coefficient."""
+r"""Closures of the turbine's twin: a law for the power coefficient, alone or with a perceptron."""
 
-import csv
-from pathlib import Path
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-DATA = Path(__file__).parent / "data"
+from rt_torchrl.envs.wind_turbine.rotor import DATA, csv_rows
+from rt_torchrl.plants.closures import BoundedPerceptron
+
 MEANINGS = {
     "c1": "factor of the exponential term of C_p",
     "c2": "factor of 1/ξ in the exponential term",
@@ -75,11 +76,11 @@ class SaintDrenan(nn.Module):
         Raises:
             ValueError: if there is no set of that name.
         """
-        with open(DATA / "saint_drenan_2020_cp_sets.csv", encoding="utf-8") as file:
-            rows = {row["set"]: row for row in csv.DictReader(line for line in file if not line.startswith("#"))}
-        if name not in rows:
-            raise ValueError(f"set {name!r} of coefficients does not exist; choose one of {', '.join(rows)}.")
-        coefficients = {key: float(rows[name][key]) for key in NAMES}
+        header, *rows = csv_rows(DATA / "saint_drenan_2020_cp_sets.csv")
+        sets = {row[0]: dict(zip(header, row, strict=True)) for row in rows}
+        if name not in sets:
+            raise ValueError(f"set {name!r} of coefficients does not exist; choose one of {', '.join(sets)}.")
+        coefficients = {key: float(sets[name][key]) for key in NAMES}
         if coefficients["c5"] == 0.0:
             coefficients |= {"c5": 1e-3, "x": 1.5}
         return cls(torch.tensor(list(coefficients.values()), dtype=torch.float64), free_c1=free_c1)
@@ -102,3 +103,30 @@ class SaintDrenan(nn.Module):
         power = (beta**2 + self.smallest_pitch**2) ** (0.5 * x)
         bracket = c2 * inverse_xi - c3 * beta - c4 * beta / inverse_xi - c5 * power - c6
         return (c1 * bracket * torch.exp(-c7 * inverse_xi) + c8 * lam).unsqueeze(-1)
+
+
+class NeuralPowerCoefficient(nn.Module):
+    r"""Saint-Drenan's law plus a perceptron for what the law cannot express; both are trained.
+
+    .. math:: C_p(\lambda, \beta) = C_p^{SD}(\lambda, \beta) + \tfrac12\tanh N(\lambda, \beta)
+
+    The closure starts as the law alone. The perceptron takes λ and β on the scales of the rotor's table. Far from the
+    visited points it adds at most 0.5 to the law.
+
+    Args:
+        law: law that the closure starts from.
+        hidden: width of each hidden layer.
+        generator: source of the perceptron's initial weights.
+    """
+
+    ranges = ((2.0, 14.0), (0.0, 25.0))  # λ [-] and β [deg]
+    bound = 0.5
+
+    def __init__(self, law: SaintDrenan, *, hidden: Sequence[int], generator: torch.Generator):
+        super().__init__()
+        self.law = law
+        self.correction = BoundedPerceptron(self.ranges, (self.bound,), hidden=hidden, generator=generator)
+
+    def forward(self, features: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
+        """C_p [-] at tip-speed ratio λ [-] and pitch β [deg]."""
+        return self.law(features) + self.correction(features)
