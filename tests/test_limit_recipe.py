@@ -118,3 +118,10 @@ def test_impossible_options_are_refused(option):
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"{name}={value}"):
         recipe("limit").Config(**option)
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    module = recipe("limit")
+    with pytest.raises(ValueError, match="folder=.*file/below cannot be made"):
+        module.main(module.Config(folder=tmp_path / "file" / "below"))
