@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.envs.wind_turbine.wind_record import WindRecord
 
 
@@ -55,7 +54,6 @@ def read_hh(path: str | os.PathLike[str]) -> WindRecord:
 
     Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198; OpenFAST InflowWind, uniform wind.
     """
-    require_bounded(path)
     rows = []
     with open(path, encoding="utf-8", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
