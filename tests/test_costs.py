@@ -7,9 +7,8 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from rt_torchrl import PlantEnv, Rollout, SaturatedAffine, check_plant, control_cost
-from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.flapping_wing.costs import TrackingCost
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.costs import EngineeringCost, PaperCost

@@ -15,7 +15,7 @@ from test_export_recipe import leave_run, recipe
 from rt_torchrl import load_run
 from rt_torchrl.control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
 from rt_torchrl.evaluation.limits import resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.results_file import write_results
