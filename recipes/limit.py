@@ -27,7 +27,7 @@ from rt_torchrl import (
 )
 from rt_torchrl.control.bounded_descent import BoundedDescentConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.evaluation.limits import (
     Contender,

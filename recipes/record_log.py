@@ -14,7 +14,7 @@ import tyro
 
 from rt_torchrl import ClassicalController, Plant, check_options, main_of
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.fit.sensor_log import SensorLog, logged_states
 from rt_torchrl.fit.simulated_log import ClassicalLaw, Law, policy_law, recorded

@@ -10,7 +10,7 @@ from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.tuning import tune
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
 from rt_torchrl.plants.extensions.scaled_actuator import ScaledActuator

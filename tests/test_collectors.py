@@ -8,7 +8,7 @@ from rt_torchrl import shipped_plants
 from rt_torchrl.control.acting import ActingController
 from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.jonkman import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine

@@ -8,7 +8,7 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 from straight_line import Line, Slope, flown, line_segment, noise_of
 
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.fit.covariance import covariance, named_values, newey_west, standard_errors
 from rt_torchrl.fit.identification import Identification, IdentificationConfig
