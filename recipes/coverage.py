@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl import EstimationConfig, Plant, Trajectory, check_options, main_of, sensors_of
-from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
+from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank

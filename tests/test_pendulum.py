@@ -12,8 +12,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from rt_torchrl.envs.pendulum.models import UniformRod
-from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
+from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.identification import Identification, IdentificationConfig
 from rt_torchrl.fit.resampling import hold_out, resample
