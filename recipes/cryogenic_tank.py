@@ -30,11 +30,10 @@ from rt_torchrl import (
     TwinningConfig,
     main_of,
 )
-from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
-from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.controllers import NarrowOnOff, OnOffValve, PIValve
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
 from rt_torchrl.envs.cryogenic_tank.unknown import require_unknown, unknown
-from rt_torchrl.envs.cryogenic_tank.valves import NarrowOnOff, OnOffValve, PIValve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -222,7 +221,7 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 
 
 def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.cryogenic_tank.animation import save_animation
+    from rt_torchrl.envs.cryogenic_tank.figures import save_animation
 
     save_animation(snapshot, path)
 

@@ -27,10 +27,9 @@ from rt_torchrl import (
     TwinningConfig,
     main_of,
 )
-from rt_torchrl.envs.flapping_wing.costs import TrackingCost, require_rate
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost, require_rate
 from rt_torchrl.envs.flapping_wing.unknown import require_unknown, unknown
 
 if TYPE_CHECKING:
@@ -222,7 +221,7 @@ def plant_figures(snapshot: "Snapshot") -> dict[str, "Figure"]:
 
 
 def animate(snapshot: "Snapshot", path: Path) -> None:
-    from rt_torchrl.envs.flapping_wing.animation import save_animation
+    from rt_torchrl.envs.flapping_wing.figures import save_animation
 
     save_animation(snapshot, path)
 

@@ -26,8 +26,8 @@ from rt_torchrl import (
     main_of,
 )
 from rt_torchrl.control.receding_horizon import BoundedDescentConfig
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.limits import (
     Contender,

@@ -16,8 +16,8 @@ import tyro
 from torch import Tensor, nn
 
 from rt_torchrl import ClassicalController, Plant, check_options, main_of, rk4_step
-from rt_torchrl.envs.cryogenic_tank.valves import PIValve
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.fit.log import SensorLog, logged_states
 from rt_torchrl.runs.shipped_plants import plant_class

@@ -1,7 +1,6 @@
 """The worth of reinforcement twinning: every arm on every plant, against classical controllers and the optimum."""
 
-import importlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -49,7 +48,7 @@ from rt_torchrl.study.yardsticks import (
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Train every arm on every plant, tune the classical controllers, find the oracle, and write a report.
+    """Train every arm on every plant, tune the classical controllers, find the oracle, and write tables and figures.
 
     The folder keeps finished results, so that the same command goes on where it was interrupted.
 
@@ -64,8 +63,8 @@ class Config:
         unseen: number of unseen episodes that judge everything.
         limit_episodes: number of unseen episodes, the first ones, on which the limit and model predictive control are
             computed; 0 leaves them out.
-        folder: folder of the report and of all runs.
-        quick: make the same report from one seed of short trainings, and mark it as quick.
+        folder: folder of tables, figures and all runs.
+        quick: make the same tables from one seed of short trainings, and mark it as quick.
     """
 
     plants: tuple[str, ...] = ("all",)
@@ -108,7 +107,7 @@ class Config:
 
     @property
     def report(self) -> Path:
-        """Folder of the report; the same names in another order give the same one."""
+        """Folder of the tables; the same names in another order give the same one."""
         names = sorted({name for of_plant in self.beside().values() for name in of_plant})
         return self.kept / "unknown" / "+".join(names) if names else self.kept
 
@@ -142,7 +141,6 @@ class Config:
             return [Training(seed=seed, folder=place / f"seed-{seed}", **common) for seed in range(count)]
 
         found = {("nominal", arm): every(arm, "nominal", seeds) for arm in ARMS}
-        found["nominal", "twinning"][0] = replace(found["nominal", "twinning"][0], figures=True)
         for name, policy in policies_of(plant, quick=self.quick).items():
             found["nominal", name] = every(
                 "twinning", "nominal", seeds, *policy, folder="-".join(policy[:2]).strip("-")
@@ -252,7 +250,7 @@ def harder_of(config: Config, plant: str) -> dict[str, list[Entry]]:
 
 
 def gather(config: Config) -> Results:
-    """Gather the results that the report needs."""
+    """Gather the results of the study."""
     results = Results({}, {}, {}, {})
     for plant in config.chosen():
         nominal = config.trainings(plant)["nominal", "twinning"]
@@ -263,20 +261,18 @@ def gather(config: Config) -> Results:
 
 
 def write(config: Config) -> Path:
-    """Write the report as Markdown, HTML, figures and ``study.json``; return the path of the page."""
-    from rt_torchrl.study import report  # here, because --help need not wait for Matplotlib
-    from rt_torchrl.study.drawing import draw
+    """Write the tables, the figures and ``study.json``; return the path of the tables."""
+    from rt_torchrl.study.figures import draw  # here, because --help need not wait for Matplotlib
+    from rt_torchrl.study.page import write as write_page
 
     results = gather(config)
-    lines = {plant: line for plant in config.chosen() if (line := config.line(plant))}
-    firsts = {plant: config.trainings(plant)["nominal", "twinning"][0] for plant in config.chosen()}
-    figures = draw(config.report, results, lines, firsts)
+    figures = draw(config.report, results, {plant: line for plant in config.chosen() if (line := config.line(plant))})
     made = {"quick": config.quick, "command": command(config), "unknown": config.beside()}
-    return report.write(config.report, results, figures=figures, **made)[1]
+    return write_page(config.report, results, figures=figures, **made)
 
 
 def command(config: Config) -> str:
-    """The command line that makes this report."""
+    """The command line that makes these tables."""
     plants = " ".join([*config.plants, *(("--unknown", *config.unknown) if config.unknown else ())])
     size = f"--seeds {config.seeds} --variant-seeds {config.variant_seeds} --unseen {config.unseen}"
     limits = "" if config.limit_episodes == 8 else f" --limit-episodes {config.limit_episodes}"
@@ -284,11 +280,10 @@ def command(config: Config) -> str:
 
 
 def main(config: Config) -> None:
-    importlib.import_module("rt_torchrl.study.report")  # a package that it lacks is missed now, not after the trainings
     if config.unknown and config.variant_seeds:
         print(f"{CHANGED} is left out: with it the real systems are others than with --unknown.", flush=True)
     compute(config)
-    print(f"report in {write(config)}")
+    print(f"tables in {write(config)}")
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from small_runs import SMALL, small_run
 
+from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import PIValve
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController

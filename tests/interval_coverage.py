@@ -19,12 +19,11 @@ from rt_torchrl import (
     sensor_record,
     sensors_of,
 )
-from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
+from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
-from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.neural import NeuralPolar
+from rt_torchrl.envs.flapping_wing.closures import NeuralPolar, QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan

@@ -9,8 +9,8 @@ from figure_reading import snapshot_of
 from matplotlib.figure import Figure
 from PIL import Image
 
-from rt_torchrl.envs.cryogenic_tank import animation as tank
-from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank import figures as tank
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine import figures as turbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine

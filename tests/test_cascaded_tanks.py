@@ -11,8 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics
-from rt_torchrl.envs.cascaded_tanks.planning import planned_under_uncertainty
+from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics
 from rt_torchrl.envs.cascaded_tanks.plant import CascadedTanks
 from rt_torchrl.envs.cascaded_tanks.record import read_benchmark
 from rt_torchrl.trajectories.rollout import Rollout
@@ -81,7 +80,7 @@ def test_a_perceptron_moves_water_and_makes_none_in_between():
 def test_a_plan_under_uncertainty_lowers_the_cost_on_every_twin():
     plant = CascadedTanks(horizon=512.0)
     other = Hydraulics(1.05 * Hydraulics.true().coefficients)
-    found = planned_under_uncertainty(plant, [Hydraulics.true(), other], iterations=15)
+    found = recipe().planned_under_uncertainty(plant, [Hydraulics.true(), other], iterations=15)
     assert found["J_a after, least twin [V^2]"] <= found["J_a after [V^2]"] <= found["J_a after, worst twin [V^2]"]
     assert found["J_a after, worst twin [V^2]"] < 0.7 * found["J_a before [V^2]"]
 

@@ -7,9 +7,9 @@ from linear_quadratic import LinearClosure, LinearQuadratic
 from test_optimal_gain import optimal_gain
 
 from rt_torchrl.control.classical import ClassicalController, tune
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve, RestingOnOff
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
 from rt_torchrl.plants.actuators import ScaledActuator

@@ -5,9 +5,9 @@ import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
 
 from rt_torchrl import shipped_plants
+from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import PIValve
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine

@@ -7,11 +7,9 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from rt_torchrl import PlantEnv, Rollout, SaturatedAffine, check_plant, control_cost
-from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
-from rt_torchrl.envs.flapping_wing.costs import TrackingCost
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank, PressureCost
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, PaperCost, WindTurbine
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy

@@ -19,8 +19,8 @@ from cryogenic_tank_reference import (
     seeded,
 )
 
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
-from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.trajectories.rollout import Rollout
 

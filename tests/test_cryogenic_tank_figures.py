@@ -9,7 +9,7 @@ from figure_reading import clipped_texts, collisions, draw, line, snapshot_of
 
 from rt_torchrl import figures as general
 from rt_torchrl.envs.cryogenic_tank import figures
-from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.trajectories.trajectory import Trajectory

@@ -5,8 +5,8 @@ import torch
 from linear_quadratic import LinearQuadratic
 from test_segments import assimilation, flight
 
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig

@@ -9,10 +9,9 @@ from flapping_wing_reference import reference_force
 from scipy.optimize import brentq, fsolve
 from torch import nn
 
-from rt_torchrl.envs.flapping_wing.costs import TrackingCost
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing, TrackingCost
 from rt_torchrl.plants.policies import mlp
 from rt_torchrl.trajectories.rollout import Rollout
 

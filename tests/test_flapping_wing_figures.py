@@ -11,8 +11,8 @@ from PIL import Image
 from torch import nn
 
 from rt_torchrl.envs.flapping_wing import figures
-from rt_torchrl.envs.flapping_wing.animation import save_animation
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.figures import save_animation
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures.animation import FRAMES, RATE
 from rt_torchrl.figures.snapshot import Snapshot

@@ -15,7 +15,7 @@ from test_export_recipe import leave_run, recipe
 from rt_torchrl import load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig
 from rt_torchrl.control.receding_horizon import BoundedDescentConfig
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
 from rt_torchrl.evaluation.limits import resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.results_file import write_results
@@ -118,3 +118,10 @@ def test_impossible_options_are_refused(option):
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"{name}={value}"):
         recipe("limit").Config(**option)
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    module = recipe("limit")
+    with pytest.raises(ValueError, match="folder=.*file/below cannot be made"):
+        module.main(module.Config(folder=tmp_path / "file" / "below"))

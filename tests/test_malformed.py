@@ -63,16 +63,6 @@ def test_every_wrong_option_is_refused_by_its_name():
     require_no_defects(every=1)
 
 
-def test_the_size_of_a_file_is_bounded_before_it_is_read(tmp_path):
-    for name in ("log.csv", "wind.hh"):
-        reader = READERS[name]
-        path = tmp_path / reader.name
-        with path.open("wb") as file:
-            file.truncate(2**31 + 1)  # no bytes on the disk
-        with pytest.raises(ValueError, match=f"{reader.name}.* has 2147483649 bytes; at most"):
-            reader.read(path)
-
-
 @pytest.mark.parametrize("compressed", [True, False], ids=["compressed", "overlapping"])
 def test_a_file_of_tensors_that_would_grow_is_refused(tmp_path, compressed):
     import zipfile

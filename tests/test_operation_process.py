@@ -1,7 +1,6 @@
 """An operation in a process of its own, with true clocks, and whole runs of it."""
 
 import os
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +13,6 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.config import OperationConfig
-from rt_torchrl.systems.operation.event_log import read_events
 from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.sound_part import EpisodeEndedError
 
@@ -53,7 +51,6 @@ def operation(make_env=simulation, **options):
         ({"asynchronous": True, "operation": OperationConfig(clock="wall")}, 2),
         ({"asynchronous": True, "operation": OperationConfig(clock="wall", core=-2)}, 0),
         ({"asynchronous": True, "operation": OperationConfig(clock="wall"), "threads": 7}, 7),
-        ({"asynchronous": True, "operation": OperationConfig(replay=Path("events.jsonl"))}, 2),
     ],
 )
 def test_the_learner_has_a_thread_for_each_core_that_is_left(options, expected, monkeypatch):
@@ -96,22 +93,11 @@ def test_a_window_ends_with_the_error_of_the_real_system_and_the_operation_goes_
 
 
 @pytest.mark.slow
-def test_a_run_on_the_wall_clock_repeats_from_its_log_to_the_bit(tmp_path):
-    """Also where it was stopped and went on."""
+def test_a_run_on_the_wall_clock_goes_on_after_a_stop(tmp_path):
     wall = {"asynchronous": True, "operation": OperationConfig(clock="wall", speed=20.0, core=-2), "threads": 1}
-    small_run(tmp_path / "wall", episodes=2, **wall).train()
-    first = small_run(tmp_path / "wall", resume=True, **wall).train()
-    replay = OperationConfig(replay=tmp_path / "wall" / "events.jsonl")
-    again = small_run(tmp_path / "again", asynchronous=True, operation=replay, threads=1).train()
-    kept = (tmp_path / name / "events.jsonl" for name in ("wall", "again"))
-    one, other = ([event for event in read_events(path) if event["event"] == "taken"] for path in kept)
-    assert one == other and "resumed" in (tmp_path / "wall" / "events.jsonl").read_text()
-    for one, other in zip(first["episodes"], again["episodes"], strict=True):
-        own = {key for key in one if key == "seconds" or key.startswith("late")}
-        assert {key: value for key, value in one.items() if key not in own} == {
-            key: value for key, value in other.items() if key != "seconds"
-        }
-    assert first["summary"]["closure"] == again["summary"]["closure"]
+    small_run(tmp_path, episodes=2, **wall).train()
+    found = small_run(tmp_path, resume=True, **wall).train()
+    assert len(found["episodes"]) > 2 and "resumed" in (tmp_path / "events.jsonl").read_text()
 
 
 def test_what_cannot_be_sent_is_refused():

@@ -13,8 +13,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from test_export_recipe import recipe
 
-from rt_torchrl.envs.pendulum.models import UniformRod
-from rt_torchrl.envs.pendulum.plant import Pendulum, wrapped
+from rt_torchrl.envs.pendulum.plant import Pendulum, UniformRod, wrapped
 from rt_torchrl.envs.pendulum.real import gymnasium_pendulum
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, identify
 from rt_torchrl.fit.log import checked

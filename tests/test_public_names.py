@@ -35,7 +35,6 @@ ROOMS_OF = {
     "memory.py": {"evaluation", "figures", "runs"},
     "pareto.py": {"runs", "study"},
     "partial.py": {"runs", "study"},
-    "real_time.py": {"runs"},
     "record_log.py": {"fit", "runs"},
     "soak.py": {"runs"},
     "study.py": {"study", "runs"},

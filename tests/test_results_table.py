@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rt_torchrl.envs.pendulum.models import UniformRod
+from rt_torchrl.envs.pendulum.plant import UniformRod
 from rt_torchrl.plants.closures import described_weights
 from rt_torchrl.runs.results_table import closure_lines
 

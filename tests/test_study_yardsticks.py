@@ -7,7 +7,7 @@ import pytest
 import torch
 from handwritten_study import RECIPES
 
-from rt_torchrl.envs.cryogenic_tank.valves import PIValve
+from rt_torchrl.envs.cryogenic_tank.controllers import PIValve
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.runs.shipped_plants import shipped_plants

@@ -11,7 +11,7 @@ from straight_line import Line, Slope, flown, line_segment, noise_of
 from test_export_recipe import recipe
 from torch import nn
 
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
+from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.design import next_manoeuvres, weight_information

@@ -11,7 +11,7 @@ from test_extensions import DT, flight
 from rt_torchrl import check_plant, load_run
 from rt_torchrl.envs.cryogenic_tank import unknown as tanks
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
-from rt_torchrl.envs.cryogenic_tank.two_zones import TwoZones
+from rt_torchrl.envs.cryogenic_tank.unknown import TwoZones
 from rt_torchrl.envs.flapping_wing import unknown as drones
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine import unknown as turbines

@@ -15,14 +15,12 @@ from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.systems.calling_simulator import CallingSimulator
 from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.reading import Reading
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
-from rt_torchrl.systems.wall_clock import WallClock
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost, identification_cost
 
@@ -136,21 +134,16 @@ def test_machine_code_flies_as_steps_do(controller):
         torch.testing.assert_close(found[0][key], found[1][key], rtol=1e-9, atol=1e-9)
 
 
-def test_a_safety_layer_and_a_wall_clock_see_readings_alone(tmp_path):
+def test_a_safety_layer_sees_readings_alone(tmp_path):
     plant = real()
-    clock = WallClock(plant, clock=lambda: 0.0, sleep=lambda seconds: None)
-    env = clock.environment()
-    assert isinstance(env, CallingSimulator)
     state, exogenous, applied = (Reading(keys=(name,)) for name in ("state", "exogenous", "applied"))
     limits = SafetyConfig(interval=plant.dt, log=tmp_path / "log.jsonl")
-    guarded = SafetyLayer(env, limits, fallback=lambda reported: torch.zeros(1, 1, dtype=torch.float64))
+    guarded = SafetyLayer(PlantEnv(plant), limits, fallback=lambda reported: torch.zeros(1, 1, dtype=torch.float64))
     system = RealSystem(guarded, BASE, state=state, exogenous=exogenous, applied=applied)
-    try:
-        policy = LivePolicy(BASE, LinearGain([[0.3, 0.3]]), ExplorationConfig(), generator=generator())
-        policy.begin(policy.policy, strength=0.0)
-        episode = EpisodeCollector(system, policy, BASE).rollout()
-    finally:
-        system.close()
+    policy = LivePolicy(BASE, LinearGain([[0.3, 0.3]]), ExplorationConfig(), generator=generator())
+    policy.begin(policy.policy, strength=0.0)
+    episode = EpisodeCollector(system, policy, BASE).rollout()
+    system.close()
     start = plant.at_rest(episode["state"][:, 0])
     expected = Rollout(plant, plant.closure)(start, episode["exogenous"], episode["next", "applied"]).states
     torch.testing.assert_close(episode["next", "state"], expected[:, 1:, :2], rtol=1e-5, atol=1e-5)

@@ -7,7 +7,6 @@ import pytest
 from fault_counts import count
 from linear_quadratic import LinearQuadratic
 
-from rt_torchrl.envs.cryogenic_tank.costs import require_sizes
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
@@ -28,6 +27,10 @@ TURN = 180.0 / math.pi
 
 def limits(plant, **given):
     return lambda: OperatingLimits(plant(), OperatingLimitsConfig(**given))
+
+
+def tank(error_sizes):
+    return lambda: CryogenicTank(error_sizes=error_sizes)
 
 
 PLANT = LinearQuadratic()
@@ -58,9 +61,21 @@ WRONG = {
     "ms for s": (lambda: FlappingWing(dt=0.5, horizon=5.0), "dt=0.5 s does not resolve", "dt <= 0.0025 s"),
     "s for ms": (lambda: GaussianGust(time_scale=1e4), "time_scale=10000 s of GaussianGust", "1 ms is 0.001 s"),
     "gusts in km/h": (lambda: GaussianGust(mean=36.0), "mean=36 m/s of GaussianGust", "1 km/h is 0.278 m/s"),
-    "kPa for Pa": (lambda: require_sizes((0.05, 0.05, 1.0)), "error_sizes=1 Pa of the tank", "1 kPa is 1000 Pa"),
-    "L for m³": (lambda: require_sizes((0.05, 50.0, 1e3)), "error_sizes=50 m³ of the tank", "1 L is 0.001 m³"),
-    "mK for K": (lambda: require_sizes((50.0, 0.05, 1e3)), "error_sizes=50 K of the tank", "1 mK is 0.001 K"),
+    "kPa for Pa": (
+        lambda: CryogenicTank(error_sizes=(0.05, 0.05, 1.0)),
+        "error_sizes=1 Pa of the tank",
+        "1 kPa is 1000 Pa",
+    ),
+    "L for m³": (
+        lambda: CryogenicTank(error_sizes=(0.05, 50.0, 1e3)),
+        "error_sizes=50 m³ of the tank",
+        "1 L is 0.001 m³",
+    ),
+    "mK for K": (
+        lambda: CryogenicTank(error_sizes=(50.0, 0.05, 1e3)),
+        "error_sizes=50 K of the tank",
+        "1 mK is 0.001 K",
+    ),
     "kJ for J": (lambda: CryogenicTank(wall_heat_capacity=500.0), "heat capacity 500 J/K", "wall='exponential'"),
     "h for s": (lambda: CyclicLoad(period=1.5), "period=1.5 s of CyclicLoad", "1 h is 3600 s"),
     "mW for W": (lambda: CyclicLoad(peak=250e3), "peak=250000 W of CyclicLoad", "1 mW is 0.001 W"),

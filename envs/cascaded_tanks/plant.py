@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.envs.cascaded_tanks.models import Hydraulics, NeuralHydraulics, ramp
+from rt_torchrl.envs.cascaded_tanks.closures import Hydraulics, NeuralHydraulics, ramp
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Signal
 
 STATES = (
@@ -101,14 +102,7 @@ class CascadedTanks(Plant):
             raise ValueError(f"pump_weight={pump_weight} of plant {self.name!r} must not be negative.")
         self.pump_weight = float(pump_weight)
 
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 2"],
-        action: Float[Tensor, "*batch 1"],
-        exogenous: Float[Tensor, "*#batch 1"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch 2"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """Rates of the levels.
 
         Args:
@@ -122,13 +116,7 @@ class CascadedTanks(Plant):
         over = Hydraulics.overflow_rate * ramp(state[..., 1] - GREATEST_READING, Hydraulics.overflow_band)
         return torch.stack([rates[..., 0], rates[..., 1] - over], -1)
 
-    def running_cost(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 2"],
-        applied: Float[Tensor, "*batch 1"],
-        exogenous: Float[Tensor, "*#batch 1"],
-    ) -> Float[Tensor, "*batch"]:
+    def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         """The squared error of the lower level [V²], and a little of the squared voltage."""
         error = state[..., 1] - exogenous[..., 0]
         return error**2 + self.pump_weight * (applied[..., 0] - 3.0) ** 2
@@ -136,12 +124,7 @@ class CascadedTanks(Plant):
     discrepancy_scales = (math.inf, 1.0)
     """L_p is half the squared error of the lower level [V²]."""
 
-    def merit(
-        self,
-        states: Float[Tensor, "batch samples 2"],
-        applied: Float[Tensor, "batch n 1"],
-        exogenous: Float[Tensor, "batch n 1"],
-    ) -> dict[str, Float[Tensor, " batch"]]:
+    def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
         """RMS error of the lower level."""
         error = states[:, 1:, 1] - exogenous[..., 0]
         return {"RMS level error [V]": error.square().mean(-1).sqrt()}
@@ -158,13 +141,11 @@ class CascadedTanks(Plant):
         level = torch.rand(batch, jumps, 1, generator=generator, dtype=torch.float64, device=generator.device)
         return 3.5 + 4.5 * level.repeat_interleave(64, 1)[:, : self.n_steps]
 
-    def make_closure(self, generator: torch.Generator) -> nn.Module:
+    def make_closure(self, generator: torch.Generator) -> Hydraulics:
         """Hydraulics that are some 20 % to 50 % off; nothing is drawn."""
         guess = (0.05, 0.008, 0.08, 0.005, 20.0, 0.8)
         return Hydraulics(torch.tensor(guess, dtype=torch.float64, device=generator.device))
 
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
         """The same hydraulics with a perceptron."""
-        law = self.make_closure(generator)
-        assert isinstance(law, Hydraulics)
-        return NeuralHydraulics(law, hidden=hidden, generator=generator)
+        return NeuralHydraulics(self.make_closure(generator), hidden=hidden, generator=generator)

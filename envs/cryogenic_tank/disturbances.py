@@ -15,15 +15,16 @@ LOWEST = 600.0
 """Time that no orbit takes: one close to the ground of the Earth takes 5060 s [s]."""
 
 
+Draw = Float[Tensor, "{batch} {n_steps}"]
+"""A sample of each episode and interval."""
+
+
 @runtime_checkable
 class LoadModel(Protocol):
     """Anything that draws histories of the heat load."""
 
-    def draw(
-        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
-    ) -> Float[Tensor, "{batch} {n_steps}"]:
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draw:
         """Heat load Q_h [W] of ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,29 +60,19 @@ class CyclicLoad:
     noise: float = 25.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("minimum", "W"), ("peak", "W"), ("noise", "W")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value} {unit} of CyclicLoad must be zero or above.")
-        for name in ("period", "width"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value} s of CyclicLoad must be positive and finite.")
-        if not 0.0 <= self.variation <= 1.0:
-            raise ValueError(f"variation={self.variation} of CyclicLoad must be in [0, 1], a fraction of the peak.")
         for name in ("minimum", "peak", "noise"):
             require_range(name, getattr(self, name), 0.0, 1e5, unit="W", of="CyclicLoad")
         for name, least in (("period", LOWEST), ("width", 1.0)):
             require_range(name, getattr(self, name), least, 1e7, unit="s", of="CyclicLoad")
+        if not 0.0 <= self.variation <= 1.0:
+            raise ValueError(f"variation={self.variation} of CyclicLoad must be in [0, 1], a fraction of the peak.")
 
     @property
     def mean(self) -> float:
         """Mean load [W] over whole orbits; exact if the noise, within ±√3σ_n, never reaches the floor at zero."""
         return self.minimum + self.peak * self.width * math.sqrt(2.0 * math.pi) / self.period
 
-    def draw(
-        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
-    ) -> Float[Tensor, "{batch} {n_steps}"]:
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draw:
         """Heat load Q_h [W] of ``batch`` independent episodes, in float64 on the generator's device.
 
         Args:

@@ -1,5 +1,6 @@
-"""Figures of the cryogenic tank: its days in orbit, what its vent takes away, the path of the vented fluid."""
+"""Figures of the cryogenic tank: its days in orbit, vent, coefficients, path of the vented fluid, and an animation."""
 
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -9,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from rt_torchrl.envs.cryogenic_tank.coefficient_figure import CLOSURE_COLOURS, LABELS, coefficients
-from rt_torchrl.envs.cryogenic_tank.merit import BAND
-from rt_torchrl.envs.cryogenic_tank.models import ConstantCoefficients
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
+from rt_torchrl.envs.cryogenic_tank.plant import BAND, GREATEST_DROP, CryogenicTank
+from rt_torchrl.evaluation.closure_error import visited_features
+from rt_torchrl.figures.animation import Trace, TracedScene, save_scene
 from rt_torchrl.figures.learning import closure_weights, tracked_weights
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
-    CLOSURE_LINES,
+    FILTERED,
     LARGE_SCALE,
     LIMIT_LINE,
     REAL,
@@ -26,10 +27,13 @@ from rt_torchrl.figures.style import (
     TWIN,
     array,
     caption,
+    closure_look,
     closures,
+    draw_groups,
     last_episode,
     legend_above,
     legend_below,
+    means_of_groups,
     panels,
     time_axis,
     twin_label,
@@ -39,6 +43,14 @@ from rt_torchrl.figures.style import (
 POINTS = 720
 """Greatest number of groups of samples in a drawn record: in five days, ten minutes each, a ninth of an orbit."""
 DAY = 86_400.0
+PUFFS = 12
+"""Greatest number of drawn puffs of vented gas."""
+LABELS = {
+    "U_s": ("wall to fluid $U_s$ [W/(m² K)]", 1.0),
+    "U_HX": ("heat exchanger $U_{HX}$ [W/(m² K)]", 1.0),
+    "K_JT": ("valve $K_{JT}$ [GPa s²/kg²]", 1e-9),
+}
+"""Label of each coefficient, and the factor to its unit."""
 
 
 def figures_of(snapshot: Snapshot) -> dict[str, Figure]:
@@ -68,20 +80,23 @@ def tank(snapshot: Snapshot) -> Figure:
     note = f"\nmean and range of every {group * plant.dt / 60.0:g} min" if group > 1 else ""
     title = f"Tank, episode {last_episode(snapshot)}{note}"
     figure, axes = panels(len(real) + 1, title=title, size=(9.5, 12.0), sharex=True)
-    _draw_references(axes[0, 0], plant)
+    target, half = 1e-3 * plant.set_point, 1e-3 * BAND
+    band = {"color": REFERENCE, "alpha": 0.13, "linewidth": 0, "label": rf"$\pm${half:g} kPa"}
+    axes[0, 0].axhspan(target - half, target + half, **band)
+    axes[0, 0].axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
     for ax, (name, values) in zip(axes.flat, real.items(), strict=False):
-        _draw_groups(ax, time, array(values), group)
+        draw_groups(ax, time, array(values), group, linewidth=1.5, label="_range")
         low, high = ax.get_ylim()
-        middle, mean = _means(group, time, array(twin[name]))
+        middle, mean = means_of_groups(group, time, array(twin[name]))
         ax.plot(middle, mean, color=TWIN, linewidth=0.9, label=twin_label(snapshot))
         height = high - low
         ax.set_ylim(max(min(low, mean.min()), low - height), min(max(high, mean.max()), high + height))
         caption(ax, name)
     load = axes[-1, 0]
-    _draw_groups(load, time, array(record.exogenous[:, 0]), group)
+    draw_groups(load, time, array(record.exogenous[:, 0]), group, linewidth=1.5, label="_range")
     if snapshot.large_scale is not None:
         mean = array(snapshot.large_scale[:, 0])
-        load.plot(*_means(group, time, mean), color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
+        load.plot(*means_of_groups(group, time, mean), color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
         legend_above(load)
     caption(load, plant.inputs[0].label)
     load.set_xlabel(label)
@@ -105,28 +120,6 @@ def _quantities(
     }
 
 
-def _draw_references(ax: Axes, plant: CryogenicTank) -> None:
-    target, half = 1e-3 * plant.set_point, 1e-3 * BAND
-    ax.axhspan(target - half, target + half, color=REFERENCE, alpha=0.13, linewidth=0, label=rf"$\pm${half:g} kPa")
-    ax.axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
-
-
-def _draw_groups(ax: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], group: int) -> None:
-    middle, mean = _means(group, time, values)
-    if group > 1:
-        starts = np.arange(0, len(values), group)
-        least, greatest = (extreme.reduceat(values, starts) for extreme in (np.minimum, np.maximum))
-        ax.fill_between(middle, least, greatest, color=SAMPLES, alpha=0.45, linewidth=0)
-    ax.plot(middle, mean, color=REAL, linewidth=1.5, label="real")
-
-
-def _means(group: int, *series: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " groups"]]:
-    """The mean of every ``group`` samples; the last group may be smaller."""
-    starts = np.arange(0, len(series[0]), group)
-    counts = np.diff(np.append(starts, len(series[0])))
-    return [np.add.reduceat(values, starts) / counts for values in series]
-
-
 @torch.no_grad()
 def heat_exchanger(snapshot: Snapshot) -> Figure:
     """Heat taken by the exchanger and load held by the vent over Δp_V at the set point, for each closure.
@@ -143,9 +136,9 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     figure, axes = panels(3, title=title, size=(7.5, 8.0), sharex=True, height_ratios=(2.0, 2.0, 1.0))
     heat, held, share = axes.flat
     for name, closure in closures(snapshot).items():
-        style = {"color": CLOSURE_COLOURS[name], "linestyle": CLOSURE_LINES[name], "linewidth": 1.8, "label": name}
-        heat.plot(1e-3 * array(drop), array(plant.vent(state, drop[:, None], closure).heat), **style)
-        held.plot(1e-3 * array(drop), array(plant.held_load(state, drop[:, None], closure)), **style)
+        look, action = closure_look(name), drop[:, None]
+        heat.plot(1e-3 * array(drop), array(plant.vent(state, action, closure).heat), **look)
+        held.plot(1e-3 * array(drop), array(plant.held_load(state, action, closure)), **look)
     mean = record.exogenous.mean().item()
     held.axhline(mean, label="mean load of the last episode", **LIMIT_LINE)
     visited = 1e-3 * array(_drop(plant, record.states[:-1], record.actions))
@@ -165,7 +158,42 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
 def _drop(plant: CryogenicTank, states: Float[Tensor, "n 3"], actions: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
     """Pressure drop p − p_1 [Pa], which is less than the action where the back pressure limits it."""
     p = states[:, 2]
-    return p - plant.valve_outlet(p, plant.command.opening(actions[:, 0])[0])
+    return p - plant.valve_outlet(p, plant.opening(actions[:, 0])[0])
+
+
+@torch.no_grad()
+def coefficients(snapshot: Snapshot) -> Figure:
+    """U_s, U_HX and K_JT over each feature of the closure, with the other features at their mean in the last episode.
+
+    Curves are pale where the episode did not visit; the axes extend the visited range by half of it on both sides.
+    """
+    plant = cast(CryogenicTank, snapshot.plant)
+    seen = visited_features(plant, snapshot.record)
+    axes_of = (
+        ("pressure [kPa]", 1e-3 * plant.set_point),
+        ("liquid volume [m³]", plant.volume),
+        ("wall-fluid difference [mK]", 1e3 * plant.superheat_unit),
+        ("valve drop [kPa]", 1e-3 * GREATEST_DROP),
+    )
+    title = f"Coefficients, episode {last_episode(snapshot)}\nother features at their mean in the episode"
+    figure, axes = panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")
+    for column, (label, unit) in enumerate(axes_of):
+        low, high = seen[:, column].min(), seen[:, column].max()
+        reach = 0.5 * (high - low).clamp(min=1e-6)
+        points = seen.mean(0).repeat(121, 1)
+        ends = (low - reach).item(), (high + reach).item()
+        points[:, column] = torch.linspace(*ends, 121, dtype=seen.dtype, device=seen.device)
+        x, inside = unit * points[:, column], (points[:, column] >= low) & (points[:, column] <= high)
+        for name, closure in closures(snapshot).items():
+            for ax, values, (_, factor) in zip(axes[:, column], closure(points).T, LABELS.values(), strict=True):
+                ax.plot(array(x), factor * array(values), **closure_look(name))
+        for ax, (name, _) in zip(axes[:, column], LABELS.values(), strict=True):
+            ax.set_yscale("log")
+            veil(ax, array(x), array(inside))
+            caption(ax, name if column == 0 else "")
+        axes[-1, column].set_xlabel(label)
+    legend_below(figure, [axes[0, 0]])
+    return figure
 
 
 @torch.no_grad()
@@ -179,7 +207,7 @@ def vent_path(snapshot: Snapshot) -> Figure:
     last = slice(-min(len(record.actions), round(DAY / plant.dt)), None)
     states, drop = record.states[:-1][last], _drop(plant, record.states[:-1][last], record.actions[last]).mean()
     state = states.mean(0)
-    effectiveness = plant.vent(state, plant.command.of_drop(drop)[None], plant.closure).effectiveness.item()
+    effectiveness = plant.vent(state, plant.action_of(drop)[None], plant.closure).effectiveness.item()
     path = VentPath.of(plant.saturation.fluid, state[2].item(), drop.item(), effectiveness)
     hours = len(states) * plant.dt / 3600.0
     title = f"Path of the vented {plant.saturation.fluid.lower()}, episode {last_episode(snapshot)}"
@@ -257,3 +285,89 @@ def _zoom(ax: Axes, path: VentPath) -> None:
     ax.ticklabel_format(axis="y", useOffset=False)
     for name, place, offset in zip("123", zip(path.s, path.T, strict=True), ((8, 7), (8, -14), (6, -14)), strict=False):
         ax.annotate(name, (1e-3 * place[0], place[1]), offset, textcoords="offset points", fontsize=11)
+
+
+def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
+    """Write the last real episode as a GIF of five seconds.
+
+    The tank shows the share of its volume that is liquid, the heat load as an arrow through the wall, and the vent flow
+    as puffs behind the valve, as many as its share of the greatest flow of the episode. Beside it stand pressure with
+    its set point, vent flow and load up to the present.
+
+    Args:
+        snapshot: snapshot with the episode.
+        path: path of the file, which ends in ``.gif``.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: if the file has another suffix.
+    """
+    return save_scene(_Scene(snapshot), len(snapshot.record.actions), path)
+
+
+class _Scene(TracedScene):
+    """The picture at the start of any interval of the record."""
+
+    @torch.no_grad()
+    def __init__(self, snapshot: Snapshot):
+        plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
+        state, n = record.states[:-1], len(record.actions)
+        super().__init__(snapshot, 3, title="Cryogenic tank", size=(9.0, 5.2), width_ratios=(1.0, 1.5))
+        self.pressure, self.fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
+        self.flow = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow)
+        self.load = array(record.exogenous[:, 0])
+        self._draw_tank()
+        held = np.full(n, 1e-3 * plant.set_point)
+        above, middle, below = self.beside
+        thin = {"linewidth": 0.8}
+        self.traces = [
+            Trace(above, self.time, self.pressure, "pressure $p$ [kPa]", setpoint=held),
+            Trace(middle, self.time, self.flow, r"vent flow $\dot m_c$ [g/s]", style=thin | {"color": SAMPLES}),
+            Trace(below, self.time, self.load, plant.inputs[0].label, style=thin | {"color": TWIN}),
+        ]
+
+    def _draw_tank(self) -> None:
+        ax = self.ax
+        ax.set(xlim=(-1.9, 1.9), ylim=(-1.3, 2.3), aspect="equal")
+        ax.axis("off")
+        round_ = np.linspace(0.0, 2.0 * np.pi, 181)
+        self.wall = np.stack([np.cos(round_), np.sin(round_)], -1)
+        (self.liquid,) = ax.fill([0.0], [0.0], color=FILTERED, alpha=0.8)
+        (self.shell,) = ax.plot(*self.wall.T, color=REAL, linewidth=3.0)
+        ax.plot([0.0, 0.0], [1.0, 1.35], color=REAL, linewidth=3.0)
+        (self.valve,) = ax.plot([0.0], [1.35], marker="D", color=REAL, markersize=8)
+        (self.puffs,) = ax.plot([], [], "o", color="0.7", markersize=5, alpha=0.8)
+        self.arrow = ax.quiver(
+            [-1.75], [0.0], [0.0], [0.0], color=TWIN, angles="xy", scale_units="xy", scale=1.0, width=0.02
+        )
+        self.note = ax.text(-1.85, -1.25, "", fontsize=9)
+        self.own += [self.liquid, self.shell, self.valve, self.puffs, self.arrow, self.note]
+
+    def show(self, k: int) -> None:
+        """Move everything to sample ``k``."""
+        height = level(self.fill[k])
+        # From one edge of the surface along the wall to the other.
+        half = np.arccos(-height)
+        angle = np.linspace(-half, half, 91)
+        self.liquid.set_xy(np.stack([np.sin(angle), -np.cos(angle)], -1))
+        greatest = self.flow.max() or 1.0
+        count = round(PUFFS * self.flow[k] / greatest)
+        rise = np.arange(count) / PUFFS
+        self.puffs.set_data(0.25 * np.sin(9.0 * rise + k) * (0.3 + rise), 1.5 + 0.75 * rise)
+        self.valve.set_color(SAMPLES if count else REAL)
+        self.arrow.set_UVC([0.7 * self.load[k] / self.load.max()], [0.0])
+        self.note.set_text(f"load {self.load[k]:.0f} W, {100.0 * self.fill[k]:.1f} % liquid")
+        for trace in self.traces:
+            trace.show(k)
+        self.caption.show(f"time {self.time[k]:.1f} {self.unit}", f"{self.pressure[k]:.0f} kPa")
+
+
+def level(fill: float) -> float:
+    """Height of the liquid in a sphere of radius 1, from its centre, of which a share of the volume is filled.
+
+    The share is (1 + h)²(2 − h)/4.
+    """
+    heights = np.linspace(-1.0, 1.0, 401)
+    return float(np.interp(fill, 0.25 * (1.0 + heights) ** 2 * (2.0 - heights), heights))

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 CELLS = 128
 """Number of pieces of the spline: over 80 … 900 kPa of hydrogen values err by 1e-7 of their maximum, slopes by 2e-6."""
 DEGREE = 5
-LAYOUT = 1
+LAYOUT = 2
 """Version of the cached array; a file of another version is fitted again."""
 TOLERANCE = 1e-6
 """Greatest error of a value between the nodes, over its maximum, at which a fit is accepted."""
@@ -35,11 +35,10 @@ class Properties(NamedTuple):
     rho_v: Tensor  # [kg/m³]
     h_l: Tensor  # [J/kg]
     h_v: Tensor  # [J/kg]
-    c_p: Tensor  # heat capacity of the liquid [J/(kg K)]
 
 
 class Saturation(nn.Module):
-    r"""T, ρ_l, ρ_v, h_l, h_v and c_p,l of a pure fluid over its saturation pressure.
+    r"""T, ρ_l, ρ_v, h_l and h_v of a pure fluid over its saturation pressure.
 
     The functions are quintic splines in ln p through the values of CoolProp on an even grid. A floor gives the cell of
     a pressure, one gather the coefficients of all properties, and Horner's rule their values and slopes,
@@ -117,7 +116,7 @@ class Saturation(nn.Module):
 
 
 @cache
-def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
+def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
     """Spline coefficients [cell, power, property], from memory, from the user's cache, or fitted."""
     # Another version of CoolProp may have other equations of state.
     path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
@@ -134,7 +133,7 @@ def cache_folder() -> Path:
     return user_cache_path("rt_torchrl")
 
 
-def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 6"] | None:
+def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 5"] | None:
     """The cached table; None if there is no table, or it cannot be read or does not agree with its name."""
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -146,7 +145,7 @@ def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]
     return table if whole and np.array_equal(limits, [low, high]) else None
 
 
-def _save(path: Path, table: Float[np.ndarray, "cells 6 6"], low: float, high: float) -> None:
+def _save(path: Path, table: Float[np.ndarray, "cells 6 5"], low: float, high: float) -> None:
     """Write a table so that other processes see it whole or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -157,7 +156,7 @@ def _save(path: Path, table: Float[np.ndarray, "cells 6 6"], low: float, high: f
         return  # Without the file the next process needs a second more; this one has its fit.
 
 
-def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 6"]:
+def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
     """Fit the spline coefficients to CoolProp and compare them with it between the nodes.
 
     Raises:
@@ -208,21 +207,13 @@ def _open_fluid(fluid: str, low: float, high: float) -> Any:
     return fluid_state
 
 
-def _from_coolprop(fluid_state: Any, pressures: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
+def _from_coolprop(fluid_state: Any, pressures: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 5"]:
     import CoolProp.CoolProp as CP
 
     rows = []
     for p in pressures:
         fluid_state.update(CP.PQ_INPUTS, float(p), 0.0)
         liquid, vapour = fluid_state.saturated_liquid_keyed_output, fluid_state.saturated_vapor_keyed_output
-        rows.append(
-            (
-                fluid_state.T(),
-                liquid(CP.iDmass),
-                vapour(CP.iDmass),
-                liquid(CP.iHmass),
-                vapour(CP.iHmass),
-                liquid(CP.iCpmass),
-            )
-        )
+        densities, enthalpies = ((liquid(key), vapour(key)) for key in (CP.iDmass, CP.iHmass))
+        rows.append((fluid_state.T(), *densities, *enthalpies))
     return np.array(rows)

@@ -1,23 +1,24 @@
-"""Figures of the flapping-wing drone: its flight, the polars of its wings, its policies."""
+"""Figures of the flapping-wing drone: its flight, the polars of its wings, its policies, and an animation."""
 
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
-from rt_torchrl.envs.flapping_wing.measurements import ERRORS
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
 from rt_torchrl.evaluation.closure_error import visited_features as features_of
+from rt_torchrl.figures.animation import MovingCaption, save_scene
 from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import (
-    CLOSURE_LINES,
     LARGE_SCALE,
     LIMIT_LINE,
     REAL,
@@ -27,18 +28,20 @@ from rt_torchrl.figures.style import (
     TWIN,
     array,
     caption,
+    closure_look,
     closures,
+    draw_groups,
     last_episode,
     legend_above,
     legend_below,
     limits,
+    means_of_groups,
     panels,
     time_axis,
     twin_label,
     veil,
 )
 
-POLAR_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 SPAN_SHARE = 0.7
 """Place of the angle of attack along the wing, from root 0 to tip 1; the outer wing makes most of the force."""
 BIN = 5.0
@@ -82,15 +85,8 @@ def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     ax.margins(0.09)
     second = np.arange(round(1.0 / plant.dt), len(real), round(1.0 / plant.dt))
     ax.plot(*real[second, :2].T, "o", color=REAL, markersize=4.5, label="every second")
-    style: dict[str, Any] = {
-        "color": SAMPLES,
-        "width": 0.005,
-        "zorder": 3,
-        "units": "width",
-        "scale": 24.0,
-        "scale_units": "width",
-    }
-    arrows = ax.quiver(*real[second, :2].T, -wind[second - 1], np.zeros(len(second)), **style)
+    style: dict[str, Any] = {"color": SAMPLES, "width": 0.005, "zorder": 3, "units": "width", "scale_units": "width"}
+    arrows = ax.quiver(*real[second, :2].T, -wind[second - 1], np.zeros(len(second)), scale=24.0, **style)
     key = {"labelpos": "N", "coordinates": "axes", "angle": 180.0, "fontproperties": {"size": 9}}
     ax.quiverkey(arrows, 0.9, 0.06, 2.0, "wind 2 m/s", **key)
     _label_seconds(ax, real[second, :2])
@@ -155,6 +151,7 @@ def flight(snapshot: Snapshot) -> Figure:
     applied = array(snapshot.record.actions)
     time, label = time_axis(plant, len(real))
     beat = round(1.0 / (plant.frequency * plant.dt))
+    of_beats: dict[str, Any] = {"linewidth": 1.9, "label": "range within each beat"}
     title = f"Flight, episode {last_episode(snapshot)}\nspeeds and actions: mean over each wing beat"
     figure, axes = panels(3, 2, title=title, size=(11.0, 7.4), sharex=True)
     for k, ax in enumerate(axes[0]):
@@ -163,32 +160,18 @@ def flight(snapshot: Snapshot) -> Figure:
         ax.axhline(plant.target[k].item(), label="target", **REFERENCE_LINE)
         caption(ax, plant.states[k].label)
     for k, ax in enumerate(axes[1], 2):
-        _draw_beats(ax, time[:-1], real[:-1, k], beat)
-        ax.plot(*_mean_over_beats(beat, time[:-1], twin[:-1, k]), color=TWIN, linewidth=0.9, label=twin_label(snapshot))
+        draw_groups(ax, time[:-1], real[:-1, k], beat, **of_beats)
+        ax.plot(*means_of_groups(beat, time[:-1], twin[:-1, k]), color=TWIN, linewidth=0.9, label=twin_label(snapshot))
         ax.axhline(0.0, label="target", **REFERENCE_LINE)
         caption(ax, plant.states[k].label)
     for ax, k in zip(axes[2], (1, 0), strict=True):
-        _draw_beats(ax, time[:-1], applied[:, k], beat)
+        draw_groups(ax, time[:-1], applied[:, k], beat, **of_beats)
         limits(ax, plant.actions[k])
         caption(ax, plant.actions[k].label)
         ax.set_xlabel(label)
     axes[0, 0].set_xlim(time[0], time[-1])
     legend_below(figure, axes[:, 0].tolist())
     return figure
-
-
-def _draw_beats(ax: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], beat: int) -> None:
-    starts, (middle, mean) = np.arange(0, len(values), beat), _mean_over_beats(beat, time, values)
-    least, greatest = (extreme.reduceat(values, starts) for extreme in (np.minimum, np.maximum))
-    ax.fill_between(middle, least, greatest, color=SAMPLES, alpha=0.45, linewidth=0, label="range within each beat")
-    ax.plot(middle, mean, color=REAL, linewidth=1.9, label="real")
-
-
-def _mean_over_beats(beat: int, *series: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " beats"]]:
-    """The mean of every ``beat`` samples; the last group may be shorter."""
-    starts = np.arange(0, len(series[0]), beat)
-    counts = np.diff(np.append(starts, len(series[0])))
-    return [np.add.reduceat(values, starts) / counts for values in series]
 
 
 @torch.no_grad()
@@ -226,7 +209,7 @@ def polars(snapshot: Snapshot) -> Figure:
 def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     """(sin α_e, cos α_e) in the last real flight, at the blade element nearest to ``SPAN_SHARE`` of the span."""
     plant = cast(FlappingWing, snapshot.plant)
-    element = (plant.wings.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
+    element = (plant.radius - plant.wing_root - SPAN_SHARE * plant.wing_length).abs().argmin()
     return features_of(plant, snapshot.record)[:, element]
 
 
@@ -241,9 +224,8 @@ def _draw_polars(axes: np.ndarray, snapshot: Snapshot) -> None:
     radians = torch.deg2rad(angle)
     features = torch.stack([radians.sin(), radians.cos()], -1)
     for name, closure in closures(snapshot).items():
-        coefficients, style = array(closure(features)), {"linestyle": CLOSURE_LINES[name], "linewidth": 1.8}
-        for ax, values in zip(axes, coefficients.T, strict=True):
-            ax.plot(array(angle), values, color=POLAR_COLOURS[name], label=name, **style)
+        for ax, values in zip(axes, array(closure(features)).T, strict=True):
+            ax.plot(array(angle), values, **closure_look(name))
 
 
 def _coefficients(snapshot: Snapshot) -> list[str]:
@@ -271,3 +253,97 @@ def control_surfaces(snapshot: Snapshot) -> Figure:
         contours(snapshot, k, {(0, 2): pair[0], (1, 3): pair[1]}, others=zero)
     legend_below(figure, [axes[0, 0]])
     return figure
+
+
+def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
+    """Write the last real flight as a GIF, in real time if it lasts five seconds.
+
+    The drone is drawn enlarged: its body, its stroke plane with the pitch β_w and a length proportional to A_φ, the
+    normal along which it is pushed, and the wing at its phase in the stroke. At 25 frames per second a beat of 20 Hz
+    looks like a beat of 5 Hz.
+
+    Args:
+        snapshot: snapshot with the flight.
+        path: path of the file, which ends in ``.gif``.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: if the file has another suffix.
+    """
+    return save_scene(_Scene(snapshot), len(snapshot.record.states), path)
+
+
+class _Scene:
+    """The picture at any sample of the record."""
+
+    def __init__(self, snapshot: Snapshot):
+        self.plant = cast(FlappingWing, snapshot.plant)
+        self.place = array(snapshot.record.states)[:, :2]
+        # The sample at the end has no interval of its own; it shows the last interval.
+        last = len(snapshot.record.actions) - 1
+        held = np.minimum(np.arange(len(self.place)), last)
+        self.actions, self.wind = array(snapshot.record.actions)[held], array(snapshot.record.exogenous)[held, 0]
+        title = f"Flight, episode {last_episode(snapshot)}"
+        self.figure, ((self.ax,),) = panels(1, title=title, size=(6.2, 6.4))
+        self._draw_still()
+        self._prepare_moving()
+
+    def _draw_still(self) -> None:
+        ax, target = self.ax, array(self.plant.target)
+        ax.plot(*target, "*", color=REFERENCE, markersize=16, label="target")
+        low, high = _square(np.vstack([self.place, target]))
+        self.width = high[0] - low[0]
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        ax.set_xlabel(self.plant.states[0].label)
+        ax.set_ylabel(self.plant.states[1].label)
+
+    def _prepare_moving(self) -> None:
+        ax = self.ax
+        self.caption = MovingCaption(ax)
+        bar = {"solid_capstyle": "round"}
+        (self.trail,) = ax.plot([], [], color="0.6", linewidth=1.4)
+        (self.plane,) = ax.plot([], [], color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$", **bar)
+        (self.normal,) = ax.plot([], [], color="0.45", linewidth=1.5, label="normal")
+        (self.wing,) = ax.plot([], [], color=REAL, linewidth=2.5, label="wing", **bar)
+        (self.body,) = ax.plot([], [], "o", color=REAL, markersize=6)
+        legend_below(self.figure, [ax])
+        arrow = {"color": SAMPLES, "scale": 12.0, "scale_units": "width", "width": 0.009}
+        self.arrow = ax.quiver([0.2], [0.93], [0.0], [0.0], transform=ax.transAxes, **arrow)
+        self.wind_text = ax.text(0.2, 0.96, "", transform=ax.transAxes, ha="center", fontsize=9)
+
+    @property
+    def moving(self) -> list[Artist]:
+        """What :meth:`show` moves."""
+        drone: list[Artist] = [self.trail, self.plane, self.normal, self.wing, self.body]
+        return [*drone, self.arrow, self.wind_text, *self.caption.moving]
+
+    def show(self, k: int) -> None:
+        """Move everything to sample ``k``."""
+        A_phi, beta_w = self.actions[k]
+        t, body = k * self.plant.dt, self.place[k]
+        along, across = _stroke_axes(np.radians(beta_w))
+        reach = 0.075 * self.width * A_phi / self.plant.actions[0].high
+        phase = np.cos(2.0 * np.pi * self.plant.frequency * t)
+        self.trail.set_data(*self.place[: k + 1].T)
+        self.plane.set_data(*np.stack([body - reach * along, body + reach * along], -1))
+        self.wing.set_data(*np.stack([body, body + reach * phase * along], -1))
+        self.normal.set_data(*np.stack([body, body + reach * across], -1))
+        self.body.set_data(*body[:, None])
+        self.arrow.set_UVC([-self.wind[k]], [0.0])
+        self.wind_text.set_text(f"headwind {round(self.wind[k], 1) + 0.0:.1f} m/s")
+        note = rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
+        self.caption.show(f"time {t:.2f} s", note)
+
+
+def _stroke_axes(beta_w: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Unit vectors in (x, z) along the stroke plane and across it, upwards; β_w in rad."""
+    return np.array([np.cos(beta_w), np.sin(beta_w)]), np.array([-np.sin(beta_w), np.cos(beta_w)])
+
+
+def _square(points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Corners of a square around all points, with a margin for the drone."""
+    low, high = points.min(0), points.max(0)
+    half = 0.6 * max((high - low).max(), 1e-3)
+    return 0.5 * (low + high) - half, 0.5 * (low + high) + half

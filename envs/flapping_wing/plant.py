@@ -2,28 +2,133 @@ r"""The flapping-wing micro air vehicle as a plant: a point mass under two beati
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from rt_torchrl.envs.flapping_wing import measurements as sensors
-from rt_torchrl.envs.flapping_wing import memory
-from rt_torchrl.envs.flapping_wing import merit as judgement
-from rt_torchrl.envs.flapping_wing.costs import TrackingCost, needs_memory, require_rate
+from rt_torchrl.envs.flapping_wing import unknown
+from rt_torchrl.envs.flapping_wing.closures import NeuralPolar, QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
-from rt_torchrl.envs.flapping_wing.models import QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.neural import drawn_neural_polar
-from rt_torchrl.envs.flapping_wing.suspects import further_suspects, suspects
-from rt_torchrl.envs.flapping_wing.wings import Wings
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.plant import Plant, RunningCost
+from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
 from rt_torchrl.plants.policies import SaturatedAffine
-from rt_torchrl.plants.sampling import require_stable_step
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.sampling import between, lag, require_stable_step
+from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
+from rt_torchrl.plants.signal import Measurement, Phase, Signal
 
 MASSES = (1e-5, 0.05)
 """Masses of which the lightest has a thousandth, and the heaviest ten times the weight that the wings carry [kg]."""
+FREQUENCY = 20.0
+"""f of the wing beat [Hz]."""
+POSITION_FILTER = 50.0
+"""ω_F [rad/s]; its lag of 20 ms is short for a flight of seconds."""
+WINDOW_WIDTH = 0.71
+"""σ of the cost's window h [m]."""
+HOVER_AMPLITUDE = 77.2
+"""Flapping amplitude A_0 that carries the weight in calm air [deg]."""
+STROKE_PLANE_RATE = 1000.0
+"""Unit of the rate of the stroke plane in the cost [deg/s]."""
+STROKE_PLANE_RATES = (60.0, 1e9)
+"""Greatest rates of the stroke plane; with the least one it takes a second for its range, and a flight takes five."""
+
+POSITIONS = (Signal(symbol="x", name="forward_position", unit="m"), Signal(symbol="z", name="height", unit="m"))
+SPEEDS = (
+    Signal(symbol=r"\dot x", name="forward_speed", unit="m/s"),
+    Signal(symbol=r"\dot z", name="climb_speed", unit="m/s"),
+)
+BODY = len(POSITIONS + SPEEDS)
+"""Number of states of the body, which stand before those that its controller remembers."""
+FILTERED = (
+    Signal(symbol="x_F", name="filtered_position", unit="m"),
+    Signal(symbol="z_F", name="filtered_height", unit="m"),
+)
+"""States that a drone has if one of ``OF_FILTERED`` is observed."""
+ACTIONS = (
+    Signal(symbol=r"A_\phi", name="flapping_amplitude", unit="deg", low=50.0, high=88.0),
+    Signal(symbol=r"\beta_w", name="stroke_plane_angle", unit="deg", low=-30.0, high=30.0),
+)
+HEADWIND = Signal(symbol=r"u_\infty", name="headwind", unit="m/s")
+
+
+# What the sensors give: the way to the target along an axis, its rate, and the rate that a filter of the position tells
+
+
+def error(axis: int, plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The way x_{f,i} − x_i to the target [m]."""
+    return plant.target[axis] - state[..., axis]
+
+
+def error_rate(axis: int, plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The rate −ẋ_i of the way [m/s]."""
+    return -state[..., 2 + axis]
+
+
+def filtered_rate(axis: int, plant: "FlappingWing", t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
+    """The rate ω_F (x_{F,i} − x_i) of the way [m/s]."""
+    return POSITION_FILTER * (state[..., axis - 2] - state[..., axis])
+
+
+STROKE_PLANE = Measurement.of(ACTIONS[1], scale=30.0)
+"""The stroke plane angle that was applied last, of a drone that remembers it."""
+OF_FILTERED = (
+    Measurement(symbol=r"\dot e_{x,F}", name="filtered_rate_x", unit="m/s", read=partial(filtered_rate, 0)),
+    Measurement(symbol=r"\dot e_{z,F}", name="filtered_rate_z", unit="m/s", read=partial(filtered_rate, 1)),
+)
+COSINE, SINE = Phase("cosine", 1.0 / FREQUENCY), Phase("sine", 1.0 / FREQUENCY)
+"""Phase of the wing beat; the wings are furthest forwards at its cosine, and pitch as its sine."""
+ERRORS = ("error_x", "error_z", "error_rate_x", "error_rate_z")
+POSITION = ("error_x", "error_z", "filtered_rate_x", "filtered_rate_z")
+PHASE = ("phase_cosine", "phase_sine")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingCost:
+    r"""The paper's cost of the way to the target, and of what the flight takes.
+
+    .. math::
+        L_a = \tfrac12\big(\|e\|^2 + \alpha_1\|\dot e\circ h\|^2\big) + w_E\Big(\frac{A_\phi}{A_0}\Big)^3
+        + w_\beta\Big(\frac{\dot\beta_w}{1000\,\mathrm{deg/s}}\Big)^2, \qquad
+        h_i = \hat h_i\exp\Big[-\frac12\Big(\frac{x_i - x_{f,i}}{\sigma}\Big)^2\Big]
+
+    with the position error e (paper, eq. drone_eq_rewardCont). The power of wings that beat at one frequency goes with
+    the cube of their amplitude; A_0 = 77.2 deg carries the weight.
+
+    Note: the paper prints a peak ĥ of x_f²/2; here it is 1, because its text calls the function unitary.
+    ``peak="printed"`` gives the printed peak.
+
+    Args:
+        velocity: weight α1 of the speed near the target.
+        peak: height of the Gaussian window h: 1, or the printed x_f²/2.
+        energy: weight w_E of the power of the wings.
+        rate: weight w_β of the rate of the stroke plane; a drone with it remembers the angle that it applied last.
+
+    Raises:
+        ValueError: if a weight is negative, or the peak is unknown.
+    """
+
+    velocity: float = 1.0
+    peak: Literal["unit", "printed"] = "unit"
+    energy: float = 0.0
+    rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_weights(self)
+
+    def __call__(self, plant: "FlappingWing", t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
+        e = plant.target - state[..., :2]
+        peak = 1.0 if self.peak == "unit" else 0.5 * plant.target**2
+        h = peak * torch.exp(-0.5 * (e / WINDOW_WIDTH) ** 2)
+        cost = 0.5 * ((e**2).sum(-1) + self.velocity * ((state[..., 2:4] * h) ** 2).sum(-1))
+        if self.energy:
+            cost = cost + self.energy * (applied[..., 0] / HOVER_AMPLITUDE) ** 3
+        if self.rate:
+            cost = cost + self.rate * ((applied[..., 1] - state[..., BODY]) / (plant.dt * STROKE_PLANE_RATE)) ** 2
+        return cost
 
 
 class FlappingWing(Plant):
@@ -51,7 +156,15 @@ class FlappingWing(Plant):
     e     error_rate_z         :math:`\dot e_z = -\dot z/v`                       -     about ±5
     ====  ===================  =================================================  ====  =============
 
-    The table shows the paper's observation e; ``observe`` chooses others.
+    The table shows the paper's observation e; ``observe`` chooses others. A controller may remember the stroke plane
+    angle that it applied last, and low-passed positions, which are further states: a sensor of the position alone tells
+    the speed by a filter, whose difference from the position is the speed behind it,
+
+    .. math:: \dot x_F = \omega_F(x - x_F), \qquad \hat{\dot x} = \omega_F(x - x_F)
+
+    The chord of the wings is a quarter ellipse along the span. With r = R_0 + R sin θ it is c(r) = (4c̄/π)√(1 − ((r −
+    R_0)/R)²) = (4c̄/π) cos θ, and c dr is (4c̄R/π) cos²θ dθ. This is smooth up to the tip, where c(r) itself has an
+    infinite slope: six Gauss nodes suffice.
 
     Note: the paper prints no number of wings; here there are two, which carry the weight at 77.2 deg, because a single
     wing cannot within the range of A_φ.
@@ -62,12 +175,12 @@ class FlappingWing(Plant):
         closure: closure for C_L and C_D of the real wings; None for the paper's polar.
         wind: source of the headwind.
         target: position x_f and z_f of the target [m].
-        cost: running cost L_a, see ``costs.py``; None for the paper's.
+        cost: running cost L_a, such as :class:`TrackingCost`; None for the paper's.
         mass: mass m_b of the body [kg].
         stroke_plane_rate: greatest rate of the stroke plane angle [deg/s]; None for none, as in the paper, so that the
             angle may flip within a wing beat. With it the angle that was applied last is a fifth state.
-        observe: names of measurements and observation sets in ``measurements.py``; by default the paper's errors. The
-            low-passed positions are two more states, the last ones, if one of these needs them.
+        observe: names of ``measurements`` and ``observation_sets``; by default the paper's errors. The low-passed
+            positions are two more states, the last ones, if one of these needs them.
 
     Raises:
         ValueError: for a mass, rate or target that a drone of this kind cannot have, an unknown measurement, or a step
@@ -78,7 +191,7 @@ class FlappingWing(Plant):
 
     gravity = 9.81  # g [m/s²]
     air_density = 1.225  # ρ [kg/m³]
-    frequency = 20.0  # f [Hz]
+    frequency = FREQUENCY
     pitching_amplitude = 45.0  # A_α [deg]
     wing_root = 0.0225  # R_0 [m]
     wing_length = 0.05  # R [m]; the tip is at R_0 + R
@@ -89,15 +202,41 @@ class FlappingWing(Plant):
     strongest_wind = 2.554  # [m/s]; the trim in it needs β_w = −30 deg
     least_steps_per_beat = 20
 
-    states: tuple[Signal, ...] = sensors.STATES
-    actions = sensors.ACTIONS
-    inputs = sensors.INPUTS
-    measurements = sensors.MEASUREMENTS
-    observation_sets = sensors.OBSERVATION_SETS
+    states: tuple[Signal, ...] = POSITIONS + SPEEDS
+    actions = ACTIONS
+    inputs = (HEADWIND,)
+    # ℓ = 2 m and v = 1 m/s: with these, good policies have weights of 1 to 2, which suit one learning rate.
+    measurements = (
+        Measurement(symbol="e_x", name="error_x", unit="m", read=partial(error, 0), scale=2.0),
+        Measurement(symbol="e_z", name="error_z", unit="m", read=partial(error, 1), scale=2.0),
+        Measurement(symbol=r"\dot e_x", name="error_rate_x", unit="m/s", read=partial(error_rate, 0)),
+        Measurement(symbol=r"\dot e_z", name="error_rate_z", unit="m/s", read=partial(error_rate, 1)),
+        Measurement.of(HEADWIND, offset=1.0),
+        Measurement(symbol=r"\cos 2\pi ft", name="phase_cosine", unit="-", low=-1.0, high=1.0, read=COSINE),
+        Measurement(symbol=r"\sin 2\pi ft", name="phase_sine", unit="-", low=-1.0, high=1.0, read=SINE),
+        STROKE_PLANE,
+        *OF_FILTERED,
+    )
+    observation_sets = {
+        "paper": ERRORS,
+        "errors": ERRORS,
+        "wind": (*ERRORS, "headwind"),
+        "phase": (*ERRORS, *PHASE),
+        "measured": (*ERRORS, *PHASE),
+        "measured+wind": (*ERRORS, *PHASE, "headwind"),
+        "position": (*POSITION, *PHASE),
+        "position+wind": (*POSITION, *PHASE, "headwind"),
+    }
+    """The paper's errors of position and speed; these with the wind; with the phase of the wing beat; with both; and
+    what a sensor of the position alone tells, with the phase, and with the wind."""
 
     target: Tensor
     mass: Tensor
     weight: Tensor
+    radius: Tensor
+    """Distances r_j of the blade elements from the flapping axis [m]."""
+    strip_mass: Tensor
+    """Weights ρ c(r_j) dr_j of the elements of both wings [kg/m]."""
 
     def __init__(
         self,
@@ -117,27 +256,25 @@ class FlappingWing(Plant):
         for coordinate in target:
             require_range("target", coordinate, -1e3, 1e3, unit="m", of="the drone")
         require_range("mass", mass, *MASSES, unit="kg", of="the drone")
+        require_rate(stroke_plane_rate)
         self.wind = GaussianGust() if wind is None else wind
         self.cost = TrackingCost() if cost is None else cost
-        require_rate(stroke_plane_rate)
         self.stroke_plane_rate, self._greatest_turn = stroke_plane_rate, (stroke_plane_rate or 0.0) * dt
-        turns = stroke_plane_rate or needs_memory(self.cost) or sensors.STROKE_PLANE in self.observed
-        filters = any(measurement in sensors.OF_FILTERED for measurement in self.observed)
+        charged = isinstance(self.cost, TrackingCost) and self.cost.rate > 0.0
+        turns = stroke_plane_rate or charged or STROKE_PLANE in self.observed
+        filters = any(measurement in OF_FILTERED for measurement in self.observed)
         self.remembered, self.filtered = 1 if turns else 0, 2 if filters else 0
-        held = (*sensors.ACTIONS[1:][: self.remembered], *sensors.FILTERED[: self.filtered])
-        self.states, self.controller_states = (*sensors.STATES, *held), tuple(signal.name for signal in held)
-        x_f = torch.tensor(target, dtype=torch.float64)
-        self.register_buffer("target", x_f)
+        held = (*ACTIONS[1:][: self.remembered], *FILTERED[: self.filtered])
+        self.states, self.controller_states = (*POSITIONS, *SPEEDS, *held), tuple(signal.name for signal in held)
+        self.register_buffer("target", torch.tensor(target, dtype=torch.float64))
         self.register_buffer("mass", torch.tensor(mass, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor([0.0, -mass * self.gravity], dtype=torch.float64))
-        self.wings = Wings(
-            root=self.wing_root,
-            length=self.wing_length,
-            mean_chord=self.mean_chord,
-            nodes=self.span_nodes,
-            air_density=self.air_density,
-            smallest_airspeed=self.smallest_airspeed,
-        )
+        places, weights = np.polynomial.legendre.leggauss(self.span_nodes)
+        theta = torch.from_numpy(0.25 * math.pi * (places + 1.0))
+        area = 4.0 * self.mean_chord * self.wing_length / math.pi * theta.cos() ** 2
+        self.register_buffer("radius", self.wing_root + self.wing_length * theta.sin())
+        # The two wings have ½ρ c dr each.
+        self.register_buffer("strip_mass", self.air_density * area * 0.25 * math.pi * torch.from_numpy(weights))
         self._require_resolved_step()
 
     def _require_resolved_step(self) -> None:
@@ -147,13 +284,8 @@ class FlappingWing(Plant):
                 f"dt={self.dt} s does not resolve the wing beat of plant {self.name!r} at {self.frequency:g} Hz; "
                 f"use dt <= {longest:g} s, {self.least_steps_per_beat} steps per beat."
             )
-        require_stable_step(
-            self.name,
-            self.dt,
-            self.damping_rate(),
-            mode="the body's velocity at full stroke",
-            remedy="a closure with less drag",
-        )
+        mode, remedy = "the body's velocity at full stroke", "a closure with less drag"
+        require_stable_step(self.name, self.dt, self.damping_rate(), mode=mode, remedy=remedy)
 
     def damping_rate(self) -> float:
         """Fastest decay rate [1/s] of the body's velocity over a beat at the largest stroke, from hover in calm air."""
@@ -170,14 +302,7 @@ class FlappingWing(Plant):
 
     # The system
 
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        action: Float[Tensor, "*batch 2"],
-        exogenous: Float[Tensor, "*#batch 1"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch n_s"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         r"""Velocity and acceleration of the body, paper eqs. (drone_eq_x) and (drone_eq_y).
 
         Args:
@@ -192,21 +317,16 @@ class FlappingWing(Plant):
         relative = torch.cat([velocity[..., :1] + exogenous, velocity[..., 1:]], -1)
         force = self.force(t, relative, action, closure)
         # The angle that was applied last is held, and the filters follow the position, or there are no such states.
-        held = torch.zeros_like(state[..., 4 : 4 + self.remembered])
-        filters = memory.filter_rates(state, self.filtered)
-        return torch.cat([velocity, (force + self.weight) / self.mass, held, filters], -1)
+        held = torch.zeros_like(state[..., BODY : BODY + self.remembered])
+        return torch.cat([velocity, (force + self.weight) / self.mass, held, self._filter_rates(state)], -1)
 
     def force(
-        self,
-        t: Float[Tensor, "*#batch"],
-        relative: Float[Tensor, "*batch 2"],
-        action: Float[Tensor, "*batch 2"],
-        closure: nn.Module,
+        self, t: Time, relative: Float[Tensor, "*batch 2"], action: Action, closure: nn.Module
     ) -> Float[Tensor, "*batch 2"]:
         r"""Forces F_x and F_z [N] of wings and body, which move at ``relative`` [m/s] to the air.
 
         R_2(β_w) turns the velocity into the stroke frame and R_3(φ) into the flapping frame; their transposes turn the
-        force back. The lateral forces of the two :class:`Wings` cancel.
+        force back. The lateral forces of the two wings cancel.
 
         Note: the paper turns [ẋ, ẏ, 0]; here it is [ẋ + u_∞, 0, ż], because the motion is in the plane (x, z).
         """
@@ -219,30 +339,83 @@ class FlappingWing(Plant):
         sin_beta, cos_beta = torch.sin(beta_w), torch.cos(beta_w)
         v_x, v_z = relative.unbind(-1)
         stroke_x, stroke_z = cos_beta * v_x + sin_beta * v_z, cos_beta * v_z - sin_beta * v_x
-        F_x, F_z = self.wings.force(cos_phi * stroke_x, stroke_z, phi_dot, alpha, closure)
+        F_x, F_z = self.wing_force(cos_phi * stroke_x, stroke_z, phi_dot, alpha, closure)
         wings = torch.stack([cos_beta * cos_phi * F_x - sin_beta * F_z, sin_beta * cos_phi * F_x + cos_beta * F_z], -1)
         speed = torch.sqrt(v_x**2 + v_z**2 + self.smallest_airspeed**2).unsqueeze(-1)
         return wings - 0.5 * self.air_density * self.body_drag_area * speed * relative
 
-    def actuate(
-        self, state: Float[Tensor, "*batch n_s"], command: Float[Tensor, "*batch 2"]
-    ) -> Float[Tensor, "*batch 2"]:
+    def wing_force(
+        self, v_x: Tensor, v_z: Tensor, phi_dot: Tensor, alpha: Tensor, closure: nn.Module
+    ) -> tuple[Tensor, Tensor]:
+        r"""Forces F_x and F_z [N] of both wings in the flapping frame, paper eqs. (drone_eq_lift) to (drone_eq_Cdrag).
+
+        .. math::
+            \begin{pmatrix}F_x\\F_z\end{pmatrix} = \int\rho\,c(r)\,|U|\left[-C_D\begin{pmatrix}U_x\\U_z\end{pmatrix}
+            + C_L\begin{pmatrix}-U_z\\U_x\end{pmatrix}\right]dr, \quad U_x = v_x - \dot\phi r,\; U_z = v_z
+
+        Only the coefficients need the wing frame, (U_ξ, U_ζ) = R_2(α)(U_x, U_z): in every frame drag lies along the
+        velocity and lift a quarter turn ahead of it. The flow along the span carries no force and is dropped.
+
+        Note: the paper prints R_2(α) with the sign of R_2(β_w); here it has the opposite sign, [[cos, −sin], [sin,
+        cos]] in (x, z), because with the printed sign the lift points downwards on both half-strokes.
+        Note: |U| is √(U_x² + U_z² + ε²), which keeps direction and slope finite where the wing meets still air.
+
+        Args:
+            v_x: velocity of the root to the air along x of the flapping frame [m/s].
+            v_z: velocity of the root to the air along z of the flapping frame [m/s].
+            phi_dot: flapping rate φ̇ [rad/s].
+            alpha: pitch α of the wings about their span [rad].
+            closure: closure from (sin α_e, cos α_e) to C_L and C_D [-] of a blade element.
+        """
+        U_x, U_z = v_x.unsqueeze(-1) - phi_dot.unsqueeze(-1) * self.radius, v_z.unsqueeze(-1)
+        sin_alpha, cos_alpha = torch.sin(alpha).unsqueeze(-1), torch.cos(alpha).unsqueeze(-1)
+        U_xi, U_zeta = cos_alpha * U_x - sin_alpha * U_z, sin_alpha * U_x + cos_alpha * U_z
+        speed = torch.sqrt(U_x**2 + U_z**2 + self.smallest_airspeed**2)
+        C_L, C_D = closure(torch.stack([U_xi / speed, U_zeta / speed], -1)).unbind(-1)
+        pressure = self.strip_mass * speed
+        return -(pressure * (C_D * U_x + C_L * U_z)).sum(-1), (pressure * (C_L * U_x - C_D * U_z)).sum(-1)
+
+    def actuate(self, state: State, command: Action) -> Action:
         """The command, in which the stroke plane turns by at most its rate times dt."""
         if self.stroke_plane_rate is None:
             return command
-        change = (command[..., 1] - state[..., 4]).clamp(-self._greatest_turn, self._greatest_turn)
-        return torch.stack([command[..., 0], state[..., 4] + change], -1)
+        change = (command[..., 1] - state[..., BODY]).clamp(-self._greatest_turn, self._greatest_turn)
+        return torch.stack([command[..., 0], state[..., BODY] + change], -1)
+
+    # What a controller remembers
+
+    def _filter_rates(self, state: State) -> Tensor:
+        """Rates of the low-passed positions [m/s], the last states; these rates are the speeds that they tell."""
+        count = self.filtered
+        return POSITION_FILTER * (state[..., :count] - state[..., state.shape[-1] - count :])
+
+    def latch(self, state: State, applied: Action) -> State:
+        """The end state, with the stroke plane angle that was applied, if there is a state for it."""
+        angle = applied[..., 1:][..., : self.remembered]
+        return torch.cat([state[..., :BODY], angle, state[..., BODY + self.remembered :]], -1)
+
+    def seen_velocity(self, state: State) -> Float[Tensor, "*batch 2"]:
+        """Speed [m/s] as a controller knows it: by the filters of the position if there are any, or as measured."""
+        return self._filter_rates(state) if self.filtered else state[..., 2:BODY]
+
+    def controller_start(self, measured: Float[Tensor, "*batch n_y"], exogenous: Input) -> Float[Tensor, "*batch n_c"]:
+        """The memory of a controller that is switched on: an upright stroke plane, and settled filters."""
+        upright = measured.new_zeros(*measured.shape[:-1], self.remembered)
+        return torch.cat([upright, measured[..., : self.filtered]], -1)
+
+    def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
+        """All states along a log; what a controller would have remembered follows from the others."""
+        completed = {ACTIONS[1].name: torch.cat([actions[:1, 1], actions[:, 1]])}
+        for position, signal in zip(POSITIONS, FILTERED[: self.filtered], strict=False):
+            if position.name in measured:
+                place = measured[position.name]
+                completed[signal.name] = lag(place[0], between(place), self.dt * POSITION_FILTER)
+        return super().complete_states(completed | measured, exogenous, actions)
 
     # The control problem
 
-    def running_cost(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch n_s"],
-        applied: Float[Tensor, "*batch 2"],
-        exogenous: Float[Tensor, "*#batch 1"],
-    ) -> Float[Tensor, "*batch"]:
-        """The cost of the task, see ``costs.py``."""
+    def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
+        """The cost of the task, such as :class:`TrackingCost`."""
         return self.cost(self, t, state, applied, exogenous)
 
     @property
@@ -250,20 +423,34 @@ class FlappingWing(Plant):
         """Scales in which L_p is ½‖x − x̌‖² [m²] of the positions (paper, eq. drone_eq_Jp)."""
         return (1.0, 1.0, *(math.inf,) * (len(self.states) - 2))
 
-    latch, controller_start, seen_velocity = memory.latch, memory.started, memory.seen_velocity
-    merit, setpoints, categories, make_neural_closure, suspects, further_suspects = (
-        judgement.merit,
-        judgement.setpoints,
-        judgement.categories,
-        drawn_neural_polar,
-        suspects,
-        further_suspects,
-    )
+    def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
+        """Distance to the target at the end and its least value, mean power of the wings, and travel of the plane.
 
-    def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
-        """All states; what a controller remembers follows from the others."""
-        found = memory.completed(self, measured, exogenous, actions)
-        return super().complete_states(found, exogenous, actions)
+        The power is that of the amplitude cubed, as a share of the power that carries the weight.
+        """
+        distance = (self.target - states[..., :2]).norm(dim=-1)
+        return {
+            "final distance [m]": distance[:, -1],
+            "least distance [m]": distance.amin(-1),
+            "wing power [-]": ((applied[..., 0] / HOVER_AMPLITUDE) ** 3).mean(-1),
+            "stroke plane travel [deg/s]": applied[..., 1].diff(dim=-1).abs().mean(-1) / self.dt,
+        }
+
+    def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
+        """Whether the stroke plane can turn far enough for the wind of the last second, when the drone should hover.
+
+        In a stronger gust every policy is blown away from the target, and the distance says nothing of the policy.
+        """
+        last = round(1.0 / self.dt)
+        held = exogenous[:, -last:, 0].amax(-1) <= self.strongest_wind
+        return {"gust can be held": held, "gust too strong to hold": ~held}
+
+    def setpoints(self, states: State, applied: Action, exogenous: Input) -> dict[str, tuple[Scalar, Scalar]]:
+        """Both coordinates, with those of the target."""
+        place, target = states[..., :2], self.target.expand_as(states[..., :2])
+        return {f"{axis} [m]": (place[..., k], target[..., k]) for k, axis in enumerate(("x", "z"))}
+
+    suspects, further_suspects = unknown.suspects, unknown.further_suspects
 
     # Randomness
 
@@ -275,10 +462,24 @@ class FlappingWing(Plant):
         """Headwind u_∞ [m/s]."""
         return self.wind.draw(batch, self.n_steps, self.dt, generator).unsqueeze(-1)
 
-    def make_closure(self, generator: torch.Generator) -> nn.Module:
+    def make_closure(self, generator: torch.Generator) -> QuasiSteadyPolar:
         """The paper's polar with random coefficients within ±50 % of the true ones."""
         return QuasiSteadyPolar.draw(generator)
+
+    def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
+        """A neural closure that starts at a draw of the paper's."""
+        return NeuralPolar(self.make_closure(generator), hidden=hidden, generator=generator)
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The paper's policy: one affine law with offset per action through the smooth clip, ten weights for errors."""
         return SaturatedAffine(len(self.observations), self.actions, weight_scale=0.2, generator=generator)
+
+
+def require_rate(rate: float | None) -> None:
+    """Refuse a greatest rate of the stroke plane [deg/s] that no drone has; None means no limit.
+
+    Raises:
+        ValueError: if the rate is not within ``STROKE_PLANE_RATES``.
+    """
+    if rate is not None:
+        require_range("stroke_plane_rate", rate, *STROKE_PLANE_RATES, unit="deg/s", of="the drone")

@@ -1,18 +1,30 @@
-"""Real drones that their twin does not know, by name; parameters without a source are engineering guesses."""
+"""What a real drone may have beside its twin: systems by name, and what the plant suspects.
 
-from collections.abc import Mapping, Sequence
+Parameters without a source are engineering guesses.
+"""
+
+from collections.abc import Mapping
 from functools import partial
 
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.plants.actuators import LaggedActuator, ResonantActuator, ScaledActuator
 from rt_torchrl.plants.coefficients import LaggedCoefficients
 from rt_torchrl.plants.extension import System, combined, require_systems
+from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.sensors import UnreadInput
 
 AMPLITUDE, PLANE = "flapping_amplitude", "stroke_plane_angle"
 STAGES = 12
 """Number of lags of a dead time, whose response thus rises within 30 % of it."""
+FIRST_LAG, FIRST_DELAY, SHORT_DELAY = 0.05, 0.1, 0.02
+"""Lag of a wing beat, and dead times of both actuators and of a link that an elastic plane follows [s].
+
+The identification begins with them.
+"""
+FIRST_FREQUENCY, FIRST_DAMPING = 10.0, 0.5
+"""Elastic mount of the stroke plane [rad/s], [-] with which the identification begins; it settles within 1 s."""
+UNKNOWN_ACCELERATION = 2.0
+"""Size of an unknown acceleration [m/s²], a fifth of gravity."""
 
 
 def tilting(plant: Plant, *, frequency: float, damping: float) -> Plant:
@@ -57,14 +69,14 @@ def gusty(plant: Plant) -> Plant:
     return UnreadInput(plant, "headwind", 0.5, (0.9, 2.1, 4.7))
 
 
-def lifting_late(plant: FlappingWing) -> Plant:
+def lifting_late(plant: Plant) -> Plant:
     """Blade elements whose lift and drag follow the flow with a lag, as after Wagner.
 
     Time constant 2 ms: two to three half chords of 5 mm at the 6 m/s of a wing's middle, the time in which Wagner's
     function makes up half of what is missing.
     """
-    elements = (plant.span_nodes,)
-    return LaggedCoefficients(plant, 2e-3, (0.0, 0.0) * plant.span_nodes, elements=elements)
+    elements = plant.get_buffer("radius").shape
+    return LaggedCoefficients(plant, 2e-3, (0.0, 0.0) * elements.numel(), elements=tuple(elements))
 
 
 PARTS = ("wings", "wind", "supply", "stroke plane", "drives", "link")
@@ -95,19 +107,37 @@ SYSTEMS: Mapping[str, System] = {
 """What the real drone has beside its twin, by the names of ``--unknown``."""
 
 
-def require_unknown(names: Sequence[str]) -> None:
-    """Refuse names that do not exist, or change the same part.
-
-    Raises:
-        ValueError: if there are such names.
-    """
-    require_systems(names, SYSTEMS)
+require_unknown = partial(require_systems, systems=SYSTEMS)
+"""Refuses names that do not exist, or change the same part."""
+unknown = partial(combined, systems=SYSTEMS, parts=PARTS)
+"""``unknown(plant, names)`` is the real drone that has all that the names say; its twin is ``plant``."""
 
 
-def unknown(plant: FlappingWing, names: Sequence[str]) -> Plant:
-    """The real drone that has all that the names say; its twin is ``plant``.
+def suspects(plant: Plant) -> Mapping[str, Plant]:
+    """Lags and dead times of the stroke plane and of the amplitude, and an elastic stroke plane behind a dead time."""
 
-    Raises:
-        ValueError: if a name does not exist, or two of them change the same part.
-    """
-    return combined(plant, names, SYSTEMS, PARTS)
+    def delayed(base: Plant, action: str) -> Plant:
+        return LaggedActuator(base, action, FIRST_DELAY, stages=4)
+
+    def swinging() -> Plant:
+        return tilting(plant, frequency=FIRST_FREQUENCY, damping=FIRST_DAMPING)
+
+    return {
+        "plane lags": LaggedActuator(plant, PLANE, FIRST_LAG),
+        "plane late": delayed(plant, PLANE),
+        "both lag": LaggedActuator(LaggedActuator(plant, PLANE, FIRST_LAG), AMPLITUDE, FIRST_LAG),
+        "both late": delayed(delayed(plant, PLANE), AMPLITUDE),
+        "plane swings, late": LaggedActuator(swinging(), PLANE, SHORT_DELAY, stages=2),
+        "plane swings, both late": delayed(delayed(swinging(), PLANE), AMPLITUDE),
+    }
+
+
+def further_suspects(plant: Plant) -> Mapping[str, Plant]:
+    """A force of unknown form that depends on the velocity, both actuators and the headwind."""
+    force = NeuralResidual(
+        plant,
+        {"forward_speed": UNKNOWN_ACCELERATION, "climb_speed": UNKNOWN_ACCELERATION},
+        inputs=("forward_speed", "climb_speed", AMPLITUDE, PLANE, "headwind"),
+        ranges={"forward_speed": (-3.0, 3.0), "climb_speed": (-3.0, 3.0), "headwind": (-3.0, 3.0)},
+    )
+    return {"unknown force": force}

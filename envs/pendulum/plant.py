@@ -6,11 +6,49 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.envs.pendulum.merit import merit
-from rt_torchrl.envs.pendulum.models import UniformRod
+from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
+from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Observation, State, States, Time
 from rt_torchrl.plants.signal import Signal
+
+UPRIGHT = 0.25
+"""Angle within which the rod counts as upright [rad]."""
+
+
+class UniformRod(PositiveCoefficients):
+    r"""Mass and length of a uniform rod that turns about its end, with moment of inertia ml²/3.
+
+    .. math:: c_g = \frac{mgl/2}{ml^2/3}\,\frac1g = \frac{3}{2l}, \qquad c_u = \frac{1}{ml^2/3} = \frac{3}{ml^2}
+
+    The coefficients do not depend on the features. Another law for c_g and c_u, such as a perceptron that also learns
+    friction, can replace this closure.
+
+    Args:
+        coefficients: mass m [kg] and length l [m], both positive.
+
+    Raises:
+        ValueError: if there are not two positive, finite coefficients.
+    """
+
+    names = {"mass": "kg", "length": "m"}
+    meanings = {"mass": "mass of the rod", "length": "length of the rod"}
+    true_coefficients = (1.0, 1.0)
+
+    @classmethod
+    def guess(cls, share: float) -> "UniformRod":
+        """A rod whose mass and length are both ``share`` times the true ones.
+
+        Raises:
+            ValueError: if ``share`` is not positive and finite.
+        """
+        return cls(share * torch.tensor(cls.true_coefficients, dtype=torch.float64))
+
+    def forward(self, features: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
+        """c_g [1/m] and c_u [1/(kg m²)], the same at every (cos θ, sin θ, dθ/dt)."""
+        mass, length = self.coefficients.unbind()
+        coefficients = torch.stack([1.5 / length, 3.0 / (mass * length**2)])
+        return coefficients.expand(*features.shape[:-1], 2)
 
 
 class Pendulum(Plant):
@@ -52,9 +90,9 @@ class Pendulum(Plant):
 
     states = (
         Signal(symbol=r"\theta", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
-        Signal(symbol=r"\dot\theta", name="angular_speed", unit="rad/s", low=-8.0, high=8.0),
+        Signal(symbol=r"\dot\theta", name="angular_speed", unit="rad/s", low=-greatest_speed, high=greatest_speed),
     )
-    actions = (Signal(symbol="u", name="torque", unit="N m", low=-2.0, high=2.0),)
+    actions = (Signal(symbol="u", name="torque", unit="N m", low=-greatest_torque, high=greatest_torque),)
     inputs = ()
     observations = (
         Signal(symbol=r"\cos\theta", name="cosine", unit="-", low=-1.0, high=1.0),
@@ -79,14 +117,7 @@ class Pendulum(Plant):
 
     # The system
 
-    def vector_field(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 2"],
-        action: Float[Tensor, "*batch 1"],
-        exogenous: Float[Tensor, "*#batch 0"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch 2"]:
+    def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         r"""The rates dθ/dt and d²θ/dt² = c_g g sin θ + c_u u.
 
         Args:
@@ -101,20 +132,11 @@ class Pendulum(Plant):
         c_g, c_u = closure(torch.stack([theta.cos(), sine, rate], -1)).unbind(-1)
         return torch.stack([rate, c_g * self.gravity * sine + c_u * u], -1)
 
-    def actuate(
-        self, state: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 1"]
-    ) -> Float[Tensor, "*batch 1"]:
+    def actuate(self, state: State, command: Action) -> Action:
         """The torque of the motor, at most ±2 N m."""
         return command.clamp(-self.greatest_torque, self.greatest_torque)
 
-    def advance(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 2"],
-        applied: Float[Tensor, "*batch 1"],
-        exogenous: Float[Tensor, "*#batch 0"],
-        closure: nn.Module,
-    ) -> Float[Tensor, "*batch 2"]:
+    def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         r"""Gymnasium's own step, semi-implicit Euler with a stop at ±8 rad/s, because it is the real system here.
 
         .. math:: \dot\theta' = \mathrm{stop}(\dot\theta + \ddot\theta\,\Delta t), \qquad
@@ -129,20 +151,12 @@ class Pendulum(Plant):
 
     # The control problem
 
-    def observe(
-        self, t: Float[Tensor, "*#batch"], state: Float[Tensor, "*batch 2"], exogenous: Float[Tensor, "*#batch 0"]
-    ) -> Float[Tensor, "*batch 3"]:
+    def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         """Gymnasium's observation cos θ, sin θ and dθ/dt, with the speed scaled to order one."""
         theta, rate = state.unbind(-1)
         return torch.stack([theta.cos(), theta.sin(), rate / self.greatest_speed], -1)
 
-    def running_cost(
-        self,
-        t: Float[Tensor, "*#batch"],
-        state: Float[Tensor, "*batch 2"],
-        applied: Float[Tensor, "*batch 1"],
-        exogenous: Float[Tensor, "*#batch 0"],
-    ) -> Float[Tensor, "*batch"]:
+    def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         """The cost θ² + 0.1 (dθ/dt)² + 0.001 u² with θ within ±π, the negative of Gymnasium's reward."""
         theta, rate = state.unbind(-1)
         return wrapped(theta) ** 2 + 0.1 * rate**2 + 0.001 * applied[..., 0] ** 2
@@ -150,8 +164,13 @@ class Pendulum(Plant):
     discrepancy_scales = (1.0, math.sqrt(15.0))
     """L_p is ½(Δθ² + Δ(dθ/dt)²/ω²) [rad²], with Δθ the short way round and ω² = 15/s² of a hanging rod."""
 
-    def merit(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, Tensor]:
-        return merit(self, states, applied, exogenous)
+    def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
+        """Gymnasium's return, and the share of the episode's last quarter in which the rod is upright."""
+        t = self.dt * torch.arange(applied.shape[1], dtype=states.dtype, device=states.device)
+        cost = self.running_cost(t, states[:, :-1], applied, exogenous)
+        last = states[:, -(applied.shape[1] // 4) :, 0]
+        upright = (torch.atan2(last.sin(), last.cos()).abs() < UPRIGHT).to(states.dtype)
+        return {"return [-]": -cost.sum(-1), "upright in the last quarter [%]": 100.0 * upright.mean(-1)}
 
     # Randomness
 

@@ -9,14 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.options import array_of
 
 Axis = Sequence[float] | np.ndarray
 Rows = Sequence[Sequence[float]] | np.ndarray
 DATA = Path(__file__).parent / "data"
-GREATEST_BYTES = 2**24
-"""Greatest size of a table [bytes]."""
 STALL_KNOT = 0.5
 """Knot between the two pieces of the stall element, as a fraction of the table's least λ."""
 STALL_SHARE = 0.2
@@ -150,11 +147,10 @@ def csv_rows(path: str | Path) -> list[list[str]]:
     Raises:
         ValueError: if the file cannot be read as such a text, or there is no row below the header.
     """
-    require_bounded(path, GREATEST_BYTES)
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
-    except (csv.Error, UnicodeError) as error:
+    except (OSError, csv.Error, UnicodeError) as error:
         raise ValueError(f"path={str(path)!r} is no comma-separated text: {error}") from error
     if len(rows) < 2:
         raise ValueError(

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.options import array_of
 
 PRINTED_TIME_RESOLUTION = 1e-3
@@ -147,7 +146,6 @@ def read_hh(path: str | os.PathLike[str]) -> WindRecord:
 
     Source: Jonkman, *TurbSim User's Guide*, NREL/TP-500-46198; OpenFAST InflowWind, uniform wind.
     """
-    require_bounded(path)
     rows = []
     with open(path, encoding="utf-8", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):

@@ -21,8 +21,7 @@ from torch import nn
 
 from benchmarking.case import System
 from rt_torchrl import Scenario
-from rt_torchrl.envs.flapping_wing.costs import WINDOW_WIDTH
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.plant import WINDOW_WIDTH, FlappingWing
 
 Method = Literal["scalar", "lanes"]
 LANES = 8

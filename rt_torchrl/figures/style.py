@@ -39,6 +39,7 @@ STEPS = {
 LIMIT_LINE: dict[str, Any] = {"color": LIMITS, "linestyle": (0, (5, 3)), "linewidth": 1.2}
 REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
 CLOSURE_LINES: dict[str, Any] = {"true": "-", "twin": (0, (5, 2)), "initial twin": (0, (1, 1.5))}
+CLOSURE_COLOURS = {"true": REAL, "twin": TWIN, "initial twin": "0.55"}
 
 
 def panels(
@@ -131,6 +132,27 @@ def veil(ax: Axes, x: np.ndarray, visited: np.ndarray) -> None:
     """Make a panel pale at every x that was not visited, because no record has taught the twin its values there."""
     whole: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "color": "white", "linewidth": 0}
     ax.fill_between(x, 0.0, 1.0, where=~visited, alpha=0.65, zorder=2.5, **whole)
+
+
+def means_of_groups(group: int, *series: np.ndarray) -> list[np.ndarray]:
+    """The mean of every ``group`` samples of each series; the last group may be smaller."""
+    starts = np.arange(0, len(series[0]), group)
+    counts = np.diff(np.append(starts, len(series[0])))
+    return [np.add.reduceat(values, starts) / counts for values in series]
+
+
+def draw_groups(ax: Axes, time: np.ndarray, values: np.ndarray, group: int, *, linewidth: float, label: str) -> None:
+    """Draw the real record in groups of samples: the mean of each, and its range, which ``label`` names."""
+    starts, (middle, mean) = np.arange(0, len(values), group), means_of_groups(group, time, values)
+    if group > 1:
+        least, greatest = (extreme.reduceat(values, starts) for extreme in (np.minimum, np.maximum))
+        ax.fill_between(middle, least, greatest, color=SAMPLES, alpha=0.45, linewidth=0, label=label)
+    ax.plot(middle, mean, color=REAL, linewidth=linewidth, label="real")
+
+
+def closure_look(name: str) -> dict[str, Any]:
+    """The look of a closure's curve: ``true``, ``twin`` or ``initial twin``."""
+    return {"color": CLOSURE_COLOURS[name], "linestyle": CLOSURE_LINES[name], "linewidth": 1.8, "label": name}
 
 
 def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:

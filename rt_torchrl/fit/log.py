@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.fit.sensors import known_sensors
 from rt_torchrl.options import array_of, check_options
 from rt_torchrl.plants.plant import Plant
@@ -285,7 +284,6 @@ def _read(path: Path) -> Any:
     if kind not in readers:
         raise ValueError(f"log {path} ends in {path.suffix!r}; it must be one of {', '.join(readers)}.")
     try:
-        require_bounded(path)
         frame = readers[kind](path)
     except Exception as error:  # the readers of tables raise errors of many kinds at what is wrong in a file
         raise ValueError(f"log {path} cannot be read: {type(error).__name__}: {error}") from error

@@ -25,3 +25,7 @@ Actions = Float[Tensor, "batch n n_a"]
 """Applied actions of whole episodes."""
 Inputs = Float[Tensor, "batch n n_z"]
 """Exogenous inputs of whole episodes."""
+Scalar = Float[Tensor, "*batch"]
+"""A quantity per realisation."""
+Memory = Float[Tensor, "*batch n_m"]
+"""The memory of a controller."""

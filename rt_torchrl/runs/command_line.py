@@ -10,7 +10,6 @@ from typing import Any, TypeVar, cast
 
 import tyro
 
-from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.runs.machine import quieten_libraries
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
@@ -79,10 +78,9 @@ def of_file(path: Path, asked: RunConfig) -> RunConfig:
             value that it does not take.
     """
     from rt_torchrl.runs.run_settings import as_written  # here, because --help needs none of it
-    from rt_torchrl.runs.settings import BESIDE, GREATEST_BYTES, config_of
+    from rt_torchrl.runs.settings import BESIDE, config_of
 
     try:
-        require_bounded(path, GREATEST_BYTES)
         text = path.read_text(encoding="utf-8")
         if text.startswith("\ufeff"):
             raise ValueError("it begins with a byte-order mark; save it as UTF-8 without one.")

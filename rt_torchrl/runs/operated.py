@@ -12,7 +12,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.cores import chosen_core
-from rt_torchrl.systems.operation.event_log import EventLog, read_events
+from rt_torchrl.systems.operation.event_log import EventLog
 from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.operation.order import FIRST
 from rt_torchrl.systems.operation.process import ProcessOperation
@@ -34,7 +34,7 @@ def learner_threads(config: RunConfig) -> int:
     Threads of torch wait actively: where there are more of them than cores, they take the time from each other.
     """
     options = config.operation
-    beside = config.asynchronous and (options.clock == "wall" or options.replay is not None)
+    beside = config.asynchronous and options.clock == "wall"
     if config.threads or not beside or chosen_core(options.core) is None:
         return config.threads
     return min(torch.get_num_threads(), max(1, len(os.sched_getaffinity(0)) - 1))
@@ -67,9 +67,9 @@ def operation_of(
         folder: run folder, for the log of the events.
 
     Raises:
-        ValueError: if episodes of the plant may end early; if model predictive control is to ask the critic, or the
-            events to be replayed cannot be read; on the wall clock, if there is no function that makes the real system,
-            the device is not the CPU, or what acts cannot be sent to another process.
+        ValueError: if episodes of the plant may end early; if model predictive control is to ask the critic; on the
+            wall clock, if there is no function that makes the real system, the device is not the CPU, or what acts
+            cannot be sent to another process.
     """
     if plant.end_cost is not None:
         raise ValueError(
@@ -92,9 +92,8 @@ def operation_of(
     )
     log = EventLog(folder / EVENTS)
     if options.clock == "simulated":
-        replayed = None if options.replay is None else read_events(options.replay)
         learning = round(options.learning * plant.n_steps)
-        return SimulatedOperation(crew.operator(env), learning=learning, log=log, replayed=replayed)
+        return SimulatedOperation(crew.operator(env), learning=learning, log=log)
     if make_env is None:
         raise ValueError(
             "clock='wall' needs the real system in a process of its own; give Run(..., env=) a function that makes it."

@@ -260,9 +260,6 @@ def _taking_away(live: str, folder: Path, planner: str | None, believed: str | N
         return [model if planned else law]
     if planned:
         model = "model that it plans on" if believed is None else f"twin with {believed}, on which it does not plan,"
-        return [
-            f"let model predictive control act: {call_of('real_time')} {folder}",
-            f"take the {model} away: {call_of('export')} {folder} --what twin",
-        ]
+        return [f"take the {model} away: {call_of('export')} {folder} --what twin"]
     role = "" if live == "model_based" else " --role model_free"
     return [f"take the controller away: {call_of('export')} {folder}{role}"]

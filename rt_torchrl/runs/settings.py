@@ -15,12 +15,10 @@ from typing import Any, Literal
 
 import cattrs
 
-from rt_torchrl.bounded_file import require_bounded
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import PREFIX, attribute, module_of
 
 FILE = "config.json"
-GREATEST_BYTES = 2**24
 RAN = "ran"
 """Key of the list with an entry for every start of the run."""
 BESIDE = ("plant", "recipe", RAN)
@@ -56,7 +54,6 @@ def read_settings(folder: Path) -> dict[str, Any]:
             "as runs/wind_turbine/TIME-seed-0."
         )
     try:
-        require_bounded(file, GREATEST_BYTES)
         settings = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is damaged: {error}") from error

@@ -1,8 +1,8 @@
 """What the study of twinning compares on each plant: its arms, policies, controllers and their sizes."""
 
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.envs.cryogenic_tank.valves import OnOffValve, PIValve
-from rt_torchrl.envs.flapping_wing.pd import TrimmedPD
+from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve
+from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.study.training import CHANGED
 

@@ -1,5 +1,7 @@
 """Figures of the study: how arms learn, and what they cost on the unseen episodes."""
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,10 @@ from matplotlib.ticker import MaxNLocator
 
 from rt_torchrl.figures.style import REAL, REFERENCE, REFERENCE_LINE, ROLES, TWIN, caption, legend_below, panels
 from rt_torchrl.study.arms import SystemResult
-from rt_torchrl.study.names import shown
-from rt_torchrl.study.results import Entry, named
+from rt_torchrl.study.results import Entry, Results, named
+from rt_torchrl.study.tables import shown
 from rt_torchrl.study.training import CHANGED
+from rt_torchrl.study.yardstick import Yardstick
 
 ARMS: dict[str, str] = {"twinning": REAL, **dict(ROLES.items())}
 ARM_SHIFT = {"twinning": -0.2, "model_based": 0.0, "model_free": 0.2}
@@ -25,6 +28,31 @@ WIDEST_LINEAR = 5.0
 """Ratio of the greatest to the least cost above which an axis is logarithmic."""
 WIDEST_LINEAR_SPAN = 50.0
 """Ratio of the greatest to the least abscissa above which its axis is logarithmic."""
+
+
+def draw(folder: Path, results: Results, lines: Mapping[str, Yardstick]) -> list[Path]:
+    """Draw what there are results for into the folder ``figures``; return the paths relative to ``folder``.
+
+    Args:
+        folder: folder of the page.
+        results: results of the study.
+        lines: costs along one quantity, of the plants that have some.
+    """
+    drawn = {"learning": learning(results.entries), "robustness": robustness(results.entries)}
+    if any(results.limits.values()):
+        drawn["limits"] = limits(results.entries, results.limits)
+    if any(results.variants.values()):
+        drawn["variants"] = variants(results.entries, results.variants)
+    if any(CHANGED in of_plant for of_plant in results.variants.values()):
+        drawn["following"] = following(results.entries, results.variants)
+    for plant, line in lines.items():
+        drawn[f"{plant}_{line.path.stem}"] = cost_line(line.run(), results.entries[plant])
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, figure in drawn.items():
+        paths.append(Path("figures") / f"{name}.png")
+        figure.savefig(folder / paths[-1], dpi=110)
+    return paths
 
 
 def learning(entries: dict[str, list[Entry]]) -> Figure:

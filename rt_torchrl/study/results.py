@@ -141,7 +141,7 @@ def weight_error(closure: dict[str, Any]) -> float | None:
 
 
 class Results(NamedTuple):
-    """Everything that the report needs, by plant.
+    """Everything that the study shows, by plant.
 
     Args:
         entries: entries of the nominal table.

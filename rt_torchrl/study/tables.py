@@ -1,12 +1,11 @@
-"""Tables of the report, as Markdown."""
+"""Tables of the study, as Markdown."""
 
 from typing import Any
 
 import numpy as np
 
 from rt_torchrl.figures.style import with_unit
-from rt_torchrl.study.names import shown
-from rt_torchrl.study.results import Entry, named, numeric
+from rt_torchrl.study.results import HALVES, Entry, difference, named, numeric
 
 COST_HEADER = ["J_a", "95 % interval"]
 TWIN_HEADER = ["J_p ratio", "weight error"]
@@ -18,6 +17,11 @@ PAPER = {
 """The paper's table of learning performance: ratios of J_p, of J_a model-based and of J_a model-free."""
 RATIOS = (("J_p_before", "J_p"), ("J_a_before", "J_a_model_based"), ("J_a_before", "J_a_model_free"))
 """Costs before and after training, whose ratios the table gives."""
+
+
+def shown(name: str) -> str:
+    """The name of a plant, an arm or a yardstick as a reader sees it."""
+    return name.replace("_", " ")
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -62,6 +66,25 @@ def variant_table(variants: dict[str, list[Entry]], nominal: list[Entry]) -> str
             cells = [variant, shown(entry.name), *cost_cells(entry), f"{entry.mean / before[entry.name]:.3f}"]
             rows.append([*cells, *merit_cells(entry), *twin_cells(entry)])
     return table(header, rows)
+
+
+def difference_table(variants: dict[str, list[Entry]]) -> str:
+    """95 % intervals of the J_a of twinning, with each policy, minus that of its halves and of classical controllers.
+
+    A negative interval says that twinning costs less, and one that holds zero that nothing is shown.
+
+    Args:
+        variants: entries of a plant by variant, with the nominal ones.
+    """
+    rows = []
+    for variant, entries in variants.items():
+        others = [entry for entry in entries if not entry.name.startswith(("twinning", "oracle"))]
+        for arm in (entry for entry in entries if entry.name.startswith("twinning")):
+            for other in others:
+                if other.name not in HALVES or arm.name == "twinning":  # the halves have its policy
+                    low, high = difference(arm, other)
+                    rows.append([variant, shown(arm.name), shown(other.name), f"{low:.3g} … {high:.3g}"])
+    return table(["", "", "minus", "95 % interval"], rows)
 
 
 def paper_table(summaries: dict[str, list[dict[str, Any]]]) -> str:

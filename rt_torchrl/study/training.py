@@ -40,8 +40,6 @@ class Training:
         folder: run folder.
         episodes: number of real episodes.
         options: further options of the recipe.
-        figures: whether to draw its figures. The report shows those of one training of a plant; drawing takes up to
-            25 s.
     """
 
     recipe: Path
@@ -51,7 +49,6 @@ class Training:
     folder: Path
     episodes: int
     options: tuple[str, ...] = ()
-    figures: bool = False
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
@@ -72,16 +69,15 @@ class Training:
 
     def _usual(self) -> list[str]:
         options = ["--twinning.arm", self.arm, "--episodes", str(self.episodes)]
-        # The report compares costs with the start of each seed, not with random starts.
-        options += ["--figures-every", "0", "--untrained", "0", "--threads", "1"]
-        return [*options, *([] if self.figures else ["--no-figures"])]
+        # The study compares costs with the start of each seed, not with random starts.
+        return [*options, "--figures-every", "0", "--untrained", "0", "--threads", "1", "--no-figures"]
 
     def command(self) -> str:
         """The same as a command line."""
         return " ".join(["uv run", str(self.recipe), *self.arguments()])
 
     def done(self) -> bool:
-        """Whether the results of all episodes are there, and the figures if it draws them.
+        """Whether the results of all episodes are there.
 
         Raises:
             ValueError: if the results are those of other options.
@@ -89,7 +85,7 @@ class Training:
         if self._results() is None:
             return False
         self._require_own_options()
-        return not self.figures or (self.folder / "figures" / "unseen.png").exists()
+        return True
 
     def _require_own_options(self) -> None:
         """Refuse results that a page would mix with those of these options; results by hand have no options."""

@@ -1,4 +1,4 @@
-"""Any FMU for co-simulation as an environment, such as the real system of a training (FMI 2 and 3, by FMPy)."""
+"""Any FMU for co-simulation as an environment, such as the real system of a training (FMI 2, by FMPy)."""
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -83,19 +83,22 @@ class FMUEnvironment(EnvBase):
             description = self._fmpy.read_model_description(str(self.path))
         except Exception as error:  # FMPy raises whatever its parser meets
             raise ValueError(f"path={self.path} is no FMU that can be read: {error}") from error
-        if description.coSimulation is None or not description.fmiVersion.startswith(("2.", "3.")):
+        if description.coSimulation is None or not description.fmiVersion.startswith("2."):
             raise ValueError(
-                f"path={self.path} is an FMU of FMI {description.fmiVersion}; it must be one of FMI 2 or 3 "
-                "for co-simulation."
+                f"path={self.path} is an FMU of FMI {description.fmiVersion}; it must be one of FMI 2 for "
+                "co-simulation."
             )
-        return description, {variable.name: variable.valueReference for variable in description.modelVariables}
+        # Of other types the same references are other variables.
+        real = [variable for variable in description.modelVariables if variable.type == "Real"]
+        return description, {variable.name: variable.valueReference for variable in real}
 
     def _require(self, names: Mapping[str, Sequence[str]]) -> None:
         for what, wanted in names.items():
             unknown = [name for name in wanted if name not in self._places]
             if unknown:
                 raise ValueError(
-                    f"{what} {unknown} do not exist in {self.path.name}; it has {', '.join(self._places)}."
+                    f"{what} {unknown} are no variables of type Real in {self.path.name}; it has "
+                    f"{', '.join(self._places)}."
                 )
 
     def _set_seed(self, seed: int | None) -> None:
@@ -117,13 +120,9 @@ class FMUEnvironment(EnvBase):
 
     def _initialise(self, start: Mapping[str, float]) -> None:
         fmu, stop = self._fmu, self.plant.horizon
-        if self._description.fmiVersion.startswith("2."):
-            self._call("setupExperiment", lambda: fmu.setupExperiment(startTime=0.0, stopTime=stop))
-            self._set(start)
-            self._call("enterInitializationMode", fmu.enterInitializationMode)
-        else:
-            self._set(start)
-            self._call("enterInitializationMode", lambda: fmu.enterInitializationMode(startTime=0.0, stopTime=stop))
+        self._call("setupExperiment", lambda: fmu.setupExperiment(startTime=0.0, stopTime=stop))
+        self._set(start)
+        self._call("enterInitializationMode", fmu.enterInitializationMode)
         self._set(dict(zip(self._exogenous, self._now().tolist(), strict=False)))
         self._call("exitInitializationMode", fmu.exitInitializationMode)
 
@@ -145,13 +144,11 @@ class FMUEnvironment(EnvBase):
     def _set(self, values: Mapping[str, float]) -> None:
         if values:
             places, fmu = [self._places[name] for name in values], self._fmu
-            write = fmu.setReal if self._description.fmiVersion.startswith("2.") else fmu.setFloat64
-            self._call(f"set {', '.join(values)}", lambda: write(places, list(values.values())))
+            self._call(f"set {', '.join(values)}", lambda: fmu.setReal(places, list(values.values())))
 
     def _report(self) -> TensorDict:
         places, fmu = [self._places[name] for name in self._outputs], self._fmu
-        get = fmu.getReal if self._description.fmiVersion.startswith("2.") else fmu.getFloat64
-        found = self._call(f"get {', '.join(self._outputs)}", lambda: get(places))
+        found = self._call(f"get {', '.join(self._outputs)}", lambda: fmu.getReal(places))
         outputs = torch.tensor(list(found), dtype=torch.float64)
         return TensorDict({"outputs": outputs, "exogenous": self._now().clone()}, batch_size=self.batch_size)
 

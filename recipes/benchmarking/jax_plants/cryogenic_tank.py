@@ -9,11 +9,15 @@ from torch import nn
 
 from benchmarking.jax_plants.jax_plant import Array, JaxPlant, Weights
 from benchmarking.jax_plants.networks import bounded_perceptron, saturated, smooth_clip
-from rt_torchrl.envs.cryogenic_tank.costs import PressureCost
-from rt_torchrl.envs.cryogenic_tank.models import CubicVentLaw
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.closures import CubicVentLaw
+from rt_torchrl.envs.cryogenic_tank.plant import (
+    EXCHANGER_AREA,
+    LAMINAR_DROP,
+    ROUNDING_DROP,
+    CryogenicTank,
+    PressureCost,
+)
 from rt_torchrl.envs.cryogenic_tank.saturation import CELLS, DEGREE, Saturation
-from rt_torchrl.envs.cryogenic_tank.vent import EXCHANGER_AREA, LAMINAR_DROP, ROUNDING_DROP
 
 VENTED = PressureCost().vented
 
@@ -26,7 +30,6 @@ class Properties(NamedTuple):
     rho_v: Array
     h_l: Array
     h_v: Array
-    c_p: Array
 
 
 def cryogenic_tank(plant: CryogenicTank, closure: nn.Module, policy: nn.Module) -> JaxPlant:

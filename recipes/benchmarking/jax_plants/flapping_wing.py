@@ -8,8 +8,7 @@ from torch import nn
 
 from benchmarking.jax_plants.jax_plant import Array, JaxPlant, Weights
 from benchmarking.jax_plants.networks import bounded_perceptron, column, saturated, smooth_clip
-from rt_torchrl.envs.flapping_wing.costs import WINDOW_WIDTH
-from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.flapping_wing.plant import WINDOW_WIDTH, FlappingWing
 
 
 def flapping_wing(plant: FlappingWing, closure: nn.Module, policy: nn.Module) -> JaxPlant:
@@ -39,7 +38,7 @@ def _same_state(state: Array, applied: Array) -> Array:
 
 
 def _field(plant: FlappingWing):
-    radius, strip_mass = plant.wings.radius.numpy(), plant.wings.strip_mass.numpy()
+    radius, strip_mass = plant.radius.numpy(), plant.strip_mass.numpy()
     mass, weight = float(plant.mass), float(plant.weight[1])
     rate, epsilon = 2.0 * math.pi * plant.frequency, plant.smallest_airspeed**2
     body = 0.5 * plant.air_density * plant.body_drag_area

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from rt_torchrl.options import check_options
@@ -18,8 +17,6 @@ class OperationConfig:
             wall clock.
         learning: time that learning from one window takes on the simulated clock, as a share of a window. With 0 each
             window begins with what was learned from the one before, as in a run that is not asynchronous.
-        replay: log of events of an earlier run, events.jsonl; the simulated clock then hands policies over in the
-            intervals, and learns from as many windows at a time, as that run did.
         speed: pace of a simulation on the wall clock, in seconds of the plant for each second; real systems keep their
             own time.
         handover: number of control intervals in which the difference between a policy and the one before it fades, if
@@ -38,7 +35,6 @@ class OperationConfig:
 
     clock: Literal["simulated", "wall"] = "simulated"
     learning: float = 0.5
-    replay: Path | None = None
     speed: float = 1.0
     handover: int = 20
     continuous: bool = False
@@ -55,5 +51,3 @@ class OperationConfig:
             raise ValueError(f"handover={self.handover} control intervals must be at least 1.")
         if self.core < -2:
             raise ValueError(f"core={self.core} must be the number of a core, -1 for the last one, or -2 for any.")
-        if self.replay is not None and self.clock == "wall":
-            raise ValueError("replay needs the simulated clock: the wall clock does not repeat.")

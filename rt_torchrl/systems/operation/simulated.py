@@ -1,18 +1,18 @@
 """Operation on a simulated clock: one process, in which the same run repeats to the bit."""
 
-import math
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
 
-from rt_torchrl.systems.operation.event_log import EventLog, counts_taken, first_intervals, stops
+from rt_torchrl.systems.operation.event_log import EventLog
 from rt_torchrl.systems.operation.operator import Operator
 from rt_torchrl.systems.operation.order import Order, OrderBook
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rt_torchrl.systems.safety_report import SafetyReport
 
 
@@ -24,37 +24,23 @@ class SimulatedOperation:
     taken together. A window is computed when the learner takes it, and not before, so that a checkpoint after an
     episode never falls within a window.
 
-    With ``replayed`` the events of an earlier run say instead in which interval each policy took over, and which
-    windows the learner took at a time.
-
     Args:
         operator: what acts.
         learning: time from taking a window to handing the next policy over, in control intervals.
         log: log of the events.
-        replayed: events of an earlier run; None for none.
 
     Raises:
         ValueError: if ``learning`` is negative.
     """
 
-    def __init__(
-        self,
-        operator: Operator,
-        *,
-        learning: int,
-        log: EventLog | None = None,
-        replayed: Sequence[dict[str, Any]] | None = None,
-    ):
+    def __init__(self, operator: Operator, *, learning: int, log: EventLog | None = None):
         if learning < 0:
             raise ValueError(f"learning={learning} control intervals must not be negative.")
         self.operator, self._learning, self.log = operator, learning, log or EventLog()
-        self._starts = None if replayed is None else first_intervals(replayed)
-        self._taken = None if replayed is None else counts_taken(replayed)
-        self._stops = stops(replayed or ())
         self.orders = OrderBook()
         self.report: SafetyReport | None = None
         self.acted: Mapping[str, float] | None = None
-        self._at: dict[int, float] = {}
+        self._at: dict[int, int] = {}
         self.version, self._now = -1, 0
 
     @property
@@ -77,16 +63,12 @@ class SimulatedOperation:
         if self.begun:
             self._now += self._learning
         self.version += 1
-        at = self._now if self._starts is None else self._starts.get(self.version, math.inf)
         self.orders[self.version] = Order.of(self.version, name, policy, strength=strength, found=found)
-        self._at[self.version] = at
+        self._at[self.version] = self._now
         self.log.note("handed over", version=self.version)
 
     def waiting(self) -> bool:
-        if self._taken is None:
-            return (self.operator.windows + 1) * self.operator.length <= self._now
-        windows = self._taken[self.version + 1] if self.version + 1 < len(self._taken) else []
-        return bool(windows) and self.operator.windows <= windows[-1]
+        return (self.operator.windows + 1) * self.operator.length <= self._now
 
     @property
     def system(self) -> EnvBase:
@@ -98,20 +80,12 @@ class SimulatedOperation:
 
         Raises:
             EpisodeEndedError: if the system failed in the window, or ended it.
-            ValueError: if the events that are replayed hold no further window.
         """
-        if self._taken is not None and not self.waiting():
-            raise ValueError(
-                f"replay holds no window {self.operator.windows} after version {self.version}; ask for as many "
-                "episodes as the run had, with its options."
-            )
-        if self.operator.windows in self._stops:
-            self.operator.load_state_dict(self.operator.state_dict())  # what the stop has done to the operation
         first = self.operator.interval
         coming: dict[int, list[Order]] = {}
         for version, at in self._at.items():
             if at < first + self.operator.length:
-                coming.setdefault(max(int(at), first), []).append(self.orders[version])
+                coming.setdefault(max(at, first), []).append(self.orders[version])
         window = self.operator.fly(coming)
         self._at = {version: at for version, at in self._at.items() if version > self.operator.version}
         self._now, self.report = max(self._now, self.operator.interval), window.report
@@ -128,7 +102,7 @@ class SimulatedOperation:
         return {
             "operator": self.operator.state_dict(),
             "orders": self.orders.state_dict(),
-            "at": [(version, float(at)) for version, at in self._at.items()],
+            "at": list(self._at.items()),
             "version": self.version,
             "now": self._now,
         }

@@ -1,11 +1,10 @@
 """The classical controller of the drone, which learned policies are compared with."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.plants.shapes import Action, Memory, State
 
 
 class TrimmedPD(ClassicalController):
@@ -29,9 +28,7 @@ class TrimmedPD(ClassicalController):
     default_gains = (571.0, 397.0, 61.5, 44.0)
     trim = (76.74, -12.50)
 
-    def law(
-        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 0"]
-    ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 0"]]:
+    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         K_Pz, K_Dz, K_Px, K_Dx = self.gains.unbind()
         e_x, e_z = (self.plant.target - state[..., :2]).unbind(-1)
         v_x, v_z = self.plant.seen_velocity(state).unbind(-1)

@@ -1,12 +1,10 @@
 """Classical controllers of the tank's vent, which learned policies are compared with."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.envs.cryogenic_tank.commands import GREATEST_DROP
-from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.cryogenic_tank.plant import GREATEST_DROP, CryogenicTank
+from rt_torchrl.plants.shapes import Action, Memory, State
 
 
 class OnOffValve(ClassicalController):
@@ -19,16 +17,14 @@ class OnOffValve(ClassicalController):
 
     plant: CryogenicTank
     gain_units = {"opening": "Pa"}
-    default_gains: tuple[float, ...] = (200e3,)
+    default_gains: tuple[float, ...] = (GREATEST_DROP,)
     half_band = 1e3  # h [Pa]
     memory_size = 1
 
-    def law(
-        self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 1"]
-    ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
+    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         error = state[..., 2:] - self.plant.set_point
         is_open = torch.where(error > self.half_band, 1.0, torch.where(error < -self.half_band, 0.0, memory))
-        return self.plant.command.of_drop(is_open * self.gains[0]), is_open
+        return self.plant.action_of(is_open * self.gains[0]), is_open
 
 
 class NarrowOnOff(OnOffValve):
@@ -46,17 +42,15 @@ class RestingOnOff(OnOffValve):
     """
 
     gain_units = {"opening": "Pa", "rest": "s"}
-    default_gains = (200e3, 43.2e3)
+    default_gains = (GREATEST_DROP, 43.2e3)
     memory_size = 2
 
-    def law(
-        self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 2"]
-    ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 2"]]:
+    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         opening, rest = self.gains.unbind()
         _, was_open = super().law(state, memory[..., :1])
         t = memory[..., 1:]
         is_open = torch.where(t < self.plant.horizon - rest, was_open, 0.0)
-        return self.plant.command.of_drop(is_open * opening), torch.cat([is_open, t + self.plant.dt], -1)
+        return self.plant.action_of(is_open * opening), torch.cat([is_open, t + self.plant.dt], -1)
 
 
 class PIValve(ClassicalController):
@@ -76,11 +70,9 @@ class PIValve(ClassicalController):
     default_gains = (77.5, 6.1e-10)
     memory_size = 1
 
-    def law(
-        self, state: Float[Tensor, "batch 3"], memory: Float[Tensor, "batch 1"]
-    ) -> tuple[Float[Tensor, "batch 1"], Float[Tensor, "batch 1"]]:
+    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         K_P, K_I = self.gains.unbind()
         error = state[..., 2:] - self.plant.set_point
         # The contribution of the integral to the drop stays within the range of the valve.
         integral = (memory + K_I * error * self.plant.dt).clamp(0.0, GREATEST_DROP)
-        return self.plant.command.of_drop(K_P * error + integral), integral
+        return self.plant.action_of(K_P * error + integral), integral
