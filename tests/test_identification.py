@@ -44,7 +44,7 @@ def test_the_likelihood_of_the_states_with_the_noise_of_their_scales_is_the_cost
     with torch.no_grad():
         likelihood.initial.offsets[:, 0].normal_(0.0, 0.01, generator=generator)
     cost = 0.0
-    for (states, actions, exogenous, start), first in zip(segments, likelihood.initial(), strict=True):
+    for (states, actions, exogenous, start, _), first in zip(segments, likelihood.initial(), strict=True):
         again = twin.replay(first[None], exogenous[None], actions[None], start=start)
         cost = cost + plant.dt * plant.discrepancy(again.states[0], states).sum()
     found, weights = likelihood.normal_equations(), [*twin.closure.parameters(), likelihood.initial.offsets]
@@ -134,7 +134,7 @@ def test_actions_that_the_actuators_would_not_apply_are_told():
     held_back, plant = recipe("identify").held_back, WindTurbine(horizon=20.0)
     (segment,) = flown(plant, torch.Generator().manual_seed(0), (40,))
     assert held_back(plant, [segment]) == {"generator_torque": 0.0, "blade_pitch": 0.0}
-    states, actions, exogenous, _ = segment
+    states, actions, exogenous, *_ = segment
     jump = actions.clone()
     jump[20:, 1] += 10.0
     # The states remember what was applied before: the pitch may move by 4 deg, and only at step 20 it moved by more;

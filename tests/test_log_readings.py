@@ -17,8 +17,11 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation
 from rt_torchrl.fit.log import SensorLog, checked
 from rt_torchrl.fit.resampling import filled, hidden_states, initial_spread, logged_readings, resample, sensors_in
+from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.hypotheses.reread import reread
 
 pd = pytest.importorskip("pandas")
 TESTS = Path(__file__).parent
@@ -139,14 +142,14 @@ def test_the_room_is_identified_from_a_file(room_log, capsys):
         identify.main(identify.Config(**given, missing=True, guess=("wall",)))
 
 
-def slow_log(seed=1, rows=240):
+def slow_log(seed=1, rows=240, noise=0.01):
     """The oscillator of the oracle at every tenth control instant, with a force held from row to row, and noise."""
     plant, generator = LinearQuadratic(horizon=1.0 * rows), torch.Generator().manual_seed(seed)
     force = torch.rand(1, rows, 1, generator=generator, dtype=torch.float64).round().repeat_interleave(10, 1) - 0.5
     start = plant.draw_initial_state(1, generator)
     with torch.no_grad():
         states = Rollout(plant, plant.closure)(start, torch.zeros_like(force), force).states[0, :-1:10]
-    states = (states + 0.01 * torch.randn(states.shape, generator=generator, dtype=torch.float64)).numpy()
+    states = (states + noise * torch.randn(states.shape, generator=generator, dtype=torch.float64)).numpy()
     columns = {"position": states[:, 0], "velocity": states[:, 1], "force": force[0, ::10, 0].numpy()}
     log = SensorLog(times=1.0 * np.arange(rows), columns=columns | {"disturbance": np.zeros(rows)})
     return plant, log
@@ -167,6 +170,21 @@ def test_what_lies_between_the_rows_of_a_slow_log_is_no_measurement():
     assert list(found.noise.values()) == pytest.approx([0.01, 0.01], rel=0.2)
     # White noise correlates by 1/√240 = 0.065 from row to row.
     assert autocorrelation(found.likelihood).abs().max() < 0.25
+
+
+@pytest.mark.parametrize("options", [{"method": "levenberg_marquardt"}, {"descent": DescentConfig(optimiser="lbfgs")}])
+def test_a_training_that_begins_with_a_slow_log_compares_its_rows_alone(options):
+    """Without noise the true weights are found; an interpolated sample of the oscillator is off by up to 1/8 of it."""
+    plant, log = slow_log(rows=60, noise=0.0)
+    (record,) = resample(log, plant).segments
+    assert record.seen.nonzero().flatten().tolist() == list(range(0, 591, 10))
+    closure = LinearClosure(torch.zeros(2, 2))
+    config = AssimilationConfig(iterations=200, inputs="record", **options)
+    found = Assimilation(DigitalTwin(plant, closure), config).update([record], [], 1, torch.Generator())
+    assert found.best < 1e-8 * found.start
+    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-3)
+    short = reread(record, plant, 12).exogenous[:, -1]
+    assert short.nonzero().flatten().tolist() == [0, *(10 * math.ceil(k * 1.2) for k in range(1, 49))]
 
 
 def test_errors_of_a_slow_log_are_those_of_its_rows():

@@ -65,10 +65,12 @@ def sensor_record(plant: Plant, sensors: Sequence[Sensor], record: Trajectory) -
 @torch.no_grad()
 def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -> list[SensorRecord]:
     """What sensors read along each trajectory of a batch; the first states are the guesses."""
-    states, actions, exogenous, start = batch
+    states, actions, exogenous, start, seen = batch
     first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(len(states))
     t = first.unsqueeze(-1) + plant.dt * torch.arange(states.shape[1], dtype=torch.float64, device=states.device)
     readings = read(sensors, plant, t, states, held_to_the_end(exogenous))
+    if seen is not None:
+        readings = torch.where(seen.unsqueeze(-1), readings, torch.nan)
     each = zip(readings, actions, exogenous, states[:, 0], first.tolist(), strict=True)
     return [SensorRecord(*parts) for parts in each]
 

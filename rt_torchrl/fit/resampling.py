@@ -163,7 +163,10 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
         if state.name in log.columns
     }
     states = plant.complete_states(measured, exogenous, actions)
-    return Trajectory(states, actions, exogenous, float(times[0]))
+    seen = torch.zeros(steps + 1, dtype=torch.bool)
+    nearest = np.rint((times - times[0]) / plant.dt).astype(int)
+    seen[torch.from_numpy(nearest[nearest <= steps])] = True
+    return Trajectory(states, actions, exogenous, float(times[0]), None if seen.all() else seen)
 
 
 def _interpolated(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.predictive_control import PredictiveControl
@@ -176,8 +176,7 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
 
 def on(device: torch.device, record: Trajectory) -> Trajectory:
     """The record on a device."""
-    states, actions, exogenous, start = record
-    return Trajectory(states.to(device), actions.to(device), exogenous.to(device), start)
+    return Trajectory(*(part.to(device) if isinstance(part, Tensor) else part for part in record))
 
 
 def _device_of(*modules: nn.Module) -> torch.device:

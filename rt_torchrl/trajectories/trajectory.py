@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant, flight_costs
@@ -25,19 +25,26 @@ class Trajectory(NamedTuple):
         actions: actions that were applied in the n intervals between the states.
         exogenous: exogenous inputs z, held over the same intervals.
         start: time of s_0 on the plant's clock [s], one for all trajectories or one for each.
+        seen: whether the state of each sample was measured; None if all were. Other states, such as those between the
+            rows of a slow log, are interpolated, and no fit compares them.
     """
 
     states: Float[Tensor, "*batch n+1 n_s"]
     actions: Float[Tensor, "*batch n n_a"]
     exogenous: Float[Tensor, "*batch n n_z"]
     start: float | Float[Tensor, " batch"] = 0.0
+    seen: Bool[Tensor, "*batch n+1"] | None = None
 
     def part(self, first: int, last: int, dt: float) -> "Trajectory":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the states around them."""
-        states, actions, exogenous, start = self
-        held = slice(first, last)
+        states, actions, exogenous, start, seen = self
+        held, samples = slice(first, last), slice(first, last + 1)
         return Trajectory(
-            states[..., first : last + 1, :], actions[..., held, :], exogenous[..., held, :], start + first * dt
+            states[..., samples, :],
+            actions[..., held, :],
+            exogenous[..., held, :],
+            start + first * dt,
+            None if seen is None else seen[..., samples],
         )
 
     def segments(self, length: int, dt: float) -> "Trajectory":
@@ -47,23 +54,30 @@ class Trajectory(NamedTuple):
             length: number of control intervals of a segment; a shorter rest at the end is dropped.
             dt: control interval [s].
         """
-        states, actions, exogenous, start = self
+        states, actions, exogenous, start, seen = self
         batch, count = len(states), actions.shape[1] // length
         n = count * length
-        pieces = torch.stack([states[:, k * length : (k + 1) * length + 1] for k in range(count)], 1)
+
+        def pieces(samples: Tensor) -> Tensor:
+            parts = [samples[:, k * length : (k + 1) * length + 1] for k in range(count)]
+            return torch.stack(parts, 1).flatten(0, 1)
+
         time = dt * length * torch.arange(count, dtype=torch.float64, device=states.device)
         first = torch.as_tensor(start, dtype=torch.float64, device=states.device).expand(batch)
         return Trajectory(
-            pieces.flatten(0, 1),
+            pieces(states),
             actions[:, :n].unflatten(1, (count, length)).flatten(0, 1),
             exogenous[:, :n].unflatten(1, (count, length)).flatten(0, 1),
             (first.unsqueeze(-1) + time).flatten(),
+            None if seen is None else pieces(seen),
         )
 
     def each(self) -> "list[Trajectory]":
         """The trajectories of a batch, one by one."""
         starts = torch.as_tensor(self.start, dtype=torch.float64, device="cpu").expand(len(self.states)).tolist()
-        return [Trajectory(*parts) for parts in zip(self.states, self.actions, self.exogenous, starts, strict=True)]
+        seen = [None] * len(starts) if self.seen is None else self.seen
+        parts = zip(self.states, self.actions, self.exogenous, starts, seen, strict=True)
+        return [Trajectory(*part) for part in parts]
 
 
 def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
@@ -72,8 +86,11 @@ def batch_of(trajectories: Sequence[Trajectory]) -> Trajectory:
     actions = torch.stack([each.actions for each in trajectories])
     exogenous = torch.stack([each.exogenous for each in trajectories])
     starts = [float(each.start) for each in trajectories]
-    together = len(set(starts)) == 1
-    return Trajectory(states, actions, exogenous, starts[0] if together else states.new_tensor(starts))
+    together, seen = len(set(starts)) == 1, None
+    if any(each.seen is not None for each in trajectories):
+        every = torch.ones(states.shape[1], dtype=torch.bool, device=states.device)
+        seen = torch.stack([every if each.seen is None else each.seen for each in trajectories])
+    return Trajectory(states, actions, exogenous, starts[0] if together else states.new_tensor(starts), seen)
 
 
 def pieces_of_equal_length(segments: Sequence[Trajectory], longest: int, dt: float) -> list[Trajectory]:
@@ -98,7 +115,7 @@ def control_cost(plant: Plant, trajectory: Trajectory) -> Float[Tensor, " batch"
 
     Where it ends early, it costs L_e from there on; see :mod:`rt_torchrl.plants.plant`.
     """
-    states, actions, exogenous, start = trajectory
+    states, actions, exogenous, start, _ = trajectory
     n = actions.shape[-2]
     clock = plant.dt * torch.arange(n, dtype=torch.float64, device=states.device)
     t = (start.unsqueeze(-1) if isinstance(start, Tensor) else start) + clock
@@ -117,7 +134,11 @@ def continued(inputs: Float[Tensor, "n_e n_z"], n: int) -> Float[Tensor, "n n_z"
 
 
 def identification_cost(
-    plant: Plant, trajectory: Trajectory, measured: Float[Tensor, "batch samples n_s"]
+    plant: Plant,
+    trajectory: Trajectory,
+    measured: Float[Tensor, "batch samples n_s"],
+    seen: Bool[Tensor, "batch samples"] | None = None,
 ) -> Float[Tensor, " batch"]:
-    r"""J_p of each trajectory, :math:`\int L_p(s, \check s)\,dt` over the samples t_1 ... t_n."""
-    return plant.dt * plant.discrepancy(trajectory.states[:, 1:], measured[:, 1:]).sum(-1)
+    r"""J_p of each trajectory, :math:`\int L_p(s, \check s)\,dt` over the samples t_1 ... t_n that were seen."""
+    rates = plant.discrepancy(trajectory.states[:, 1:], measured[:, 1:])
+    return plant.dt * (rates if seen is None else rates * seen[:, 1:]).sum(-1)

@@ -186,9 +186,10 @@ class Assimilation:
         whole = batch_of(records)
         if self.config.inputs == "realisations":
             sampled = torch.cat([process.sample(count, generator) for process in processes])
-            states, actions = (part.repeat_interleave(count, 0) for part in whole[:2])
-            start = whole.start.repeat_interleave(count, 0) if isinstance(whole.start, Tensor) else whole.start
-            whole = Trajectory(states, actions, self.twin.plant.with_previews(sampled), start)
+            states, actions, _, start, seen = (
+                part.repeat_interleave(count, 0) if isinstance(part, Tensor) else part for part in whole
+            )
+            whole = Trajectory(states, actions, self.twin.plant.with_previews(sampled), start, seen)
         if not self.config.segment:
             return self._descend_anew(whole)
         before = self.cost_of(whole)
@@ -244,9 +245,9 @@ class Assimilation:
         return found[0]._replace(best=min((one.best for one in found), default=math.nan))
 
     def _identification_cost(self, replayed: Trajectory) -> Tensor:
-        measured, actions, exogenous, start = replayed
-        flown = self.twin.replay(measured[:, 0], exogenous, actions, start=start)
-        return identification_cost(self.twin.plant, flown, measured).mean()
+        states, actions, exogenous, start, seen = replayed
+        flown = self.twin.replay(states[:, 0], exogenous, actions, start=start)
+        return identification_cost(self.twin.plant, flown, states, seen).mean()
 
     @torch.no_grad()
     def cost_of(self, whole: Trajectory) -> float:

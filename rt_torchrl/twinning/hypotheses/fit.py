@@ -151,8 +151,8 @@ def misfit(twin: DigitalTwin, records: Sequence[Trajectory], segment: int) -> fl
     """Mean J_p with which a twin replays segments of the records; infinite if it diverges."""
     try:
         stacked = batch_of([with_hidden_states(twin, record) for record in records])
-        measured, actions, exogenous, start = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
-        flown = twin.replay(measured[:, 0], exogenous, actions, start=start)
+        pieces = stacked.segments(min(segment, stacked.actions.shape[1]), twin.plant.dt)
+        flown = twin.replay(pieces.states[:, 0], pieces.exogenous, pieces.actions, start=pieces.start)
     except DivergenceError:
         return float("inf")
-    return identification_cost(twin.plant, flown, measured).mean().item()
+    return identification_cost(twin.plant, flown, pieces.states, pieces.seen).mean().item()

@@ -51,7 +51,12 @@ def reread(record: Trajectory, plant: Plant, segment: int) -> Trajectory:
     """
     read = record.states[:-1]
     flag = torch.zeros_like(read[:, :1])
-    flag[::segment] = 1.0
+    starts = torch.arange(0, len(read), segment, device=read.device)
+    if record.seen is not None:  # from each start on, the next sample that was measured
+        measured = record.seen[:-1].nonzero().flatten()
+        place = torch.searchsorted(measured, starts)
+        starts = measured[place[place < len(measured)]]
+    flag[starts] = 1.0
     return at_rest(record, plant)._replace(exogenous=torch.cat([record.exogenous, read, flag], -1))
 
 

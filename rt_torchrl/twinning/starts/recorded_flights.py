@@ -39,7 +39,7 @@ def transitions_of(plant: Plant, record: Trajectory) -> TensorDict:
 
     The last one pays the terminal cost if the record is as long as an episode.
     """
-    states, actions, inputs, start = record
+    states, actions, inputs, start, _ = record
     n = len(actions)
     t = start + plant.dt * torch.arange(n + 1, dtype=torch.float64, device=states.device)
     # There is no input after the last interval; the last input takes its place.
