@@ -55,7 +55,7 @@ class LaggedPower(Extension):
         missing = hidden[..., 0] * MEGA / speed - torque
         field = plant.vector_field(t, base, action, exogenous, inner)
         accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
-        rate = -(missing * speed).unsqueeze(-1) / (MEGA * closure.get_submodule("own")()[0])
+        rate = -(missing * speed).unsqueeze(-1) / (MEGA * self.coefficients(closure)[0])
         return torch.cat([accelerated, field[..., 1:], rate], -1)
 
     def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 1"]:

@@ -89,10 +89,8 @@ class PositiveCoefficients(nn.Module):
             return self.log_coefficients.exp()
         return self.first * torch.exp(math.log(self.factor) * torch.tanh(self.weights))
 
-    def forward(self, features: Float[Tensor, "*batch f"] | None = None) -> Float[Tensor, "*batch n"]:
-        """The coefficients for every row of features, or once, in the order of ``names``."""
-        if features is None:
-            return self.coefficients
+    def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch n"]:
+        """The coefficients for every row of features, in the order of ``names``."""
         return self.coefficients.expand(*features.shape[:-1], len(self.names))
 
     def named_coefficients(self) -> dict[str, Tensor]:

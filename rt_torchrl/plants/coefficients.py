@@ -86,11 +86,11 @@ class LaggedCoefficients(Extension):
         lagging = _Lagging(self.of_base(closure), self._at_places(held), torch.ones_like(self.initial[0]))
         field = self.base.vector_field(t, base, action, exogenous, lagging)
         said = lagging.said[0].reshape(held.shape)
-        return torch.cat([field, (said - held) / closure.get_submodule("own")()[0]], -1)
+        return torch.cat([field, (said - held) / self.coefficients(closure)[0]], -1)
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         base, held = self.split(state)
-        steps = self.dt / closure.get_submodule("own")()[0]
+        steps = self.dt / self.coefficients(closure)[0]
         left = torch.exp(-steps)
         lagging = _Lagging(self.of_base(closure), self._at_places(held), (1.0 - left) / steps)
         end = self.base.advance(t, base, applied, exogenous, lagging)

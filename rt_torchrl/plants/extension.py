@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.closures import PositiveCoefficients
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import (
     Action,
@@ -153,6 +154,12 @@ class Extension(Plant):
     def of_base(self, closure: nn.Module) -> nn.Module:
         """The part of the closure that belongs to the plant."""
         return closure.get_submodule("base") if self._parameterised else closure
+
+    def coefficients(self, closure: nn.Module) -> Float[Tensor, " n"]:
+        """The extension's own coefficients in a closure, where its parameters are :class:`PositiveCoefficients`."""
+        own = closure.get_submodule("own")
+        assert isinstance(own, PositiveCoefficients)
+        return own.coefficients
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         base, hidden = self.split(state)
