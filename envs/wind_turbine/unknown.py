@@ -14,7 +14,7 @@ from torch import nn
 from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
 from rt_torchrl.plants.coefficients import ScaledCoefficients
-from rt_torchrl.plants.extension import Extension, System, combined, own_coefficients, replaced, require_systems
+from rt_torchrl.plants.extension import Extension, System, combined, replaced, require_systems
 from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Input, Inputs, State, Time
@@ -74,7 +74,7 @@ class LaggedInflow(Extension):
             # The floor is that of the torque, where the rotor hardly turns.
             speed = torch.maximum(base[..., 0], plant.least_tip_speed_ratio * u / plant.radius)
             missing = hidden[..., 0] * MEGA / speed - torque
-            rate = -(missing * speed) / (MEGA * own_coefficients(closure)[0])
+            rate = -(missing * speed) / (MEGA * self.coefficients(closure)[0])
         accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
         return torch.cat([accelerated, field[..., 1:], rate.unsqueeze(-1)], -1)
 

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.extension import Extension, own_coefficients, place_of, replaced, settled
+from rt_torchrl.plants.extension import Extension, place_of, replaced, settled
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Hidden, State
 from rt_torchrl.plants.signal import Signal
@@ -49,7 +49,7 @@ class LaggedActuator(Extension):
         super().__init__(base, hidden, own)
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
-        steps = self.dt * self.stages / own_coefficients(closure)[0]
+        steps = self.dt * self.stages / self.coefficients(closure)[0]
         left = torch.exp(-steps)
         share = (1.0 - left) / steps
         mean, ends = applied[..., self.place], []
@@ -61,7 +61,7 @@ class LaggedActuator(Extension):
 
     def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
         before = torch.cat([applied[..., self.place : self.place + 1], hidden[..., :-1]], -1)
-        return (before - hidden) * self.stages / own_coefficients(closure)[0]
+        return (before - hidden) * self.stages / self.coefficients(closure)[0]
 
     def acting(self, hidden: Hidden, applied: Action) -> Action:
         return replaced(applied, self.place, hidden[..., -1])
@@ -103,7 +103,7 @@ class ResonantActuator(Extension):
 
     def respond(self, hidden: Hidden, applied: Action, closure: nn.Module) -> tuple[Action, Hidden]:
         asked, (x, v) = applied[..., self.place], hidden.unbind(-1)
-        omega, odds = own_coefficients(closure).unbind()
+        omega, odds = self.coefficients(closure).unbind()
         zeta = odds / (1.0 + odds)
         decay, ringing = zeta * omega, omega * torch.sqrt(1.0 - zeta * zeta)
         left, turn = torch.exp(-decay * self.dt), ringing * self.dt
@@ -116,7 +116,7 @@ class ResonantActuator(Extension):
 
     def rates(self, hidden: Hidden, applied: Action, closure: nn.Module) -> Hidden:
         x, v = hidden.unbind(-1)
-        omega, odds = own_coefficients(closure).unbind()
+        omega, odds = self.coefficients(closure).unbind()
         zeta = odds / (1.0 + odds)
         pull = omega * omega * (applied[..., self.place] - x)
         return torch.stack([v, pull - 2.0 * zeta * omega * v], -1)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.closures import FACTOR, PositiveCoefficients
-from rt_torchrl.plants.extension import Extension, own_coefficients
+from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.shapes import Action, Hidden, Input, State, Time
 from rt_torchrl.plants.signal import Signal
@@ -86,11 +86,11 @@ class LaggedCoefficients(Extension):
         lagging = _Lagging(self.of_base(closure), self._at_places(held), torch.ones_like(self.initial[0]))
         field = self.base.vector_field(t, base, action, exogenous, lagging)
         said = lagging.said[0].reshape(held.shape)
-        return torch.cat([field, (said - held) / own_coefficients(closure)[0]], -1)
+        return torch.cat([field, (said - held) / self.coefficients(closure)[0]], -1)
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         base, held = self.split(state)
-        steps = self.dt / own_coefficients(closure)[0]
+        steps = self.dt / self.coefficients(closure)[0]
         left = torch.exp(-steps)
         lagging = _Lagging(self.of_base(closure), self._at_places(held), (1.0 - left) / steps)
         end = self.base.advance(t, base, applied, exogenous, lagging)

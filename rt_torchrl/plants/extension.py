@@ -63,18 +63,6 @@ class ExtendedClosure(nn.Module):
         return self.base(features)
 
 
-def own_coefficients(closure: nn.Module) -> Float[Tensor, " n"]:
-    """The parameters of an extension, where they are a few positive numbers.
-
-    Raises:
-        TypeError: if the closure is not extended by :class:`PositiveCoefficients`.
-    """
-    own = closure.get_submodule("own")
-    if not isinstance(own, PositiveCoefficients):
-        raise TypeError(f"closure.own={type(own).__name__} must be PositiveCoefficients.")
-    return own.coefficients
-
-
 class Extension(Plant):
     r"""A plant whose inputs or outputs pass through additional dynamics with hidden states x.
 
@@ -167,6 +155,12 @@ class Extension(Plant):
     def of_base(self, closure: nn.Module) -> nn.Module:
         """The part of the closure that belongs to the plant."""
         return closure.get_submodule("base") if self._parameterised else closure
+
+    def coefficients(self, closure: nn.Module) -> Float[Tensor, " n"]:
+        """The extension's own coefficients in a closure, where its parameters are :class:`PositiveCoefficients`."""
+        own = closure.get_submodule("own")
+        assert isinstance(own, PositiveCoefficients)
+        return own.coefficients
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         base, hidden = self.split(state)
