@@ -1,12 +1,11 @@
 """Figures of the cryogenic tank: its days in orbit, vent, coefficients, path of the vented fluid, and an animation."""
 
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
@@ -203,88 +202,48 @@ def vent_path(snapshot: Snapshot) -> Figure:
     1: liquid of the tank at p. 2: behind the valve at p_1, same enthalpy. 3: all vapour at p_1, as an endless heat
     exchanger would leave it; the real one leaves it at the cross, with the share ε of the heat from 2 to 3.
     """
+    from CoolProp.CoolProp import PropsSI  # here, because it takes a second to load
+
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     last = slice(-min(len(record.actions), round(DAY / plant.dt)), None)
     states, drop = record.states[:-1][last], _drop(plant, record.states[:-1][last], record.actions[last]).mean()
-    state = states.mean(0)
+    state, fluid = states.mean(0), plant.saturation.fluid
     effectiveness = plant.vent(state, plant.action_of(drop)[None], plant.closure).effectiveness.item()
-    path = VentPath.of(plant.saturation.fluid, state[2].item(), drop.item(), effectiveness)
-    hours = len(states) * plant.dt / 3600.0
-    title = f"Path of the vented {plant.saturation.fluid.lower()}, episode {last_episode(snapshot)}"
-    title += rf", mean of the last {hours:g} h" + "\n"
-    title += rf"$p$ = {1e-3 * path.p:.4g} kPa, $\Delta p_V$ = {1e-3 * path.drop:.3g} kPa, "
-    title += rf"$T - T_1$ = {path.T[0] - path.T[1]:.3g} K, $\Delta h_c$ = {1e-3 * path.latent:.4g} kJ/kg"
+    p, p_1 = state[2].item(), (state[2] - drop).item()
+
+    def saturated(pressure: Any, quality: float) -> list[Any]:
+        """Entropy, temperature and enthalpy of saturated liquid (0) or vapour (1)."""
+        return [PropsSI(name, "P", pressure, "Q", quality, fluid) for name in "STH"]
+
+    (s_1, T_1, h_1), (s_3, T_3, h_3) = saturated(p, 0.0), saturated(p_1, 1.0)
+    (s_l, T_valve, h_l), (s_v, _, h_v) = (saturated(np.linspace(p, p_1, 21), quality) for quality in (0.0, 1.0))
+    s_valve = s_l + (h_1 - h_l) / (h_v - h_l) * (s_v - s_l)
+    s = 1e-3 * np.array([s_1, s_valve[-1], s_3, s_valve[-1] + effectiveness * (s_3 - s_valve[-1])])
+    # The heights end where CoolProp's saturation solver is still sure to succeed.
+    heights = np.linspace(PropsSI("Ttriple", fluid), PropsSI("Tcrit", fluid) - 0.01, 300)
+    left, right = (1e-3 * PropsSI("S", "T", heights, "Q", quality, fluid) for quality in (0.0, 1.0))
+    title = f"Path of the vented {fluid.lower()}, episode {last_episode(snapshot)}"
+    title += rf", mean of the last {len(states) * plant.dt / 3600.0:g} h" + "\n"
+    title += rf"$p$ = {1e-3 * p:.4g} kPa, $\Delta p_V$ = {1e-3 * (p - p_1):.3g} kPa, "
+    title += rf"$T - T_1$ = {T_1 - T_3:.3g} K, $\Delta h_c$ = {1e-3 * (h_3 - h_1):.4g} kJ/kg"
     figure, ((whole, near),) = panels(1, 2, title=title, size=(11.0, 5.0), width_ratios=(1.0, 1.3))
-    for ax in (whole, near):
-        _draw_path(ax, path)
-    caption(whole, "temperature $T$ [K]", "whole dome")
-    caption(near, "temperature $T$ [K]", "around the vent")
-    _zoom(near, path)
+    for ax, part in ((whole, "whole dome"), (near, "around the vent")):
+        ax.plot([*left, *right[::-1]], [*heights, *heights[::-1]], color="0.55", linewidth=1.3, label="saturation")
+        ax.axhline(T_1, label="liquid in the tank", **REFERENCE_LINE)
+        ax.plot(1e-3 * s_valve, T_valve, color=REAL, linewidth=2.0, label="valve (1-2)")
+        ax.plot(s[1:3], [T_3, T_3], color=TWIN, linewidth=2.0, label="heat exchanger (2-3)")
+        ax.plot(s[:3], [T_1, T_3, T_3], "o", color=REAL, markersize=5, label="_points")
+        outlet = rf"outlet, $\varepsilon$ = {effectiveness:.3g}"
+        ax.plot(s[3:], [T_3], "x", color=REAL, markersize=9, markeredgewidth=1.8, label=outlet)
+        ax.set_xlabel("specific entropy $s$ [kJ/(kg K)]")
+        caption(ax, "temperature $T$ [K]", part)
+    height, width = max(T_1 - T_3, 0.02), s[2] - s[0]
+    near.set(ylim=(T_3 - 0.5 * height, T_1 + 0.5 * height), xlim=(s[0] - 0.06 * width, s[2] + 0.06 * width))
+    near.ticklabel_format(axis="y", useOffset=False)
+    for (name, T, offset), x in zip((("1", T_1, (8, 7)), ("2", T_3, (8, -14)), ("3", T_3, (6, -14))), s, strict=False):
+        near.annotate(name, (x, T), offset, textcoords="offset points", fontsize=11)
     legend_below(figure, [near])
     return figure
-
-
-class VentPath(NamedTuple):
-    """States of the vented fluid at the points 1, 2, 3 and at the outlet, and the saturation lines around them."""
-
-    p: float  # [Pa]
-    drop: float  # p − p_1 [Pa]
-    latent: float  # Δh_c = h_v(p_1) − h_l(p) [J/kg]
-    effectiveness: float  # ε [-]
-    T: list[float]  # [K]
-    s: list[float]  # [J/(kg K)]
-    valve: Float[np.ndarray, "2 n"]  # s and T from 1 to 2 at constant enthalpy
-    dome: Float[np.ndarray, "2 m"]  # s and T of saturated liquid, then of saturated vapour from the critical point
-
-    @classmethod
-    def of(cls, fluid: str, p: float, drop: float, effectiveness: float) -> "VentPath":
-        """The path of a fluid from the tank's pressure p [Pa] over a pressure drop [Pa], computed by CoolProp."""
-        import CoolProp.CoolProp as CP  # imported here, because it takes a second to load
-
-        fluid_state = CP.AbstractState("HEOS", fluid)
-
-        def at(pair: Any, first: float, second: float) -> tuple[float, float, float]:
-            fluid_state.update(pair, first, second)
-            return fluid_state.smass(), fluid_state.T(), fluid_state.hmass()
-
-        def mixed(p: float, h: float) -> tuple[float, float]:
-            """Entropy s and temperature T of the mixture of enthalpy h at the pressure p."""
-            (s_l, T, h_l), (s_v, _, h_v) = (at(CP.PQ_INPUTS, p, quality) for quality in (0.0, 1.0))
-            return s_l + (h - h_l) / (h_v - h_l) * (s_v - s_l), T
-
-        s_1, T_1, h_1 = at(CP.PQ_INPUTS, p, 0.0)
-        s_3, T_3, h_3 = at(CP.PQ_INPUTS, p - drop, 1.0)
-        valve = np.array([mixed(between, h_1) for between in np.linspace(p, p - drop, 21)]).T
-        latent = h_3 - h_1
-        s_out = mixed(p - drop, h_1 + effectiveness * latent)[0]
-        # The heights end where CoolProp's saturation solver is still sure to succeed.
-        heights = np.linspace(fluid_state.trivial_keyed_output(CP.iT_triple), fluid_state.T_critical() - 0.01, 300)
-        sides = [[at(CP.QT_INPUTS, quality, T)[:2] for T in heights] for quality in (0.0, 1.0)]
-        dome = np.array(sides[0] + sides[1][::-1]).T
-        s = [s_1, valve[0, -1], s_3, s_out]
-        return cls(p, drop, latent, effectiveness, [T_1, T_3, T_3, T_3], s, valve, dome)
-
-
-def _draw_path(ax: Axes, path: VentPath) -> None:
-    s = [1e-3 * entropy for entropy in path.s]
-    ax.plot(1e-3 * path.dome[0], path.dome[1], color="0.55", linewidth=1.3, label="saturation")
-    ax.axhline(path.T[0], label="liquid in the tank", **REFERENCE_LINE)
-    ax.plot(1e-3 * path.valve[0], path.valve[1], color=REAL, linewidth=2.0, label="valve (1-2)")
-    ax.plot(s[1:3], path.T[1:3], color=TWIN, linewidth=2.0, label="heat exchanger (2-3)")
-    ax.plot(s[:3], path.T[:3], "o", color=REAL, markersize=5, label="_points")
-    outlet = rf"outlet, $\varepsilon$ = {path.effectiveness:.3g}"
-    ax.plot(s[3:], path.T[3:], "x", color=REAL, markersize=9, markeredgewidth=1.8, label=outlet)
-    ax.set_xlabel("specific entropy $s$ [kJ/(kg K)]")
-
-
-def _zoom(ax: Axes, path: VentPath) -> None:
-    """Fit the axes to the path, and number its points."""
-    height, (left, right) = max(path.T[0] - path.T[1], 0.02), (1e-3 * path.s[0], 1e-3 * path.s[2])
-    ax.set_ylim(path.T[1] - 0.5 * height, path.T[0] + 0.5 * height)
-    ax.set_xlim(left - 0.06 * (right - left), right + 0.06 * (right - left))
-    ax.ticklabel_format(axis="y", useOffset=False)
-    for name, place, offset in zip("123", zip(path.s, path.T, strict=True), ((8, 7), (8, -14), (6, -14)), strict=False):
-        ax.annotate(name, (1e-3 * place[0], place[1]), offset, textcoords="offset points", fontsize=11)
 
 
 def save_animation(snapshot: Snapshot, path: Path | str) -> Path:

@@ -1,8 +1,7 @@
 """Saturation properties of a pure fluid as differentiable functions of pressure."""
 
+import io
 import math
-import os
-import tempfile
 import zipfile
 import zlib
 from functools import cache
@@ -15,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from platformdirs import user_cache_path
 from torch import Tensor, nn
+
+from rt_torchrl.atomic_file import write_atomically
 
 CELLS = 128
 """Number of pieces of the spline: over 80 … 900 kPa of hydrogen values err by 1e-7 of their maximum, slopes by 2e-6."""
@@ -147,11 +148,11 @@ def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]
 
 def _save(path: Path, table: Float[np.ndarray, "cells 6 5"], low: float, high: float) -> None:
     """Write a table so that other processes see it whole or not at all."""
+    file = io.BytesIO()
+    np.savez(file, table=table, range=np.array([low, high]))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            np.savez(file, table=table, range=np.array([low, high]))
-        os.replace(file.name, path)
+        write_atomically(path, file.getvalue())
     except OSError:
         return  # Without the file the next process needs a second more; this one has its fit.
 
