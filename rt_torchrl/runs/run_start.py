@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.predictive_control import PredictiveControl
@@ -176,7 +176,7 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
 
 def on(device: torch.device, record: Trajectory) -> Trajectory:
     """The record on a device."""
-    return Trajectory(*(part.to(device) if isinstance(part, Tensor) else part for part in record))
+    return record.mapped(lambda part: part.to(device))
 
 
 def _device_of(*modules: nn.Module) -> torch.device:

@@ -35,6 +35,17 @@ class Trajectory(NamedTuple):
     start: float | Float[Tensor, " batch"] = 0.0
     seen: Bool[Tensor, "*batch n+1"] | None = None
 
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Trajectory":
+        """The trajectory whose tensors are changed by a function, such as one that moves them to a device."""
+        states, actions, exogenous, start, seen = self
+        return Trajectory(
+            change(states),
+            change(actions),
+            change(exogenous),
+            change(start) if isinstance(start, Tensor) else start,
+            None if seen is None else change(seen),
+        )
+
     def part(self, first: int, last: int, dt: float) -> "Trajectory":
         """The intervals ``first`` to ``last`` − 1 of length ``dt`` [s], with the states around them."""
         states, actions, exogenous, start, seen = self

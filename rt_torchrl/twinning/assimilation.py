@@ -186,10 +186,8 @@ class Assimilation:
         whole = batch_of(records)
         if self.config.inputs == "realisations":
             sampled = torch.cat([process.sample(count, generator) for process in processes])
-            states, actions, _, start, seen = (
-                part.repeat_interleave(count, 0) if isinstance(part, Tensor) else part for part in whole
-            )
-            whole = Trajectory(states, actions, self.twin.plant.with_previews(sampled), start, seen)
+            repeated = whole.mapped(lambda part: part.repeat_interleave(count, 0))
+            whole = repeated._replace(exogenous=self.twin.plant.with_previews(sampled))
         if not self.config.segment:
             return self._descend_anew(whole)
         before = self.cost_of(whole)
