@@ -1,6 +1,6 @@
 """Trajectories of a system, the scenarios that they start from, and their costs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
