@@ -50,7 +50,6 @@ class Turning(LinearQuadratic):
         Signal(symbol="a", name="angle", unit="rad", low=-math.pi, high=math.pi, periodic=True),
     )
     state_sizes = (2.0, 0.5)
-    discrepancy_scales = Plant.discrepancy_scales
 
 
 def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way():
