@@ -28,7 +28,7 @@ from rt_torchrl.runs.command_line import from_command_line
 from rt_torchrl.runs.results_table import next_steps
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import SPREAD_OF_IMITATION
-from rt_torchrl.trajectories.engines.compilation import without_warnings_of_libraries
+from rt_torchrl.trajectories.engines.parallel import without_warnings_of_libraries
 
 PLANT = LinearQuadratic(horizon=2.0)
 

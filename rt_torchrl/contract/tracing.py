@@ -7,13 +7,11 @@ from torch import Tensor
 
 from rt_torchrl.contract.calls import Arguments, Calls, Method
 from rt_torchrl.contract.draws import seeded
+from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.programs.vector_functions import lanes_of_this_machine
-from rt_torchrl.trajectories.engines.compilation import raised_limits, without_warnings_of_libraries
+from rt_torchrl.trajectories.engines.code import IntervalCode, UncomparedError, point_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
-from rt_torchrl.trajectories.engines.linearisation import linearise
-from rt_torchrl.trajectories.engines.programs import point_of
-from rt_torchrl.trajectories.engines.traced_interval import Programs, UncomparedError
+from rt_torchrl.trajectories.engines.parallel import linearise, raised_limits, without_warnings_of_libraries
 
 REMEDY = (
     "no Python branch on a tensor, .item(), float(tensor), numpy or print inside; use torch.where, and torch functions "
@@ -78,7 +76,7 @@ def untraceable(calls: Calls) -> str | None:
     point = point_of(initial_state, drive, lanes.number)
     try:
         interval = CostInterval(Interval(plant, calls.closure, policy))
-        Programs(interval, point, lanes).prepare_sweep(interval, False)
+        IntervalCode(interval, point, lanes).prepare_sweep(interval, False)
     except UncomparedError:
         return None
     except Exception as error:
