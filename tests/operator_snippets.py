@@ -231,3 +231,81 @@ OPERATORS = {
         A=torch.randn(40, 3, **D),
     ),
 }
+
+
+def _pivoted(m, s, d):
+    """A matrix with zeros on its diagonal, which needs pivots."""
+    x = torch.nn.functional.pad(s, (0, 3), value=0.7)
+    A = torch.diag_embed(x).roll(2, -1) + 0.1 * m.A * x.unsqueeze(-1)
+    return torch.linalg.solve(A, x)[..., :3] * m.w0
+
+
+def _double_pendulum(m, s, d):
+    """M⁻¹f of two links."""
+    c = 0.5 * torch.cos(s[..., 0] - s[..., 1])
+    M = torch.stack([torch.stack([1.0 + m.w0.expand_as(c), c], -1), torch.stack([c, torch.ones_like(c)], -1)], -2)
+    a = torch.linalg.solve(M, s[..., 1:].sin().unsqueeze(-1)).squeeze(-1)
+    return torch.cat([a, s[..., :1] * torch.linalg.inv(M)[..., 0, :1]], -1)
+
+
+def _assigned(m, s, d):
+    rows = torch.arange(len(s)).unsqueeze(-1)
+    return m.table.expand(len(s), 4).index_put((rows, (s > 0).long() + torch.arange(3) // 2), s)[..., :3] * m.w0
+
+
+def _sparse(m, s, d):
+    return torch.sparse.mm(m.sparse, s.t()).t() * m.w0
+
+
+class WithBuffers(F):
+    """A snippet with buffers: tables, a matrix and a sparse matrix."""
+
+    def __init__(self, f, **weights):
+        super().__init__(f, **weights)
+        self.register_buffer("knots", knots.clone())
+        self.register_buffer("table", knots.outer(knots.sin()))
+        self.register_buffer("matrix", torch.tensor([[0.0, 2.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 3.0]], **D))
+        self.register_buffer("sparse", torch.eye(3, **D).to_sparse(), persistent=False)
+        self.plain = torch.tensor(2.0, **D)
+
+
+OPERATORS |= {
+    "solve 6x6 with pivots": F(_pivoted, A=torch.randn(6, 6, **D)),
+    "solve 7x7": F(lambda m, s, d: torch.linalg.solve(m.A, m.A[0])[:3] * s, A=torch.randn(7, 7, **D)),
+    "solve from the right": F(
+        lambda m, s, d: torch.linalg.solve(m.A + torch.diag_embed(s), s.unsqueeze(-2), left=False).squeeze(-2),
+        A=torch.randn(3, 3, **D),
+    ),
+    "solve, several right sides": F(
+        lambda m, s, d: torch.linalg.solve(m.A, torch.stack([s, s.sin()], -1)).sum(-1), A=torch.randn(3, 3, **D)
+    ),
+    "inverse that is learned": F(lambda m, s, d: s @ torch.linalg.inv(m.A), A=torch.randn(3, 3, **D)),
+    "inverse of a buffer": WithBuffers(lambda m, s, d: s @ torch.linalg.inv(m.matrix) * m.w0),
+    "double pendulum": F(_double_pendulum),
+    "diag_embed": F(lambda m, s, d: (torch.diag_embed(s[..., :2], offset=1) @ s.unsqueeze(-1)).squeeze(-1) * m.w0),
+    "table in a buffer": WithBuffers(lambda m, s, d: m.table[torch.bucketize(s, m.knots) - 1, 3] * m.w0),
+    "table of a buffer's numbers": WithBuffers(
+        lambda m, s, d: (m.table.exp() * m.w0)[(s > 0).long(), torch.bucketize(s, m.knots).clamp(0, 19)]
+    ),
+    "table of states": F(lambda m, s, d: s[torch.arange(len(s)).unsqueeze(-1), (s > 0).long()] * m.w0),
+    "column of a table": WithBuffers(lambda m, s, d: m.table[:, 2][torch.bucketize(s, m.knots) - 1] * m.w0),
+    "learned table, assigned": F(_assigned, table=torch.randn(4, **D)),
+    "scaled dot product": F(
+        lambda m, s, d: FF.scaled_dot_product_attention(*(s.reshape(-1, 1, 3, 1) * m.w0 for _ in range(3))).flatten(1)
+    ),
+    "number of a buffer": WithBuffers(lambda m, s, d: s * m.knots[3].item() * m.w0),
+    "branch on a buffer": WithBuffers(lambda m, s, d: s * m.w0 if m.knots[3] > 0 else -s),
+    "number of a plain tensor": WithBuffers(lambda m, s, d: s * m.plain.item() * m.w0 if m.plain > 0 else -s),
+    "sparse buffer": WithBuffers(_sparse),
+    "wide relu and max": F(
+        lambda m, s, d: torch.maximum(m.modules_[0](s), 0.1 * m.modules_[1](s)).relu() @ m.A,
+        nn.Linear(3, 40),
+        nn.Linear(3, 40),
+        A=torch.randn(40, 3, **D),
+    ),
+    "wide masks": F(
+        lambda m, s, d: ((m.modules_[0](s) > 0.0) & ~(m.modules_[0](s) > 1.0)).double() @ m.A * m.w0,
+        nn.Linear(3, 40),
+        A=torch.randn(40, 3, **D),
+    ),
+}

@@ -53,6 +53,7 @@ class Swish(torch.autograd.Function):
 
 
 knots = torch.linspace(-3, 3, 20, **D)
+EYE = torch.eye(3, **D)
 
 
 def table_linear(m, s, d):
@@ -94,10 +95,8 @@ CASES = {
     ),
     "linalg.cross": F(lambda m, s, d: torch.linalg.cross(s, m.a.expand_as(s)), a=torch.randn(3, **D)),
     "norm": F(lambda m, s, d: s / torch.linalg.vector_norm(s, dim=-1, keepdim=True) * m.w0),
-    "linalg.solve 3x3": F(lambda m, s, d: torch.linalg.solve(torch.eye(3, **D) + 0.1 * torch.diag_embed(s), s * m.w0)),
-    "linalg.inv": F(
-        lambda m, s, d: (torch.linalg.inv(torch.eye(3, **D) * 2 + torch.diag_embed(s)) @ s.unsqueeze(-1)).squeeze(-1)
-    ),
+    "linalg.solve 3x3": F(lambda m, s, d: torch.linalg.solve(EYE + 0.1 * torch.diag_embed(s), s * m.w0)),
+    "linalg.inv": F(lambda m, s, d: (torch.linalg.inv(EYE * 2 + torch.diag_embed(s)) @ s.unsqueeze(-1)).squeeze(-1)),
     "cumsum": F(lambda m, s, d: s.cumsum(-1) * m.w0),
     "prod": F(lambda m, s, d: s.prod(-1, keepdim=True) * m.w0 * s),
     "max over dim": F(lambda m, s, d: s.amax(-1, keepdim=True) * m.w0),

@@ -8,7 +8,7 @@ import torch
 from c_build import library, needs_compiler
 
 from rt_torchrl.programs.c_source import CSource
-from rt_torchrl.programs.operators import new_tracer
+from rt_torchrl.programs.rules import new_tracer
 
 pytestmark = needs_compiler
 EDGES = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-310, 0.5, 1.5, 2.5, -0.5, -1.5, 1e300, -3.0, 7.0, 49.0, 50.0]

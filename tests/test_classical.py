@@ -15,7 +15,7 @@ from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
 from rt_torchrl.plants.actuators import ScaledActuator
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.runs.results import ROLES, judge
-from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import control_cost
 

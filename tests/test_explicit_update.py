@@ -13,7 +13,7 @@ from torch import nn
 from torch.utils._pytree import tree_flatten_with_path
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, mlp
-from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
+from rt_torchrl.programs.machine_code import Lanes, lanes_of_this_machine
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig, ddpg, make_learner
 from rt_torchrl.twinning.learners.explicit import formulas
 from rt_torchrl.twinning.learners.explicit.formulas import Ascent, CriticShape, RowFunction, TemporalDifferences

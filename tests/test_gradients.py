@@ -12,8 +12,8 @@ from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP, mlp
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.engines import linearisation
-from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.engines import parallel
+from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 
@@ -197,7 +197,7 @@ def test_products_are_made_in_pieces(driver, monkeypatch):
     """The tape holds at most 50 of 160 intervals at a time; the gradients are exact and equal those of one piece."""
     case, seen = Case(PLANTS["linear_quadratic"](), "perceptron", driver, 4), []
     whole = case.gradients("parallel")
-    monkeypatch.setattr(linearisation, "PIECE", 50)
+    monkeypatch.setattr(parallel, "PIECE", 50)
     step = case.plant.step
 
     def counted(t, state, *rest):

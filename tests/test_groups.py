@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from rt_torchrl.trajectories.engines.groups import Group, for_each_group
+from rt_torchrl.trajectories.engines.code import Group, for_each_group
 from rt_torchrl.trajectories.rollout import all_finite
 
 

@@ -20,11 +20,11 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.engines import programs
+from rt_torchrl.trajectories.engines import code
 from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.code import Inputs
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.native import LEAST_MEMORY, Native
-from rt_torchrl.trajectories.engines.weights import Weights
 from rt_torchrl.trajectories.rollout import Rollout
 
 PLANTS = {
@@ -328,7 +328,7 @@ def test_states_that_leave_the_numbers_are_kept():
 
 
 def test_weights_are_one_row():
-    assert Weights(nn.Linear(2, 1).double()).row().shape == (3,)
+    assert Inputs(nn.Linear(2, 1).double()).row().shape == (3,)
 
 
 class Saturated(nn.Module):
@@ -345,7 +345,7 @@ class Saturated(nn.Module):
 
 @pytest.mark.parametrize("bias", [17.0, 17.34, 17.85, 18.36, 18.7])
 def test_the_rounding_of_a_saturated_policy_is_no_reason_to_refuse_it(bias, monkeypatch):
-    monkeypatch.setattr(programs, "_kept", OrderedDict())  # policies of the same kind share their programs
+    monkeypatch.setattr(code, "_kept", OrderedDict())  # policies of the same kind share their programs
     plant, generator = LinearQuadratic(horizon=1.0), torch.Generator().manual_seed(0)
     state, exogenous = plant.draw_initial_state(4, generator), plant.draw_exogenous(4, generator)
     policy = Saturated(bias)

@@ -10,14 +10,11 @@ from hypothesis import strategies as st
 from torch import nn
 from traced_function import Snippet, compared, gap, marched, signals
 
-from rt_torchrl.programs.machine_code import march_text
-from rt_torchrl.programs.operators import new_tracer
-from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
+from rt_torchrl.programs.machine_code import Lanes, lanes_of_this_machine, march_text
+from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.trajectories.engines import native
+from rt_torchrl.trajectories.engines.code import Inputs, IntervalCode, Point
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.programs import Programs
-from rt_torchrl.trajectories.engines.traced_interval import Point
-from rt_torchrl.trajectories.engines.weights import Weights
 
 LANES = [Lanes(8, "e"), Lanes(4, "d"), Lanes(2, "b"), Lanes(2, "")]
 SPECIAL = torch.tensor(
@@ -77,10 +74,10 @@ def assert_same(f, lanes=None):
     usual = Point(
         torch.linspace(0.3, 0.8, 2 * n).double().view(n, 2), Drive(drive.t[0].expand(n), *(z[0, :n] for z in drive[1:]))
     )
-    programs = Programs(snippet, usual, lanes)
+    programs = IntervalCode(snippet, usual, lanes)
     with torch.no_grad():
-        task = native._Task(programs, Weights(snippet), state, drive, native.MEMORY)
-        found = native._EndStates.apply(task, state, *drive, *task.weights.learned)[0, :, 0]
+        task = native._Task(programs, Inputs(snippet), state, drive, native.MEMORY)
+        found = native._EndStates.apply(task, state, *drive, *task.inputs.learned)[0, :, 0]
         exact = marched(snippet, state, *drive)[0, :, 0]
     torch.testing.assert_close(found, exact, rtol=1e-12, atol=1e-300, equal_nan=True)
 

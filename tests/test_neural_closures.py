@@ -19,7 +19,7 @@ from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import main_of
 from rt_torchrl.trajectories.engines.interval import Interval
-from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, linearise_by_rows
+from rt_torchrl.trajectories.engines.parallel import as_one_batch, linearise, linearise_by_rows
 from rt_torchrl.trajectories.rollout import drive_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig

@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from rt_torchrl.programs import object_code
-from rt_torchrl.programs.object_code import DIGEST, ObjectCode
+from rt_torchrl.programs import machine_code
+from rt_torchrl.programs.machine_code import DIGEST, ObjectCode
 
 POINTER = ctypes.c_void_p
 
@@ -29,7 +29,7 @@ def put_by(code):
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(object_code, "cache_folder", lambda: tmp_path / "native")
+    monkeypatch.setattr(machine_code, "cache_folder", lambda: tmp_path / "native")
     return tmp_path / "native"
 
 
@@ -49,8 +49,8 @@ def test_code_can_be_freed_and_other_code_stays():
 @pytest.fixture
 def compilations(monkeypatch):
     """The texts that were compiled."""
-    seen, compile_ = [], object_code._compile
-    monkeypatch.setattr(object_code, "_compile", lambda text: seen.append(text) or compile_(text))
+    seen, compile_ = [], machine_code._compile
+    monkeypatch.setattr(machine_code, "_compile", lambda text: seen.append(text) or compile_(text))
     return seen
 
 
@@ -63,12 +63,12 @@ SECOND = """
 import ctypes, sys
 from pathlib import Path
 import numpy as np
-from rt_torchrl.programs import object_code
+from rt_torchrl.programs import machine_code
 
-object_code.cache_folder = lambda: Path(sys.argv[1])
+machine_code.cache_folder = lambda: Path(sys.argv[1])
 if sys.argv[2] == "reads":
-    object_code._compile = None
-code, found = object_code.ObjectCode(sys.argv[3], "put", (ctypes.c_void_p,)), np.zeros(1)
+    machine_code._compile = None
+code, found = machine_code.ObjectCode(sys.argv[3], "put", (ctypes.c_void_p,)), np.zeros(1)
 code(found)
 print(found[0])
 """
@@ -111,7 +111,7 @@ def test_damaged_code_is_made_again(damage, folder, compilations):
 
 def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, compilations):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(object_code, "cache_folder", lambda: tmp_path / "file" / "native")
+    monkeypatch.setattr(machine_code, "cache_folder", lambda: tmp_path / "file" / "native")
     assert put_by(loaded(1.0)) == put_by(loaded(1.0)) == 1.0
     assert len(compilations) == 2
 
@@ -119,14 +119,14 @@ def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, 
 @pytest.mark.parametrize("changed", ["processor", "features", "llvm", "llvmlite"])
 def test_other_processors_and_versions_have_files_of_their_own(changed, folder, monkeypatch):
     loaded(1.0)
-    llvm = object_code.llvm
+    llvm = machine_code.llvm
     changes = {
         "processor": (llvm, "get_host_cpu_name", lambda: "x86-64"),
-        "features": (object_code, "_features", lambda: "-avx512f"),
+        "features": (machine_code, "_features", lambda: "-avx512f"),
         "llvm": (llvm, "llvm_version_info", (1, 0, 0)),
-        "llvmlite": (object_code, "version", lambda name: "0.1"),
+        "llvmlite": (machine_code, "version", lambda name: "0.1"),
     }
     monkeypatch.setattr(*changes[changed])
-    monkeypatch.setattr(object_code, "_compile", lambda text: b"other code")
-    object_code._compiled(text(1.0))
+    monkeypatch.setattr(machine_code, "_compile", lambda text: b"other code")
+    machine_code._compiled(text(1.0))
     assert len(list(folder.iterdir())) == 2

@@ -7,7 +7,7 @@ from test_algorithm import STEPS, twinning
 
 from rt_torchrl.runs import progress
 from rt_torchrl.runs.progress import Progress
-from rt_torchrl.trajectories.engines.compilation import watched_compilation
+from rt_torchrl.trajectories.engines.parallel import watched_compilation
 
 
 def test_it_names_each_step_as_it_begins():

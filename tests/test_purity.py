@@ -6,10 +6,10 @@ from impure import Recurrent, Rows
 from linear_quadratic import LinearQuadratic
 from torch import nn
 
+from rt_torchrl.programs.contract import ImpureError
 from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
-from rt_torchrl.trajectories.engines.purity import ImpureError
 from rt_torchrl.trajectories.rollout import ENGINES, Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 

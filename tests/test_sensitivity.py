@@ -11,7 +11,7 @@ from rt_torchrl import shipped_plants
 from rt_torchrl.contract.methods import random_commands
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
-from rt_torchrl.trajectories.engines import linearisation, programs, traced_interval
+from rt_torchrl.trajectories.engines import code, parallel
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.trajectory import identification_cost
@@ -31,10 +31,10 @@ def recorded(plant, batch=3, seed=0):
     return DigitalTwin(plant, plant.make_closure(generator)), flown, exogenous
 
 
-@pytest.mark.parametrize("piece", [linearisation.PIECE, 7], ids=["at once", "in pieces"])
+@pytest.mark.parametrize("piece", [parallel.PIECE, 7], ids=["at once", "in pieces"])
 @pytest.mark.parametrize("plant", [LinearQuadratic(), WindTurbine(horizon=30.0)], ids=lambda plant: plant.name)
 def test_gradient_and_states_are_those_of_backpropagation(plant, piece, monkeypatch):
-    monkeypatch.setattr(linearisation, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
+    monkeypatch.setattr(parallel, "PIECE", piece)  # no divisor of the intervals: the last piece overlaps
     twin, flown, exogenous = recorded(plant)
     found = Assimilation(twin, AssimilationConfig()).normal_equations(flown)
     rollout = Rollout(plant, twin.closure, engine="autograd")
@@ -64,14 +64,14 @@ def test_they_are_machine_code_on_every_plant(kind, monkeypatch):
 def test_tangents_leave_out_what_is_known_to_be_zero(monkeypatch):
     """By n_w weights they take n_w times the operators of the states alone; in loops over long rows it is 27 times."""
     suspect = WindTurbine(horizon=2.0).suspects()["inflow, pitch lag, late by 2"]
-    counts, text = list[int](), traced_interval.march_text
+    counts, text = list[int](), code.march_text
 
     def counted(program, *rest):
         counts.append(len(program.operations))
         return text(program, *rest)
 
-    monkeypatch.setattr(traced_interval, "march_text", counted)
-    monkeypatch.setattr(programs, "_kept", OrderedDict())  # programs of other tests
+    monkeypatch.setattr(code, "march_text", counted)
+    monkeypatch.setattr(code, "_kept", OrderedDict())  # programs of other tests
     closure = extended(suspect, WindTurbine().make_closure(torch.Generator()))
     generator = torch.Generator().manual_seed(0)
     given = suspect.draw_initial_state(2, generator), suspect.draw_exogenous(2, generator)

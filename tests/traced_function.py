@@ -3,11 +3,10 @@
 import torch
 from torch import nn
 
-from rt_torchrl.programs.vector_functions import lanes_of_this_machine
+from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.trajectories.engines import native
+from rt_torchrl.trajectories.engines.code import Inputs, IntervalCode, point_of
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.programs import Programs, point_of
-from rt_torchrl.trajectories.engines.weights import Weights
 
 
 class Snippet(nn.Module):
@@ -36,7 +35,7 @@ def signals(batch, n, states=3, *, seed=0, scale=1.0):
 def traced(interval, initial_state, drive, lanes=None):
     """Machine code of an interval; raises UntraceableError where native falls back."""
     lanes = lanes or lanes_of_this_machine()
-    programs = Programs(interval, point_of(initial_state, drive, lanes.number), lanes)
+    programs = IntervalCode(interval, point_of(initial_state, drive, lanes.number), lanes)
     programs.prepare_sweep(interval, driven=True)
     return programs
 
@@ -54,11 +53,11 @@ def compared(interval, initial_state, drive, *, lanes=None, seed=5):
     """States and gradients by all leaves: of machine code and of eager torch."""
     programs = traced(interval, initial_state, drive, lanes)
     leaves = [x.clone().requires_grad_() for x in (initial_state, *drive)]
-    task = native._Task(programs, Weights(interval), leaves[0], Drive(*leaves[1:]), native.MEMORY)
-    found = native._EndStates.apply(task, *leaves, *task.weights.learned)
+    task = native._Task(programs, Inputs(interval), leaves[0], Drive(*leaves[1:]), native.MEMORY)
+    found = native._EndStates.apply(task, *leaves, *task.inputs.learned)
     exact = marched(interval, *leaves)
     costate = torch.randn(exact.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    given = [*leaves, *task.weights.learned]
+    given = [*leaves, *task.inputs.learned]
     by_found = torch.autograd.grad(found, given, costate, allow_unused=True)
     by_exact = torch.autograd.grad(exact, given, costate, allow_unused=True) if exact.requires_grad else by_found
     zero = [torch.zeros_like(x) for x in given]

@@ -10,13 +10,11 @@ from rt_torchrl.contract.draws import seeded
 from rt_torchrl.contract.methods import Arguments, Calls, Method
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.programs.vector_functions import lanes_of_this_machine
-from rt_torchrl.trajectories.engines.compilation import raised_limits, without_warnings_of_libraries
+from rt_torchrl.trajectories.engines.code import IntervalCode, UncomparedError, point_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
-from rt_torchrl.trajectories.engines.linearisation import linearise
-from rt_torchrl.trajectories.engines.programs import point_of
-from rt_torchrl.trajectories.engines.traced_interval import Programs, UncomparedError
+from rt_torchrl.trajectories.engines.parallel import linearise, raised_limits, without_warnings_of_libraries
 
 STEP = 1e-6
 """Step of a difference, as a share of the argument's size; rounding then errs by 1e-10, and curvature by 1e-12."""
@@ -280,7 +278,7 @@ def untraceable(calls: Calls) -> str | None:
     point = point_of(initial_state, drive, lanes.number)
     try:
         interval = CostInterval(Interval(plant, calls.closure, policy))
-        Programs(interval, point, lanes).prepare_sweep(interval, False)
+        IntervalCode(interval, point, lanes).prepare_sweep(interval, False)
     except UncomparedError:
         return None
     except Exception as error:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from rt_torchrl.contract.draws import GROUPS, misshapen, neural_closure_of, seeded, wanted_as
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.signal import bounds, differences
-from rt_torchrl.trajectories.engines.purity import REMEDY
+from rt_torchrl.programs.contract import PURE
 from rt_torchrl.trajectories.rollout import Rollout
 
 Arguments = dict[str, Tensor]
@@ -160,7 +160,7 @@ def methods(calls: Calls) -> Iterator[str]:
             said = str(error).splitlines()[0] if str(error) else ""
             yield (
                 f"{method.name}: what it makes raises {type(error).__name__}: {said}. It must work for every leading "
-                f"dimension: rows of one, a batch, and times by batches. {REMEDY}."
+                f"dimension: rows of one, a batch, and times by batches. {PURE}."
             )
     yield from _judgement(calls)
 
@@ -209,7 +209,7 @@ def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
         yield (
             f"{method.name}: gives something else when it is called again with the same arguments; it must be a pure "
             "function: no random number inside, and nothing kept from call to call (what is remembered is a state). "
-            f"{REMEDY}."
+            f"{PURE}."
         )
 
 

@@ -21,11 +21,8 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.engines.groups import Group, signals_of
+from rt_torchrl.trajectories.engines.code import Group, Inputs, IntervalCode, code_of, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.programs import programs_of
-from rt_torchrl.trajectories.engines.traced_interval import Programs
-from rt_torchrl.trajectories.engines.weights import Weights
 from rt_torchrl.trajectories.rollout import require_double
 
 TerminalCost = Callable[[Tensor], Tensor]
@@ -111,7 +108,7 @@ class CommandCost:
         self.plant, self.hold, self.terminal = plant, hold, terminal
         self.interval = PenalisedInterval(plant, closure, penalty)
         self._low, self._span = low.numpy(), (high - low).numpy()
-        self._programs: Programs | None = None
+        self._code: IntervalCode | None = None
 
     @property
     def count(self) -> int:
@@ -121,7 +118,7 @@ class CommandCost:
     @property
     def traced(self) -> bool:
         """Whether the plant has become machine code, after :meth:`begin`."""
-        return self._programs is not None
+        return self._code is not None
 
     def blocks(self, n: int) -> int:
         """Number of commands of a window of n control intervals; the last may be held for less time."""
@@ -151,21 +148,21 @@ class CommandCost:
         state = torch.nn.functional.pad(initial_state, (0, 1))
         command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
         self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
-        found, self._programs = self._traced(), None
-        if found is not None:  # kept programs, unless the plant or the closure is another one by now
-            self._programs, weights = found
-            self._weights = weights.row()
-            self._place(self._programs)
+        found, self._code = self._traced(), None
+        if found is not None:  # kept code, unless the plant or the closure is another one by now
+            self._code, inputs = found
+            self._weights = inputs.row()
+            self._place(self._code)
 
-    def _traced(self) -> tuple[Programs, Weights] | None:
+    def _traced(self) -> tuple[IntervalCode, Inputs] | None:
         with torch.enable_grad():
             drive = self._drive._replace(command=self._drive.command.clone().requires_grad_())
-            return programs_of(self.interval, self._state, drive)
+            return code_of(self.interval, self._state, drive)
 
-    def _place(self, programs: Programs) -> None:
+    def _place(self, code: IntervalCode) -> None:
         """Lay out the arrays of the window, one set for each group of lanes."""
-        lanes, batch = programs.lanes.number, len(self._state)
-        n, n_s, n_x = self.n, self._state.shape[1], programs.sizes["x"]
+        lanes, batch = code.lanes.number, len(self._state)
+        n, n_s, n_x = self.n, self._state.shape[1], code.sizes["x"]
         groups = [Group(first, min(first + lanes, batch), lanes) for first in range(0, batch, lanes)]
         if getattr(self, "_shape", None) != (n, batch):
             self._shape = n, batch
@@ -179,8 +176,8 @@ class CommandCost:
             self._first_block = np.arange(0, n, self.hold)
         adjoint = (self._nothing, 0, self._costate, self._weights, self._by_drive, self._by_weights, n)
         calls = [(*x, s) for x, s in zip(self._driven, self._states, strict=True)]
-        self._march = [programs.march.bound(*call, self._weights, n) for call in calls]
-        self._sweeps = [programs.sweeps[True].bound(*call, *adjoint) for call in calls]
+        self._march = [code.march.bound(*call, self._weights, n) for call in calls]
+        self._sweeps = [code.sweeps[True].bound(*call, *adjoint) for call in calls]
         self._groups, first = groups, 1 + self._drive.exogenous.shape[-1]
         exogenous, state = self._drive.exogenous.numpy(), self._state.numpy()[None]
         for k, group in enumerate(groups):
@@ -192,7 +189,7 @@ class CommandCost:
         self, unit: Float[np.ndarray, "batch m n_a"]
     ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, "batch m n_a"]]:
         """J and its gradient by the commands u in [0, 1] of each realisation of the window."""
-        if self._programs is None:
+        if self._code is None:
             return self._by_torch(unit)
         costs, gradient = np.empty(len(unit)), np.empty_like(unit)
         for k, group in enumerate(self._groups):

@@ -8,9 +8,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.programs.escapes import Escapes
-from rt_torchrl.programs.operators import new_tracer
 from rt_torchrl.programs.program import Program, UntraceableError
+from rt_torchrl.programs.rules import new_tracer
 from rt_torchrl.programs.tracer import Tracer
 
 REMEDY = "Write it with arithmetic of torch in float64; the formats pt2 and onnx take more of a policy than C does."
@@ -74,7 +73,7 @@ def traced(
             tracer.weight(weight)
         if prepare is not None:
             prepare(tracer)
-        with torch.no_grad(), Escapes(tracer), tracer, _noted(modules, entered):
+        with torch.no_grad(), tracer.following(), _noted(modules, entered):
             found = function(**given)
         outputs = {name: tracer.outputs(value) for name, value in found.items()}
     except UntraceableError as error:

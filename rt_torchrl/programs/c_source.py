@@ -7,10 +7,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rt_torchrl.programs.lowering import Lowering
-from rt_torchrl.programs.operations import FORMS
-from rt_torchrl.programs.program import Program
+from rt_torchrl.programs.program import COMPARISONS, ROUNDED, Program
 
 WIDTH = 110
+CALLED = {"abs": "fabs", "round": "rint"}
+FORMS = {
+    **{name: f"{{0}} {sign} {{1}}" for name, sign in {"add": "+", "sub": "-", "mul": "*", "div": "/"}.items()},
+    **{name: f"{{0}} {sign} {{1}}" for name, sign in zip(COMPARISONS, "> < >= <= == !=".split(), strict=True)},
+    **{name: f"{{0}} {sign} {{1}}" for name, sign in {"and": "&&", "or": "||", "xor": "!="}.items()},
+    **{name: f"{CALLED.get(name, name)}({{0}})" for name in ROUNDED},
+    "minimum": "{0} < {1} || {0} != {0} ? {0} : {1}",
+    "maximum": "{0} > {1} || {0} != {0} ? {0} : {1}",
+    "neg": "-{0}",
+    "not": "!{0}",
+    "select": "{0} ? {1} : {2}",
+}
+"""Operations that are expressions, with their operands in braces; others are calls of the C library."""
 Inputs = Mapping[tuple[str, int], str]
 Outputs = Sequence[tuple[str, int]]
 
@@ -84,7 +96,7 @@ class CWriter:
         return str(int(number)) if truth else literal(number)
 
     def compute(self, name: str, *operands: str, truth: bool = False) -> str:
-        text = FORMS[name].c.format(*operands) if name in FORMS else f"{name}({', '.join(operands)})"
+        text = FORMS[name].format(*operands) if name in FORMS else f"{name}({', '.join(operands)})"
         if self._depth:  # what a loop computes is read once
             return f"({text})"
         return self._new("const int" if truth else "const double", f" = {text}")
@@ -110,8 +122,8 @@ class CWriter:
     def store(self, array: str, index: str, operand: str) -> None:
         self._emit(f"{array}[{index}] = {operand};")
 
-    def look_up(self, table: str, place: str, offset: int) -> str:
-        return self._new("const double", f" = {table}[{self.index(offset, [(1, f'(int){place}')])}]")
+    def look_up(self, array: str, place: str, offset: int, *, shared: bool) -> str:
+        return self._new("const double", f" = {array}[{self.index(offset, [(1, f'(int){place}')])}]")
 
     @contextmanager
     def loop(self, count: int) -> Iterator[str]:

@@ -1,13 +1,12 @@
 """Lowering: a program becomes arithmetic, loads, stores and loops, which a writer puts into a language."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import groupby
 from typing import Protocol, runtime_checkable
 
-from rt_torchrl.programs.elementwise import ELEMENTWISE
-from rt_torchrl.programs.program import Access, Program
+from rt_torchrl.programs.program import ELEMENTWISE, Access, Program
 
 BLOCKS = (8, 6, 5, 4, 3, 2, 1)
 """Numbers of columns of a product of matrices that are summed at once, so that a row is read once for all of them."""
@@ -31,7 +30,7 @@ class Writer(Protocol):
     def index(self, base: int, terms: Sequence[tuple[int, str]]) -> str: ...
     def load(self, array: str, index: str, *, shared: bool = False) -> str: ...
     def store(self, array: str, index: str, operand: str) -> None: ...
-    def look_up(self, table: str, place: str, offset: int) -> str: ...
+    def look_up(self, array: str, place: str, offset: int, *, shared: bool) -> str: ...
     def loop(self, count: int) -> AbstractContextManager[str]: ...
 
 
@@ -75,7 +74,8 @@ class Lowering:
         elif name == "element":
             found = self._load(operands[0], attributes[0])
         elif name == "look_up":
-            found = writer.look_up(self._arrays[operands[0]][0], self.operand(operands[1]), attributes[0])
+            array, offset, shared = self._arrays[operands[0]]
+            found = writer.look_up(array, self.operand(operands[1]), offset + attributes[0], shared=shared)
         else:
             found = writer.compute(name, *map(self.operand, operands), truth=p.kinds[value] == "truth")
         self._operands[value] = found
@@ -96,7 +96,7 @@ class Lowering:
         else:
             array = self.writer.local(math.prod(attributes[0]))
             self._arrays[value] = (array, 0, False)
-            getattr(self, f"_{name}")(array, operands, *attributes)
+            ARRAYS[name](self, array, operands, *attributes)
 
     def _row(self, array: str, operands: Sequence[int], dims: Sequence[int]) -> None:
         for i, a in enumerate(operands):
@@ -110,7 +110,7 @@ class Lowering:
         with self._loops(dims) as indices:
             read = {("x", k): self._read(*pair, indices) for k, pair in enumerate(zip(operands, accesses, strict=True))}
             found = ELEMENTWISE[name](body, *(body.new("input", attributes=key) for key in read))
-            (result,) = Lowering(body, self.writer, read, "").write([found])
+            (result,) = Lowering(body, self.writer, read, "").write([body.as_number(found)])
             self.writer.store(array, self.writer.index(0, [*zip(strides, indices, strict=True)]), result)
 
     def _product(self, array: str, operands: Sequence[int], dims: Sequence[int], k: int, accesses: Accesses) -> None:
@@ -166,3 +166,11 @@ class Lowering:
 
     def _add(self, array: str, index: str, operand: str) -> None:
         self.writer.store(array, index, self.writer.compute("add", self.writer.load(array, index), operand))
+
+
+ARRAYS: dict[str, Callable[..., None]] = {
+    "row": Lowering._row,
+    "map": Lowering._map,
+    "product": Lowering._product,
+}
+"""How an array of lanes is filled, by the operation that makes it."""

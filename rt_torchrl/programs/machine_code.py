@@ -1,22 +1,111 @@
-"""Programs as LLVM's intermediate language, over lanes of realisations."""
+"""Programs as machine code over lanes of realisations: LLVM's intermediate language, compiled and loaded."""
 
+import ctypes
+import ctypes.util
+import hashlib
+import platform
 import struct
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
 
+import llvmlite.binding as llvm
+import numpy as np
+from platformdirs import user_cache_path
+
+from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.programs.lowering import Lowering
-from rt_torchrl.programs.operations import FORMS
-from rt_torchrl.programs.program import Program
-from rt_torchrl.programs.vector_functions import Lanes, symbol
+from rt_torchrl.programs.program import ARITHMETIC, COMPARISONS, EXTREMES, FUNCTIONS, ROUNDED, Program
 
 PURE = "memory(none) nounwind willreturn speculatable"
 """Attributes of mathematical functions, by which LLVM computes once what is the same in all steps."""
 WIDTH = "align 8"  # torch aligns rows to doubles
-DRIVE = "ptr noalias %x, i64 %first, i64 %last, i64 %row"
 STACK = 2**17
 """Bytes of arrays that lie on the stack, which is 512 KiB in the threads of some systems; others are allocated."""
 SMALL = 8
 """Size of arrays that always lie on the stack, from where LLVM takes them into registers."""
+X = "ptr noalias %x, i64 %first, i64 %last, i64 %row"
+"""Parameters of functions that read a drive, see :func:`march_text`."""
+OPTIMISATION = 2
+DIGEST = hashlib.sha256().digest_size
+_memory_of = (ctypes.c_char * 0).from_buffer  # four times faster than the array's own address
+INTRINSICS = {"abs": "fabs", "round": "rint"}
+"""Names in LLVM and in the C library that are not torch's."""
+FORMS = {
+    **{name: f"f{name} contract {{number}} {{0}}, {{1}}" for name in ARITHMETIC},
+    **{name: f"fcmp {'une' if name == 'ne' else 'o' + name} {{number}} {{0}}, {{1}}" for name in COMPARISONS},
+    **{name: f"{name} {{truth}} {{0}}, {{1}}" for name in ("and", "or", "xor")},
+    **{name: f"call {{number}} @llvm.{INTRINSICS.get(name, name)}.v{{lanes}}f64({{number}} {{0}})" for name in ROUNDED},
+    **{
+        name: f"call nsz {{number}} @llvm.{name}.v{{lanes}}f64({{number}} {{0}}, {{number}} {{1}})" for name in EXTREMES
+    },
+    "neg": "fneg {number} {0}",
+    "not": "xor {truth} {0}, splat (i1 true)",
+    "select": "select {truth} {0}, {number} {1}, {number} {2}",
+}
+"""Operations that are instructions, with their operands in braces; ``number`` and ``truth`` are the types of lanes,
+``lanes`` is their number. Products and sums may be contracted into one rounding; nothing else of floating-point
+arithmetic is relaxed."""
+
+
+class Lanes(NamedTuple):
+    """The lanes of a processor.
+
+    Args:
+        number: number of doubles that are computed at once.
+        variant: letter of the C library's vector functions for these lanes (glibc's vector ABI); empty for none.
+    """
+
+    number: int
+    variant: str
+
+
+@cache
+def lanes_of_this_machine() -> Lanes:
+    """The widest lanes of this processor: AVX-512, AVX2, or 128 bits (SSE2, NEON)."""
+    features = llvm.get_host_cpu_features()
+    if platform.machine().lower() in ("aarch64", "arm64"):
+        return Lanes(2, "n")
+    if features.get("avx512f") and features.get("avx512dq"):
+        return Lanes(8, "e")
+    if features.get("avx2") and features.get("fma"):
+        return Lanes(4, "d")
+    return Lanes(2, "b")
+
+
+@cache
+def symbol(name: str, lanes: Lanes) -> str | None:
+    """The C library's vector function for these lanes, made known to LLVM; None where the library has none."""
+    library = _vector_library()
+    found = f"_ZGV{lanes.variant}N{lanes.number}{'v' * FUNCTIONS[name]}_{name}"
+    if library is None or not lanes.variant or not hasattr(library, found):
+        return None
+    _publish(library, found)
+    return found
+
+
+@cache
+def publish_scalar_functions() -> None:
+    """Make the C library's functions of one number, and those of memory, known to LLVM."""
+    library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
+    for name in (*FUNCTIONS, *(INTRINSICS.get(name, name) for name in ROUNDED if name != "abs"), "malloc", "free"):
+        _publish(library, name)
+
+
+@cache
+def _vector_library() -> ctypes.CDLL | None:
+    try:
+        return ctypes.CDLL("libmvec.so.1")  # the vector functions of glibc 2.22, all of them since 2.35
+    except OSError:
+        return None
+
+
+def _publish(library: ctypes.CDLL, name: str) -> None:
+    llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0)
 
 
 class LaneWriter:
@@ -56,7 +145,7 @@ class LaneWriter:
     def compute(self, name: str, *operands: str, truth: bool = False) -> str:
         types = {"number": self.vector, "truth": self.mask, "lanes": self.lanes.number}
         if name in FORMS:
-            return self.emit(FORMS[name].llvm.format(*operands, **types))
+            return self.emit(FORMS[name].format(*operands, **types))
         vector_function = symbol(name, self.lanes)
         if vector_function:
             return self._call(vector_function, self.vector, operands)
@@ -116,12 +205,20 @@ class LaneWriter:
         place = self.emit(f"getelementptr {self.vector}, ptr {array}, i64 {index}")
         self.body.append(f"store {self.vector} {operand}, ptr {place}, {WIDTH}")
 
-    def look_up(self, table: str, place: str, offset: int) -> str:
+    def look_up(self, array: str, place: str, offset: int, *, shared: bool) -> str:
         n = self.lanes.number
         short = self.emit(f"fptosi {self.vector} {place} to <{n} x i32>")
         index = self.emit(f"sext <{n} x i32> {short} to <{n} x i64>")
-        base = f"getelementptr (double, ptr {table}, i64 {offset})"
+        if not shared:  # each lane has elements of its own
+            index = self.emit(f"mul nsw <{n} x i64> {index}, {self._in_all('i64', str(n))}")
+            index = self.emit(f"add nsw <{n} x i64> {index}, {self._numbers()}")
+            offset *= n
+        base = self.emit(f"getelementptr double, ptr {array}, i64 {offset}")
         return self._gathered(self.emit(f"getelementptr double, ptr {base}, <{n} x i64> {index}"))
+
+    def _numbers(self) -> str:
+        """The numbers of the lanes."""
+        return f"<{', '.join(f'i64 {lane}' for lane in range(self.lanes.number))}>"
 
     def _gathered(self, places: str) -> str:
         n = self.lanes.number
@@ -150,8 +247,7 @@ class LaneWriter:
         """Drive and state of interval k, see :func:`march_text`."""
         n, found = self.lanes.number, {("s", j): x for j, x in enumerate(self.row("%s", sizes["s"], k))}
         count, row = self._in_all("i64", "%last"), self.emit(f"add nsw i64 {k}, %row")
-        lanes = f"<{n} x i64> <{', '.join(f'i64 {i}' for i in range(n))}>"
-        lane = self.emit(f"add {lanes}, {self._in_all('i64', '%first')}")
+        lane = self.emit(f"add <{n} x i64> {self._numbers()}, {self._in_all('i64', '%first')}")
         lane = self.emit(f"call <{n} x i64> @llvm.smin.v{n}i64(<{n} x i64> {lane}, <{n} x i64> {count})")
         for j in range(sizes["x"]):
             at = [self.emit(f"getelementptr i64, ptr %x, i64 {3 * j + i}") for i in range(3)]
@@ -195,7 +291,7 @@ def march_text(program: Program, ends: Sequence[int], sizes: dict[str, int], lan
         inputs = writer.inputs(sizes, k)
         found = Lowering(program, writer, inputs, "%w").write(ends)
         writer.store_row("%s", found, writer.emit(f"add nsw i64 {k}, 1"))
-    return writer.function("march", f"{DRIVE}, ptr noalias %s, ptr noalias %w")
+    return writer.function("march", f"{X}, ptr noalias %s, ptr noalias %w")
 
 
 def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[str, int], lanes: Lanes) -> str:
@@ -220,4 +316,86 @@ def sweep_text(program: Program, outputs: Sequence[Sequence[int]], sizes: dict[s
         writer.store_row("%gx", [*map(lowering.operand, driven)], k)
         lowering.add_to("%gw", gradients)
     arrays = ", ".join(f"ptr noalias %{name}" for name in ("s", "source", "l", "w", "gx", "gw"))
-    return writer.function("sweep", f"{DRIVE}, {arrays.replace('%source', '%source, i64 %stride')}")
+    return writer.function("sweep", f"{X}, {arrays.replace('%source', '%source, i64 %stride')}")
+
+
+class ObjectCode:
+    """A function of machine code, which stays loaded as long as this object lives.
+
+    Args:
+        text: LLVM's text of a module.
+        name: name of the function.
+        arguments: types of the arguments of the function.
+    """
+
+    def __init__(self, text: str, name: str, arguments: tuple[type, ...]):
+        publish_scalar_functions()
+        code = llvm.ObjectFileRef.from_data(_compiled(text))
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+        self._engine.add_object_file(code)
+        self._engine.finalize_object()
+        self._function = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(name))
+
+    def __call__(self, *arguments: np.ndarray | int) -> None:
+        """Run the function; of an array, whose numbers lie side by side, it gets the address."""
+        self._function(*(x if isinstance(x, int) else _memory_of(x.data) for x in arguments))
+
+    def bound(self, *arguments: np.ndarray | int) -> Callable[[], None]:
+        """The call with these arrays, whose numbers may change between calls; it keeps their memory alive."""
+        return partial(self._function, *(x if isinstance(x, int) else _memory_of(x.data) for x in arguments))
+
+
+def _compiled(text: str) -> bytes:
+    """Object code of a text: from the disk, where its name is the digest of everything it depends on, or made anew.
+
+    A file begins with the digest of its code; one that is damaged is made again.
+    """
+    identity = (text, llvm.llvm_version_info, version("llvmlite"), llvm.get_host_cpu_name(), _features(), OPTIMISATION)
+    path = cache_folder() / f"{hashlib.sha256(repr(identity).encode()).hexdigest()}.o"
+    try:
+        held = path.read_bytes()
+    except OSError:
+        held = b""
+    if held and hashlib.sha256(held[DIGEST:]).digest() == held[:DIGEST]:
+        return held[DIGEST:]
+    code = _compile(text)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, hashlib.sha256(code).digest() + code)
+    except OSError:
+        pass  # where nothing can be kept, the next process compiles again
+    return code
+
+
+def cache_folder() -> Path:
+    """The folder of object code in the user's cache."""
+    return user_cache_path("rt_torchrl") / "native"
+
+
+def _compile(text: str) -> bytes:
+    machine = _machine()
+    module = llvm.parse_assembly(text)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=OPTIMISATION)
+    options.slp_vectorization = options.loop_vectorization = False  # the lanes are the vectors
+    passes = llvm.create_pass_builder(machine, options)
+    passes.getModulePassManager().run(module, passes)
+    return bytes(machine.emit_object(module))
+
+
+def _machine() -> llvm.TargetMachine:
+    """A new description of this processor, because the code that is loaded with one frees it."""
+    target = _target()
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=OPTIMISATION, jit=True)
+
+
+@cache
+def _target() -> llvm.Target:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple()
+
+
+@cache
+def _features() -> str:
+    return str(llvm.get_host_cpu_features().flatten())

@@ -1,18 +1,27 @@
 """Programs of scalar operations: values in the order of their computation, folded and shared."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from rt_torchrl.programs.operations import COMPARISONS
-
+ARITHMETIC = ("add", "sub", "mul", "div")
+COMPARISONS = ("gt", "lt", "ge", "le", "eq", "ne")
+"""Comparisons, of which NaN makes all false but the last one."""
+ROUNDED = ("sqrt", "floor", "ceil", "trunc", "round", "abs")
+"""Functions that are instructions of most processors; halves are rounded to even."""
+EXTREMES = ("minimum", "maximum")
+"""Extremes, which are NaN if one of the two is NaN."""
+FUNCTIONS = {
+    **dict.fromkeys("exp exp2 expm1 log log1p log2 log10 sin cos tan tanh sinh cosh asin acos atan".split(), 1),
+    **dict.fromkeys("asinh acosh atanh erf erfc".split(), 1),
+    **dict.fromkeys("pow atan2 hypot fmod".split(), 2),
+}
+"""Functions of the C library, under its names and torch's, and the numbers of their arguments."""
 Kind = Literal["number", "truth", "array"]
-SIMPLER = frozenset("add sub mul div pow".split())
-"""Functions of numbers that may become simpler ones, each by a method of :class:`Program`."""
 HIGHEST_POWER = 8
 """Greatest integer exponent of a power that becomes a product."""
 
@@ -131,8 +140,8 @@ class Program:
         if len(given) == len(known):
             return self.constant(getattr(torch, name)(*given).item())
         kind: Kind = "truth" if name in COMPARISONS else "number"
-        found: int = getattr(self, f"_{name}")(*numbers) if name in SIMPLER else self.new(name, *numbers, kind=kind)
-        return found
+        simplified = SIMPLIFIED.get(name)
+        return simplified(self, *numbers) if simplified else self.new(name, *numbers, kind=kind)
 
     def _is_nothing(self, a: int, *, subtracted: bool = False) -> bool:
         """Whether a value is a zero that a sum does not need: 0 − 0 is 0, but −0 + 0 is not −0."""
@@ -167,3 +176,78 @@ class Program:
             return one
         found = self.apply("sqrt", a) if abs(y) == 0.5 else reduce(partial(self.apply, "mul"), [a] * int(abs(y)))
         return found if y > 0 else self.apply("div", one, found)
+
+
+SIMPLIFIED: dict[str, Callable[..., int]] = {
+    "add": Program._add,
+    "sub": Program._sub,
+    "mul": Program._mul,
+    "div": Program._div,
+    "pow": Program._pow,
+}
+"""Functions of numbers that may become simpler ones."""
+
+# Elementwise operators of torch
+
+Scalar = Callable[..., int]
+"""A function that applies an operator of torch to values of a program."""
+
+
+def _sigmoid(p: Program, a: int) -> int:
+    one = p.constant(1.0)
+    return p.apply("div", one, p.apply("add", one, p.apply("exp", p.apply("neg", a))))
+
+
+def _sign(p: Program, a: int) -> int:
+    zero = p.constant(0.0)
+    return p.apply("sub", p.apply("gt", a, zero), p.apply("lt", a, zero))
+
+
+def _remainder(p: Program, a: int, b: int) -> int:
+    """What is left of a division, with the sign of the divisor; exact, however large the quotient is."""
+    left, zero = p.apply("fmod", a, b), p.constant(0.0)
+    opposite = p.logic("xor", p.apply("lt", left, zero), p.apply("lt", b, zero))
+    return p.select(p.logic("and", opposite, p.apply("ne", left, zero)), p.apply("add", left, b), left)
+
+
+def _number_of(how: str) -> Scalar:
+    """Minimum or maximum that prefers a number to NaN."""
+    return lambda p, a, b: p.select(p.logic("or", p.apply(how, a, b), p.apply("ne", b, b)), a, b)
+
+
+def _to(name: str) -> Scalar:
+    return lambda p, *operands: p.apply(name, *operands)
+
+
+def _logic(name: str) -> Scalar:
+    return lambda p, *operands: p.logic(name, *operands)
+
+
+OF_ONE: dict[str, Scalar] = {
+    **{name: _to(name) for name in (*ROUNDED, *FUNCTIONS, "neg") if FUNCTIONS.get(name, 1) == 1},
+    **{f"{how}_not": _logic("not") for how in ("logical", "bitwise")},
+    "reciprocal": lambda p, a: p.apply("div", p.constant(1.0), a),
+    "rsqrt": lambda p, a: p.apply("div", p.constant(1.0), p.apply("sqrt", a)),
+    "square": lambda p, a: p.apply("mul", a, a),
+    "isnan": lambda p, a: p.apply("ne", a, a),
+    "relu": lambda p, a: p.select(p.apply("lt", a, p.constant(0.0)), p.constant(0.0), a),
+    "sign": _sign,
+    "sgn": _sign,
+    "sigmoid": _sigmoid,
+}
+OF_TWO: dict[str, Scalar] = {
+    **{name: _to(name) for name in (*ARITHMETIC, *COMPARISONS, *EXTREMES)},
+    **{name: _to(name) for name, count in FUNCTIONS.items() if count == 2},
+    **{f"{how}_{name}": _logic(name) for how in ("logical", "bitwise") for name in ("and", "or", "xor")},
+    "fmin": _number_of("lt"),
+    "fmax": _number_of("gt"),
+    "remainder": _remainder,
+    "tanh_backward": lambda p, g, y: p.apply("mul", g, p.apply("sub", p.constant(1.0), p.apply("mul", y, y))),
+    "sigmoid_backward": lambda p, g, y: p.apply("mul", g, p.apply("mul", y, p.apply("sub", p.constant(1.0), y))),
+}
+OF_THREE: dict[str, Scalar] = {
+    "where": Program.select,
+    "threshold_backward": lambda p, g, x, low: p.select(p.apply("le", x, low), p.constant(0.0), g),
+}
+ELEMENTWISE: dict[str, Scalar] = {**OF_ONE, **OF_TWO, **OF_THREE}
+ARITY = {name: count for count, held in enumerate((OF_ONE, OF_TWO, OF_THREE), 1) for name in held}

@@ -1,21 +1,26 @@
 """Tracing: one execution of torch code, for one realisation, becomes a program."""
 
+import linecache
 import math
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
+from traceback import walk_stack
+from types import CodeType, ModuleType
 from typing import Any
 
+import jaxtyping
 import torch
 from torch import Tensor
 from torch._ops import OpOverload
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from rt_torchrl.programs.decompositions import SIMPLER, tables_of_torch
-from rt_torchrl.programs.elementwise import ARITY, ELEMENTWISE, IN_LOOPS
-from rt_torchrl.programs.places import Places
-from rt_torchrl.programs.program import Access, Program, UntraceableError
+from rt_torchrl.programs.program import ARITY, ELEMENTWISE, Access, Program, UntraceableError
 
 STRAIGHT = 24
 """Greatest number of elements of a row that becomes straight-line code, unless a tracer is told another one."""
@@ -25,10 +30,52 @@ FILLS = frozenset(
     "zeros ones full empty zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty "
     "scalar_tensor arange eye linspace empty_strided new_empty_strided".split()
 )
+ESCAPES = {
+    getattr(Tensor, name): name
+    for name in ("numpy", "tolist", "__array__", "data_ptr", "__dlpack__", "untyped_storage")
+}
+"""Methods by which numbers leave torch, where a tracer cannot follow them."""
+GENERATED = ("<@beartype", "<string>")
+"""Code that checks annotations at run time."""
 
 Arguments = tuple[Any, ...]
 Options = dict[str, Any]
 Rule = Callable[["Tracer", Arguments, Options, Any], Any]
+
+
+class Places:
+    """The lines of the caller's code whose operators are executed.
+
+    An operator of a backward pass has no line of its own; it has the line of the operator that it is the gradient of,
+    whose number in the order of the tape it shares.
+    """
+
+    def __init__(self) -> None:
+        self._own = (*map(_folder, (torch, sys.modules[__package__], jaxtyping)), *GENERATED)
+        self._noted: dict[int, tuple[CodeType, int]] = {}
+
+    def note(self) -> None:
+        """Note the line of an operator of a forward pass."""
+        if not torch.is_grad_enabled():
+            return
+        number, found = torch._C._autograd._get_sequence_nr() - 1, self._innermost()
+        if found is not None and number not in self._noted:  # operators without a gradient draw no number
+            self._noted[number] = found
+
+    def now(self) -> str:
+        """The line of the operator that is executed now, as the end of a message."""
+        node = torch._C._current_autograd_node()
+        found = self._noted.get(node._sequence_nr()) if node is not None else None
+        code, line = found or self._innermost() or (None, 0)
+        if code is None:
+            return ""
+        text = linecache.getline(code.co_filename, line).strip()
+        return f" (in {code.co_name}, {code.co_filename}:{line}: {text})"
+
+    def _innermost(self) -> tuple[CodeType, int] | None:
+        """The innermost line outside of torch, this room and the checks of annotations."""
+        frames = walk_stack(sys._getframe(1))
+        return next(((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._own)), None)
 
 
 class Tracer(TorchDispatchMode):
@@ -39,18 +86,27 @@ class Tracer(TorchDispatchMode):
 
     Args:
         rules: operators that do not act elementwise, by name.
+        decompositions: operators as torch code of simpler ones, by name; they go before those of torch.
+        of_torch: the ways in which torch computes operators by simpler ones.
         straight: greatest number of elements of a row that becomes straight-line code; a longer one becomes a loop.
     """
 
     supports_higher_order_operators = True  # to refuse them with a message
 
-    def __init__(self, rules: dict[str, Rule], straight: int):
+    def __init__(
+        self,
+        rules: Mapping[str, Rule],
+        decompositions: Mapping[str, Callable[..., Any]],
+        of_torch: Callable[[], Mapping[Any, Callable[..., Any]]],
+        straight: int,
+    ):
         super().__init__()
         self.program = Program()
         self.places, self.straight = Places(), straight
         elementwise = {name: partial(Tracer._elementwise, name=name) for name in ELEMENTWISE}
         filled = dict.fromkeys(FILLS, lambda tracer, args, options, out: tracer._constants(out))
         self._rules: dict[str, Rule] = {**filled, **elementwise, **rules}
+        self._decompositions, self._of_torch = decompositions, of_torch
         self._cells: dict[int, Tensor] = {}
         self._sizes = Counter[str]()  # of the inputs by their names, and of the weights
         self._alive: list[Tensor] = []  # a storage that is freed could give its address to another one
@@ -61,6 +117,8 @@ class Tracer(TorchDispatchMode):
         """The values of the program that a tensor or a number holds, in the shape of the tensor."""
         if not isinstance(x, Tensor):
             return torch.tensor(self.program.constant(x))
+        if x.layout is not torch.strided:
+            raise self.refuse(f"a tensor of layout {x.layout}")
         key = _storage_of(x)
         if key not in self._cells:  # a tensor from outside is a constant
             if x.requires_grad and x.is_leaf and x.numel():
@@ -77,8 +135,10 @@ class Tracer(TorchDispatchMode):
         return in_shape([self.program.constant(v) for v in x.flatten().tolist()], x.shape)
 
     def assign(self, x: Tensor, cells: Tensor) -> None:
-        """Let a new tensor hold values of the program."""
-        cell = torch.zeros(x.untyped_storage().nbytes() // max(1, x.element_size()), dtype=torch.int64)
+        """Let a new tensor hold values of the program; a part of a storage leaves the rest of it as it is."""
+        cell = self._cells.get(_storage_of(x))
+        if cell is None:
+            cell = torch.zeros(x.untyped_storage().nbytes() // max(1, x.element_size()), dtype=torch.int64)
         once = tuple(slice(1) if stride == 0 else slice(None) for stride in x.stride())
         torch.as_strided(cell, x.shape, x.stride(), x.storage_offset())[once].copy_(cells[once])
         self._cells[_storage_of(x)] = cell
@@ -92,6 +152,8 @@ class Tracer(TorchDispatchMode):
 
     def weight(self, x: Tensor) -> None:
         """Let a tensor be the next part of the weights, which are the same for all lanes and steps."""
+        if x.numel() * x.element_size() < x.untyped_storage().nbytes():
+            self.cells(x.detach())  # what is beside it in its memory is constant
         array = self.program.new("weights", attributes=(self._sizes["weights"], x.numel()), kind="array")
         self._sizes["weights"] += x.numel()
         self.assign(x, self.elements(array, x.numel()).view(x.shape))
@@ -115,6 +177,12 @@ class Tracer(TorchDispatchMode):
 
     # Operators
 
+    @contextmanager
+    def following(self) -> Iterator[None]:
+        """A context in which the caller's code is traced, and may take no number out of torch that varies."""
+        with sdpa_kernel(SDPBackend.MATH), _Escapes(self), self:  # attention as products of matrices
+            yield
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Arguments = (), kwargs: Options | None = None) -> Any:
         kwargs = kwargs or {}
         if not isinstance(func, OpOverload):
@@ -129,7 +197,7 @@ class Tracer(TorchDispatchMode):
             if packet in DECISIONS:
                 self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
                 return func(*args, **kwargs)
-            known = name in self._rules or name in SIMPLER
+            known = name in self._rules or name in self._decompositions
             if not known and func._can_decompose():  # into views or copies, depending on the strides
                 with self:
                     return func.decompose(*args, **kwargs)
@@ -142,11 +210,11 @@ class Tracer(TorchDispatchMode):
             if not func._schema.is_mutable and self._foldable(args):
                 return self._folded(func, args, kwargs)
             in_place = func._schema.is_mutable and packet.endswith("_")
-            if name in SIMPLER and in_place >= func._schema.is_mutable:
+            if name in self._decompositions and in_place >= func._schema.is_mutable:
                 with self:
-                    found = self._translated(func, SIMPLER[name], *args, **kwargs)
+                    found = self._translated(func, self._decompositions[name], *args, **kwargs)
                     return args[0].copy_(found) if in_place else found
-            if not known and not in_place and (decomposition := tables_of_torch().get(func)):
+            if not known and not in_place and (decomposition := self._of_torch().get(func)):
                 with self:
                     return decomposition(*args, **kwargs)
             return self._executed(func, name, args, kwargs)
@@ -215,9 +283,8 @@ class Tracer(TorchDispatchMode):
         """The cells of an elementwise operator on cells: straight-line code, or one loop over a long row."""
         shape, p = tuple(shape), self.program
         spread = [o.expand(shape) for o in operands]
-        values = {i for o in spread for i in o.flatten().tolist()}
-        long = math.prod(shape) > self.straight and name in IN_LOOPS and {p.kinds[i] for i in values} == {"number"}
-        if not long or all(p.numbers.get(i) is not None for i in values):
+        long = math.prod(shape) > self.straight
+        if not long or all(self.numbers(o) is not None for o in spread):
             rows = zip(*(o.flatten().tolist() for o in spread), strict=True)
             return in_shape([ELEMENTWISE[name](p, *row) for row in rows], shape)
         if (shortcut := self._shortcut(name, spread)) is not None:
@@ -251,7 +318,7 @@ class Tracer(TorchDispatchMode):
         """An operand of a loop: a scalar (None), or an array with the way to walk through it."""
         flat, p = cells.flatten().tolist(), self.program
         if len(set(flat)) == 1:
-            return flat[0], None
+            return p.as_number(flat[0]), None
         found = [p.operations[i] for i in flat]
         if all(o.name == "element" for o in found) and len({o.operands for o in found}) == 1:
             walk = Access.over(torch.tensor([o.attributes[0] for o in found]).view(cells.shape))
@@ -267,6 +334,23 @@ class Tracer(TorchDispatchMode):
         return self.program.new("table", attributes=tuple(x.hex() for x in numbers), kind="array")
 
 
+class _Escapes(TorchFunctionMode):
+    """Refuses such methods for tensors whose numbers are not known when the program is made.
+
+    Args:
+        tracer: the tracer that knows them.
+    """
+
+    def __init__(self, tracer: Tracer):
+        super().__init__()
+        self._tracer = tracer
+
+    def __torch_function__(self, func: Any, types: Any, args: Arguments = (), kwargs: Options | None = None) -> Any:
+        if func in ESCAPES:
+            self._tracer.require_known(f".{ESCAPES[func]}() takes a number from a tensor that varies", args)
+        return func(*args, **(kwargs or {}))
+
+
 def tensors_in(values: Iterable[Any]) -> list[Tensor]:
     """The tensors among arguments, also within lists."""
     return [value for value in tree_leaves(values) if isinstance(value, Tensor)]
@@ -279,3 +363,7 @@ def in_shape(values: list[int], shape: Iterable[int]) -> Tensor:
 
 def _storage_of(x: Tensor) -> int:
     return x.untyped_storage()._cdata
+
+
+def _folder(module: ModuleType) -> str:
+    return str(module.__file__).removesuffix("__init__.py")

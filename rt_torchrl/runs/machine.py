@@ -6,7 +6,7 @@ import warnings
 
 import torch
 
-from rt_torchrl.trajectories.engines.compilation import OF_LIBRARIES, missing_for_compilation
+from rt_torchrl.trajectories.engines.parallel import OF_LIBRARIES, missing_for_compilation
 
 NOISY = ("torchrl", "torch.utils.cpp_extension")
 """Loggers that report the inner work of a library."""

@@ -8,7 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from rt_torchrl.runs.results_table import progress
-from rt_torchrl.trajectories.engines.compilation import watched_compilation
+from rt_torchrl.trajectories.engines.parallel import watched_compilation
 
 WORDS = {
     "start": "learning from what is known",

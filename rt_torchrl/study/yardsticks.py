@@ -24,7 +24,7 @@ from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.configured_plant import physics_of, plant_of
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.study.training import CHANGED, VARIANTS
-from rt_torchrl.trajectories.engines.compilation import missing_for_compilation
+from rt_torchrl.trajectories.engines.parallel import missing_for_compilation
 
 Options = tuple[str, ...]
 """Options of a recipe's command line."""

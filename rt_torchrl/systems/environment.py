@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from rt_torchrl.options import require_number
 from rt_torchrl.plants.plant import Plant, Transition
 from rt_torchrl.plants.signal import bounds
-from rt_torchrl.trajectories.engines.compilation import compiled_if
+from rt_torchrl.trajectories.engines.parallel import compiled_if
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
 

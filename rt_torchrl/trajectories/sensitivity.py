@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
-from rt_torchrl.trajectories.engines.linearisation import linearise_by_rows, over_all
+from rt_torchrl.trajectories.engines.parallel import linearise_by_rows, over_all
 from rt_torchrl.trajectories.rollout import drive_of
 
 WIDE = 64

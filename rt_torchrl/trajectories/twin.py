@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant, require_end_cost
-from rt_torchrl.programs.fingerprint import fingerprint
+from rt_torchrl.programs.contract import Holdings
 from rt_torchrl.trajectories.rollout import Engine, Rollout, able
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -152,11 +152,11 @@ class _Planned:
     """
 
     def __init__(self, modules: nn.ModuleList, rollout: Rollout):
-        self.rollout, self._pair, self._watch = rollout, modules, fingerprint(modules).watch
+        self.rollout, self._pair, self._holdings = rollout, modules, Holdings(modules)
 
     def serves(self, *modules: nn.Module) -> bool:
         """Whether closure and policy are those of the rollout, and nothing but their weights' values has changed."""
-        return all(map(is_, self._pair, modules)) and self._watch.holds(self._pair)
+        return all(map(is_, self._pair, modules)) and self._holdings.unchanged(self._pair)
 
 
 def constant(module: nn.Module) -> nn.Module:

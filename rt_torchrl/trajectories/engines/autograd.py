@@ -4,11 +4,8 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from rt_torchrl.trajectories.engines.compilation import compiled_if
-from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
-from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.linearisation import prepared
-from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
+from rt_torchrl.trajectories.engines.interval import Drive, GradientEngine
+from rt_torchrl.trajectories.engines.parallel import compiled_if, march, march_by_scan, prepared
 
 
 class Autograd(GradientEngine):

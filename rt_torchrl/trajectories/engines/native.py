@@ -21,14 +21,17 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rt_torchrl.trajectories.engines.autograd import Autograd
-from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
-from rt_torchrl.trajectories.engines.groups import Group, for_each_group, signals_of
-from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
+from rt_torchrl.trajectories.engines.code import (
+    Group,
+    Inputs,
+    IntervalCode,
+    code_of,
+    for_each_group,
+    require_pure_once,
+    signals_of,
+)
+from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, GradientEngine, Interval
 from rt_torchrl.trajectories.engines.parallel import Parallel
-from rt_torchrl.trajectories.engines.programs import programs_of
-from rt_torchrl.trajectories.engines.purity import require_pure_once
-from rt_torchrl.trajectories.engines.traced_interval import Programs
-from rt_torchrl.trajectories.engines.weights import Weights
 
 MEMORY = 2.0**30
 """Bytes of states and drive that a sweep holds at once; of longer trajectories it holds checkpoints in time."""
@@ -92,7 +95,7 @@ class Native(GradientEngine):
         return costs
 
     def _task(self, interval: nn.Module, initial_state: Tensor, drive: Drive) -> "_Task | None":
-        found = programs_of(interval, initial_state, drive)
+        found = code_of(interval, initial_state, drive)
         return found and _Task(*found, initial_state, drive, self.memory)
 
 
@@ -100,26 +103,26 @@ class _Task:
     """Trajectories that are to be computed, in pieces of time.
 
     Args:
-        programs: machine code of the interval.
-        weights: weights of the interval.
+        code: machine code of the interval.
+        inputs: weights and buffers of the interval.
         initial_state: initial states; further states of the program begin with zero.
         drive: drive of all intervals.
         memory: bytes that a sweep may hold.
     """
 
-    def __init__(self, programs: Programs, weights: Weights, initial_state: Tensor, drive: Drive, memory: float):
-        self.programs, self.weights, self.lanes = programs, weights, programs.lanes.number
-        self.leaves, self.row = (initial_state, *drive, *weights.learned), weights.row()
+    def __init__(self, code: IntervalCode, inputs: Inputs, initial_state: Tensor, drive: Drive, memory: float):
+        self.code, self.inputs, self.lanes = code, inputs, code.lanes.number
+        self.leaves, self.row = (initial_state, *drive, *inputs.learned), inputs.row(code.read)
         self.initial_state, self.n, self.batch = initial_state.detach().numpy(), len(drive.t), len(initial_state)
         self.drive = [drive.t.unsqueeze(-1), drive.exogenous, drive.command]
         self._signals = signals_of(self.drive)
-        in_lanes = 16 * self.lanes * (programs.sizes["s"] + programs.sizes["x"])
+        in_lanes = 16 * self.lanes * (code.sizes["s"] + code.sizes["x"])
         length = max(1, int(memory / torch.get_num_threads() / in_lanes))
         self.pieces = [slice(first, min(first + length, self.n)) for first in range(0, self.n, length)]
 
     def start(self, group: Group) -> np.ndarray:
         """The initial states of a group, ``n_s lanes``."""
-        found = np.zeros((self.programs.sizes["s"], self.lanes))
+        found = np.zeros((self.code.sizes["s"], self.lanes))
         found[: self.initial_state.shape[1]] = group.gather(self.initial_state[None])[0]
         return found
 
@@ -127,7 +130,7 @@ class _Task:
         """The states ``n+1 n_s lanes`` of a piece, from the state at its start on."""
         states = np.empty((piece.stop - piece.start + 1, *state.shape))
         states[0] = state
-        self.programs.march(*self.driving(group, piece), states, self.row, piece.stop - piece.start)
+        self.code.march(*self.driving(group, piece), states, self.row, piece.stop - piece.start)
         return states
 
     def flown(self, group: Group) -> Iterator[tuple[slice, np.ndarray]]:
@@ -154,9 +157,9 @@ class _Gradients:
     def __init__(self, task: _Task, *, driven: bool):
         self._task = task
         self._by_state = np.empty((1, *task.initial_state.shape))
-        self._by_weights = np.empty((1, task.batch, sum(task.weights.sizes)))
-        self._by_drive = np.empty((task.n, task.batch, task.programs.sizes["x"])) if driven else None
-        self._sweep = task.programs.sweeps[driven]
+        self._by_weights = np.empty((1, task.batch, sum(task.inputs.sizes)))
+        self._by_drive = np.empty((task.n, task.batch, task.code.sizes["x"])) if driven else None
+        self._sweep = task.code.sweeps[driven]
 
     def sweep(self, group: Group, pieces: Iterable[Piece], *, last: float) -> None:
         """Go back over the trajectories of a group.
@@ -167,12 +170,12 @@ class _Gradients:
             last: ∂J/∂s of the last signal at the end of all, beside that of the last piece.
         """
         task = self._task
-        costate = np.zeros((task.programs.sizes["s"], group.lanes))
+        costate = np.zeros((task.code.sizes["s"], group.lanes))
         by_weights = np.zeros((self._by_weights.shape[-1], group.lanes))
         costate[-1] = last
         for piece, states, source in pieces:
             n, stride = piece.stop - piece.start, int(len(source) > 1)
-            by_drive = np.empty((n, task.programs.sizes["x"], group.lanes) if self._by_drive is not None else 0)
+            by_drive = np.empty((n, task.code.sizes["x"], group.lanes) if self._by_drive is not None else 0)
             arrays = costate, task.row, by_drive, by_weights
             self._sweep(*task.driving(group, piece), states, source, stride, *arrays, n)
             if self._by_drive is not None:
@@ -188,7 +191,7 @@ class _Gradients:
             by_t, *rest = by_drive.split([signal.shape[-1] for signal in self._task.drive], -1)
             along = [by_t.squeeze(-1).sum_to_size(self._task.leaves[1].shape), *rest]
         by_state = torch.from_numpy(self._by_state[0] * factor[:, None])
-        return [by_state, *along, *self._task.weights.split(np.einsum("i,ij->j", factor, self._by_weights[0]))]
+        return [by_state, *along, *self._task.inputs.split(np.einsum("i,ij->j", factor, self._by_weights[0]))]
 
 
 class _EndStates(torch.autograd.Function):
@@ -229,7 +232,7 @@ class _Costs(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, task: _Task, enabled: bool, *leaves: Tensor) -> Tensor:
-        costs, nothing = np.empty(task.batch), np.zeros((1, task.programs.sizes["s"], task.lanes))
+        costs, nothing = np.empty(task.batch), np.zeros((1, task.code.sizes["s"], task.lanes))
         wanted, driven = enabled and any(ctx.needs_input_grad), any(ctx.needs_input_grad[3:6])
         gradients = ctx.gradients = _Gradients(task, driven=driven) if wanted else None
 

@@ -12,19 +12,36 @@ Only the recurrence of the states and the linear recurrence of λ are sequential
 of all intervals of all trajectories, and another one the sum over k; both are cut into pieces where intervals are many.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial, reduce
+import shutil
+import sysconfig
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache, partial, reduce
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, ClassVar
+from weakref import WeakSet
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rt_torchrl.trajectories.engines.compilation import compiled_if, marked_dynamic, plain
-from rt_torchrl.trajectories.engines.gradient_engine import GradientEngine
-from rt_torchrl.trajectories.engines.interval import Drive
-from rt_torchrl.trajectories.engines.linearisation import as_one_batch, linearise, over_all, piece, pieces, prepared
-from rt_torchrl.trajectories.engines.recurrence import march, march_by_scan
+from rt_torchrl.trajectories.engines.interval import Drive, GradientEngine, with_weights
+
+LIMITS = {
+    # One graph per plant, policy and shape; the default of 8 is for loops that recompile by mistake.
+    "recompile_limit": 256,
+    "accumulated_recompile_limit": 4096,
+    # The dt of a second plant would otherwise become a symbol, which a scan cannot capture.
+    "specialize_float": True,
+}
+"""Settings of the tracer."""
+OF_LIBRARIES = r".*torch\.jit\.script.*is deprecated"
+"""A warning that code of PyTorch and TorchRL themselves causes, with new versions of PyTorch."""
+PIECE = 2048
+"""Number of intervals that are linearised at once, which bounds the memory. Forward mode ties a compiled graph to one
+number of intervals; with this fixed number one graph serves all trajectories that are not shorter."""
 
 
 class Parallel(GradientEngine):
@@ -47,6 +64,9 @@ class Parallel(GradientEngine):
         """States at the end of every interval, ``n batch n_s``, differentiable."""
         initial_state, drive = prepared(initial_state, drive)
         weights = [w for w in interval.parameters() if w.requires_grad]
+        if torch.is_grad_enabled() and interval not in _linearisable:
+            require_forward_mode(interval, initial_state, drive)
+            _linearisable.add(interval)
         return _DiscreteAdjoint.apply(self, interval, initial_state, *drive, *weights)
 
 
@@ -160,3 +180,246 @@ def costates_by_scan(jacobians: Tensor, cost_gradient: Tensor) -> Tensor:
     last = plain(cost_gradient[-1])
     earlier = scan(body, last, (jacobians.flip(0), cost_gradient[:-1].flip(0)))[1]
     return torch.cat([earlier.flip(0), last.unsqueeze(0)])
+
+
+# Jacobians of all intervals
+
+_linearisable: "WeakSet[nn.Module]" = WeakSet()
+
+
+def require_forward_mode(interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:
+    """Refuse an interval whose Jacobian cannot be computed by forward-mode products of a batch.
+
+    Raises:
+        ValueError: if it cannot, such as that of attention; the message says why.
+    """
+    try:
+        linearise(interval, (), *as_one_batch(initial_state[None, :1], Drive(*(x[:1, :1] for x in drive))))
+    except Exception as error:
+        said = next((line for line in str(error).splitlines() if line), type(error).__name__)
+        raise ValueError(
+            "engine='parallel' needs derivatives by torch.func.jvp under vmap, which an operator of plant, closure or "
+            f"policy lacks, such as attention: {said.rstrip('.')}. Use engine='native' or 'autograd'."
+        ) from error
+
+
+def prepared(initial_state: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
+    """State and drive in memory of their own, marked so that one compiled graph serves all batch sizes."""
+    copies = Drive(drive.t, plain(drive.exogenous), plain(drive.command))
+    for tensor in copies if drive.t.shape[1] > 1 else copies[1:]:
+        marked_dynamic(tensor, 1)
+    return marked_dynamic(plain(initial_state), 0), copies
+
+
+def as_one_batch(starts: Tensor, drive: Drive) -> tuple[Tensor, Drive]:
+    """The intervals of all realisations as ``n·batch`` rows.
+
+    A function of single intervals does not depend on the trajectories that these belong to. As rows, one graph serves
+    every length and every number of realisations, and its loops run over one dimension. With loops over both time and
+    realisations, of which t has only the time, the compiler takes a minute for the step of a drone.
+    """
+    t = drive.t.expand(starts.shape[:2]).flatten()
+    return starts.flatten(0, 1), Drive(t, drive.exogenous.flatten(0, 1), drive.command.flatten(0, 1))
+
+
+def piece(rows: Tensor, drive: Drive, first: int, last: int) -> tuple[Tensor, Drive]:
+    """Rows ``first`` to ``last`` − 1 in memory of their own.
+
+    The compiler traces a view together with the tensor behind it. Behind the rows is a tensor ``n batch ...`` with two
+    unknown sizes, of which the compiler finds only the product; it then gives up.
+    """
+    return plain(rows[first:last]), Drive(*(plain(x[first:last]) for x in drive))
+
+
+def pieces(count: int) -> list[slice]:
+    """Cut ``count`` rows into as few pieces as :data:`PIECE` allows, with lengths that differ by one at most.
+
+    No piece is left with a single row, for which the compiler would trace again.
+    """
+    number = -(-count // PIECE)
+    ends = [count * k // number for k in range(number + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def over_all(
+    function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive, *, at_once: int | None = None
+) -> Tensor:
+    """``function`` of every interval, ``n batch ...``, in pieces of which the last one may overlap another.
+
+    Args:
+        function: a function of states and drive of many intervals.
+        starts: states at the starts of the intervals.
+        drive: times and inputs of the intervals.
+        at_once: number of intervals of a piece; None for :data:`PIECE`.
+    """
+    rows, driven = as_one_batch(starts, drive)
+    length = min(at_once or PIECE, len(rows))
+    firsts = [*range(0, len(rows) - length, length), len(rows) - length]
+    found = [function(*piece(rows, driven, first, first + length)) for first in firsts]
+    found[-1] = found[-1][len(found) * length - len(rows) :]
+    return torch.cat(found).unflatten(0, starts.shape[:2])
+
+
+def linearise(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """[∂Φ/∂s, ∂Φ/∂w] at every interval, ``rows n_s n_s+n_w``, by a forward-mode product for each column.
+
+    Args:
+        interval: the map Φ.
+        names: names of the weights w of its closure; without names the result is ∂Φ/∂s alone.
+        starts: states at the starts of the intervals, ``rows n_s``.
+        drive: times and inputs of the intervals.
+    """
+    weights = tuple(interval.get_parameter(f"closure.{name}") for name in names)
+    sizes = [starts.shape[-1], *(w.numel() for w in weights)]
+    basis = torch.eye(sum(sizes), dtype=starts.dtype, device=starts.device)
+
+    def end(state: Tensor, *values: Tensor) -> Tensor:
+        replaced = {f"closure.{name}": value for name, value in zip(names, values, strict=True)}
+        return with_weights(interval, replaced, state, drive)
+
+    def column(direction: Tensor) -> Tensor:
+        by_state, *by_weights = direction.split(sizes)
+        tangents = (part.reshape(w.shape) for part, w in zip(by_weights, weights, strict=True))
+        return torch.func.jvp(end, (starts, *weights), (by_state.expand_as(starts), *tangents))[1]
+
+    return torch.func.vmap(column, out_dims=-1)(basis)
+
+
+def linearise_by_rows(interval: nn.Module, names: tuple[str, ...], starts: Tensor, drive: Drive) -> Tensor:
+    """The result of :func:`linearise` by a reverse-mode product for each row: less work where n_w is far above n_s."""
+    weights = {f"closure.{name}": interval.get_parameter(f"closure.{name}").detach() for name in names}
+
+    def end(values: dict[str, Tensor], state: Tensor, *drive: Tensor) -> Tensor:
+        return with_weights(interval, values, state, Drive(*drive))
+
+    rows = torch.func.vmap(torch.func.jacrev(end, argnums=(1, 0)), in_dims=(None, 0, 0, 0, 0))
+    by_state, by_weights = rows(weights, starts, *drive)
+    # A weight may be one number, of no dimension.
+    parts = (jacobian.reshape(*by_state.shape[:2], -1) for jacobian in by_weights.values())
+    return torch.cat([by_state, *parts], -1)
+
+
+# The recurrence of the states
+
+
+def march(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
+    """States at the end of every interval, ``n batch n_s``, by a loop."""
+    state, states = initial_state, []
+    for k in range(drive.t.shape[0]):
+        state = interval(state, Drive(drive.t[k], drive.exogenous[k], drive.command[k]))
+        states.append(state)
+    return torch.stack(states)
+
+
+def march_by_scan(interval: nn.Module, initial_state: Tensor, drive: Drive) -> Tensor:
+    """The states of :func:`march` by one ``scan``, for the compiler."""
+    from hoptorch.scan import scan  # here, because it takes seconds to load and only the compiler needs it
+
+    def body(state: Tensor, x: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        # The scan wants a carry that keeps its strides and an output that does not alias it.
+        state = interval(state, Drive(*x)).contiguous()
+        return state, state.clone()
+
+    return scan(body, plain(initial_state), tuple(drive))[1]
+
+
+# Compilation by PyTorch, whose compiler takes seconds to load: the functions below import it
+
+
+@contextmanager
+def without_warnings_of_libraries() -> Iterator[None]:
+    """A context without the warnings that concern the libraries' own code, which a user cannot mend."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=OF_LIBRARIES, category=FutureWarning)
+        yield
+
+
+def raised_limits() -> AbstractContextManager[None]:
+    """A context in which the tracer has the settings that this library compiles under."""
+    return torch._dynamo.config.patch(LIMITS)
+
+
+def compiled_if(
+    compiled: bool, function: Callable[..., Any], eager: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """``torch.compile(function)`` if ``compiled``, otherwise ``eager`` (by default ``function`` itself).
+
+    Raises:
+        RuntimeError: if ``compiled`` and this machine has no compiler; the message says what to install.
+    """
+    if not compiled:
+        return function if eager is None else eager
+    missing = missing_for_compilation()
+    if missing:
+        raise RuntimeError(
+            f"compiled=True needs {missing}, which this machine lacks. Install it (Debian: apt-get install g++ "
+            "python3-dev) or choose compiled=False; a recipe takes --compiled False."
+        )
+    return _compile(function)
+
+
+def marked_dynamic(tensor: Tensor, dim: int) -> Tensor:
+    """Tell the compiler that a dimension of the tensor changes its size, so that one graph serves all sizes."""
+    torch._dynamo.maybe_mark_dynamic(tensor, dim)
+    return tensor
+
+
+def plain(tensor: Tensor) -> Tensor:
+    """A copy with the strides of its shape.
+
+    A tensor with a dimension of size one counts as contiguous whatever its stride in that dimension. The compiler
+    nevertheless traces again for another stride, and a scan refuses it.
+    """
+    return tensor.clone(memory_format=torch.contiguous_format)
+
+
+def missing_for_compilation() -> str | None:
+    """The name of what torch.compile lacks on this machine's CPU; None if it lacks nothing."""
+    from torch._inductor import config as inductor_config
+
+    candidates = [c for c in inductor_config.cpp.cxx if c] if isinstance(inductor_config.cpp.cxx, tuple) else ["g++"]
+    if not any(shutil.which(str(candidate)) for candidate in candidates):
+        return "a C++ compiler"
+    if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
+        return "the headers of Python"
+    return None
+
+
+@contextmanager
+def watched_compilation(tell: Callable[[bool], None]) -> Iterator[None]:
+    """A context that calls ``tell(True)`` when the compiler begins and ``tell(False)`` when it ends."""
+    from torch._dynamo.callback import callback_handler
+
+    begun = callback_handler.register_start_callback(lambda arguments: tell(True))
+    ended = callback_handler.register_end_callback(lambda arguments: tell(False))
+    try:
+        yield
+    finally:
+        callback_handler.remove_start_callback(begun)
+        callback_handler.remove_end_callback(ended)
+
+
+@cache
+def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
+    # Cached, so that every user of a function shares its graphs.
+    _prepare()
+    return torch.compile(function, fullgraph=True, options={"guard_filter_fn": _lasting})
+
+
+def _lasting(guards: Sequence[Any]) -> list[bool]:
+    """Leave out the one guard that fails again and again although nothing has changed.
+
+    TensorDict takes part in every vmap and remembers there which classes are its own. This memory grows as a program
+    goes on, and each time the compiler would trace every graph with a vmap in it once more.
+    """
+    return ["_TENSORCLASS_MEMO" not in guard.name for guard in guards]
+
+
+@cache
+def _prepare() -> None:
+    from hoptorch.scan import ensure_scan_backward
+
+    # The scan's backward must have been probed before it is traced.
+    ensure_scan_backward("cuda" if torch.cuda.is_available() else "cpu")
+    for name, value in LIMITS.items():
+        setattr(torch._dynamo.config, name, value)

@@ -12,10 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.programs.lowering import Lowering
-from rt_torchrl.programs.machine_code import LaneWriter
-from rt_torchrl.programs.object_code import ObjectCode
-from rt_torchrl.programs.operators import new_tracer
-from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine, symbol
+from rt_torchrl.programs.machine_code import Lanes, LaneWriter, ObjectCode, lanes_of_this_machine, symbol
+from rt_torchrl.programs.rules import new_tracer
 
 Layer = tuple[Tensor, Tensor]
 """Weights (out, in) and biases (out) of an affine map."""

@@ -1,0 +1,385 @@
+"""Translations of torch's operators: rules for what is neither elementwise nor a fill, and decompositions."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial, reduce
+from itertools import accumulate, product
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rt_torchrl.programs.tracer import STRAIGHT, Arguments, Options, Rule, Tracer, in_shape
+
+STRAIGHT_PRODUCT = 200
+"""Greatest number of multiplications of a product of matrices that becomes straight-line code."""
+LARGEST_SOLVED = 6
+"""Greatest size of a matrix that is eliminated."""
+SPREAD = 4096
+"""Greatest number of places times assigned numbers of an assignment to places that vary."""
+
+
+def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    source, p = tracer.cells(args[0]), tracer.program
+    if args[0].dtype == out.dtype:
+        return source
+    if out.dtype == torch.bool:
+        convert: Callable[[int], int] = p.as_truth
+    elif out.is_floating_point() and out.dtype != torch.float64:
+        raise tracer.refuse(f"a conversion to {out.dtype}; trajectories need torch.float64")
+    elif args[0].is_floating_point() and not out.is_floating_point():
+        convert = partial(p.apply, "trunc")
+    else:
+        convert = p.as_number
+    return in_shape([convert(i) for i in source.flatten().tolist()], source.shape)
+
+
+# Elementwise operators with arguments of their own
+
+
+def _clamp(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    low, high = (*args[1:], None, None)[:2]
+    cells = tracer.cells(args[0]).expand(out.shape)
+    for name, limit in (("maximum", options.get("min", low)), ("minimum", options.get("max", high))):
+        if limit is not None:
+            cells = tracer.pointwise(name, [cells, tracer.cells(limit)], out.shape)
+    return cells
+
+
+# Sums, products and folds
+
+
+def _sum(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    cells, p = tracer.cells(args[0]), tracer.program
+    rows = _rows(cells, args[1] if len(args) > 1 else options.get("dim"))
+    m, n = rows.shape
+    if m * n > 4 * STRAIGHT:
+        ones = torch.full((n, 1), p.constant(1.0))
+        return matrix_product(tracer, rows, ones).view(out.shape)
+    found = [reduce(partial(p.apply, "add"), row) for row in rows.tolist()] if n else [p.constant(0.0)] * m
+    return in_shape(found, out.shape)
+
+
+def _fold(name: str) -> Rule:
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+        rows = _rows(tracer.cells(args[0]), args[1] if len(args) > 1 else options.get("dim")).tolist()
+        found = [reduce(partial(tracer.program.apply, name), row) for row in rows]
+        return in_shape(found, out.shape)
+
+    return rule
+
+
+def _rows(cells: Tensor, dims: int | Sequence[int] | None) -> Tensor:
+    """Cells as a matrix, with the dimensions ``dims`` (None or none for all) in its rows."""
+    chosen = [dims] if isinstance(dims, int) else list(dims or range(cells.ndim))
+    chosen = [d % cells.ndim for d in chosen]
+    kept = [d for d in range(cells.ndim) if d not in chosen]
+    return cells.permute(*kept, *chosen).reshape(math.prod(cells.shape[d] for d in kept), -1)
+
+
+def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = None) -> Tensor:
+    """The cells of ``start`` + a b: straight-line code, or one loop for large matrices."""
+    p, (m, k), n = tracer.program, a.shape, b.shape[1]
+    first = torch.full((m, n), p.constant(-0.0)) if start is None else start.expand(m, n)
+    if m * k * n <= STRAIGHT_PRODUCT:
+        found = []
+        for row, starts in zip(a.tolist(), first.tolist(), strict=True):
+            for column, total in zip(b.t().tolist(), starts, strict=True):
+                for x, y in zip(row, column, strict=True):
+                    total = p.apply("add", total, p.apply("mul", x, y))
+                found.append(total)
+        return in_shape(found, (m, n))
+    if p.differentiating and 0.0 in (tracer.uniform_number(a), tracer.uniform_number(b)):
+        return first
+    return tracer.loop("product", (a, b, first), (m, n), k)
+
+
+def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    if options.get("beta", 1) != 1 or options.get("alpha", 1) != 1:
+        raise tracer.refuse("addmm with alpha or beta")
+    start, a, b = (tracer.cells(x) for x in args)
+    return matrix_product(tracer, a, b, start)
+
+
+# Tables
+
+
+def _index(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    p, (source, indices) = tracer.program, args
+    given = [i for i in indices if i is not None]
+    cells = tracer.cells(source)
+    if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
+        picked: Tensor = torch.ops.aten.index.Tensor(cells, indices)
+        return picked
+    array, walk = tracer.access(cells.flatten())
+    nan, rest, found = p.constant(math.nan), math.prod(source.shape[len(given) :]), []
+    for place, inside in _places(tracer, source.shape, indices):
+        if walk is None:
+            there = [array] * rest
+        else:
+            (stride,) = walk.strides
+            place = p.apply("mul", place, p.constant(float(stride)))
+            offsets = [walk.base + stride * r for r in range(rest)]
+            there = [p.new("look_up", array, place, attributes=(offset,)) for offset in offsets]
+        found += [p.select(inside, x, nan) for x in there]
+    return in_shape(found, out.shape)
+
+
+def _places(tracer: Tracer, shape: Sequence[int], indices: Sequence[Tensor | None]) -> Iterator[tuple[int, int]]:
+    """Of every entry of indices that vary: its place in a tensor side by side, and whether it lies in the tensor."""
+    p, given = tracer.program, [i for i in indices if i is not None]
+    if None in indices[: len(given)] or any(i.dtype == torch.bool for i in given):
+        raise tracer.refuse("an index by a mask that varies, or after a full slice")
+    strides, zero = torch.empty(tuple(shape), device="meta").stride(), p.constant(0.0)
+    spread = torch.broadcast_tensors(*(tracer.cells(i) for i in given))
+    for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
+        place, inside = zero, []
+        for index, size, stride in zip(at, shape, strides, strict=False):
+            first, end = p.constant(-float(size)), p.constant(float(size))
+            inside.append(p.logic("and", p.apply("ge", index, first), p.apply("lt", index, end)))
+            wrapped = p.select(p.apply("lt", index, zero), p.apply("add", index, end), index)
+            safe = p.select(inside[-1], wrapped, zero)
+            place = p.apply("add", place, p.apply("mul", safe, p.constant(float(stride))))
+        yield place, reduce(partial(p.logic, "and"), inside)
+
+
+def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    target, indices, values = args[:3]
+    p, found = tracer.program, tracer.cells(target).flatten().tolist()
+    added = (*args[3:], options.get("accumulate", False))[0]
+    given = [i for i in indices if i is not None]
+    if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
+        places = torch.ops.aten.index.Tensor(torch.arange(target.numel()).view(target.shape), indices)
+        source = tracer.cells(values).expand(places.shape)
+        for place, value in zip(places.flatten().tolist(), source.flatten().tolist(), strict=True):
+            found[place] = p.apply("add", found[place], value) if added else value
+        return in_shape(found, target.shape)
+    rest = target.shape[len(given) :]
+    at = torch.broadcast_shapes(*(i.shape for i in given))
+    rows = tracer.cells(values).expand(*at, *rest).reshape(-1, math.prod(rest)).tolist()
+    if len(rows) * len(found) > SPREAD:
+        raise tracer.refuse(f"an assignment to {len(found)} places that vary")
+    for (place, inside), row in zip(_places(tracer, target.shape, indices), rows, strict=True):
+        for j, before in enumerate(found):
+            first, r = divmod(j, len(row))
+            hit = p.logic("and", inside, p.apply("eq", place, p.constant(float(first * len(row)))))
+            new = p.apply("add", before, row[r]) if added else row[r]
+            found[j] = p.select(hit, new, before)
+    return in_shape(found, target.shape)
+
+
+# Linear equations
+
+
+def _eliminate(tracer: Tracer, A: Tensor, B: Tensor) -> Tensor:
+    """The cells of X with A X = B of matrices in the last two dimensions, by elimination with partial pivoting."""
+    n = A.shape[-1]
+    if n > LARGEST_SOLVED:
+        raise tracer.refuse(f"linear equations of {n} unknowns, more than {LARGEST_SOLVED}")
+    lead = torch.broadcast_shapes(A.shape[:-2], B.shape[:-2])
+    pairs = (x.expand(*lead, *x.shape[-2:]).reshape(-1, *x.shape[-2:]).tolist() for x in (A, B))
+    solved = [_eliminated(tracer, [[*a, *b] for a, b in zip(*pair, strict=True)]) for pair in zip(*pairs, strict=True)]
+    return in_shape([x for rows in solved for row in rows for x in row], (*lead, n, B.shape[-1]))
+
+
+def _eliminated(tracer: Tracer, rows: list[list[int]]) -> list[list[int]]:
+    """X of rows (A, B)."""
+    p, n, width = tracer.program, len(rows), range(len(rows[0]))
+    for k in range(n):
+        for i in range(k + 1, n):  # of the two rows, the one with the greater pivot goes first
+            greater = p.apply("gt", p.apply("abs", rows[i][k]), p.apply("abs", rows[k][k]))
+            pairs = [(p.select(greater, b, a), p.select(greater, a, b)) for a, b in zip(rows[k], rows[i], strict=True)]
+            rows[k], rows[i] = ([*row] for row in zip(*pairs, strict=True))
+        for i in range(k + 1, n):
+            factor = p.apply("div", rows[i][k], rows[k][k])
+            rows[i] = [
+                p.apply("sub", rows[i][j], p.apply("mul", factor, rows[k][j])) if j > k else rows[i][j] for j in width
+            ]
+    found: list[list[int]] = []
+    for k in reversed(range(n)):
+        totals = rows[k][n:]
+        for a, x in zip(rows[k][k + 1 : n], found, strict=True):
+            totals = [p.apply("sub", total, p.apply("mul", a, y)) for total, y in zip(totals, x, strict=True)]
+        found.insert(0, [p.apply("div", total, rows[k][k]) for total in totals])
+    return found
+
+
+def _solve(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor, ...]) -> list[Tensor]:
+    """X of A X = B; in the place of the factors of A stands A itself, which :func:`_solve_again` takes."""
+    A, B = map(tracer.cells, args[:2])
+    vector = B.ndim == 1 or (B.ndim == A.ndim - 1 and B.shape == A.shape[:-1])
+    found = _solved(tracer, A, B.unsqueeze(-1) if vector else B, left=options.get("left", True))
+    nothing = [torch.full(x.shape, tracer.program.constant(0)) for x in out[2:]]
+    return [found.squeeze(-1) if vector else found, A, *nothing]
+
+
+def _solve_again(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    A, _, B = map(tracer.cells, args)
+    return _solved(tracer, A.mT if options.get("adjoint", False) else A, B, left=options.get("left", True))
+
+
+def _solved(tracer: Tracer, A: Tensor, B: Tensor, *, left: bool) -> Tensor:
+    return _eliminate(tracer, A, B) if left else _eliminate(tracer, A.mT, B.mT).mT
+
+
+def _invert(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor, ...]) -> list[Tensor]:
+    A, p = tracer.cells(args[0]), tracer.program
+    one = torch.tensor([[p.constant(float(i == j)) for j in range(A.shape[-1])] for i in range(A.shape[-1])])
+    return [_eliminate(tracer, A, one), torch.full(out[1].shape, p.constant(0))]
+
+
+# Copies, carried out on the cells
+
+
+def _copy_by(name: str) -> Rule:
+    """An operator on the cells; an index, which is its third argument, must be known."""
+    operator = getattr(torch.ops.aten, name)
+
+    def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
+        def celled(x: Any) -> Any:
+            if isinstance(x, Tensor):
+                return tracer.cells(x)
+            return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
+
+        index = args[2:] if name in INDEXED else ()
+        tracer.require_known(f"{name} by an index that varies", index)
+        kept = {key: value for key, value in options.items() if key != "memory_format"}
+        return operator(*map(celled, args[: len(args) - len(index)]), *index, **kept)
+
+    return rule
+
+
+def _overwrite(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    return tracer.cells(args[1])
+
+
+def _diag_embed(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    places = torch.diag_embed(1 + tracer.cells(args[0]), *args[1:], **options)  # zero is no place of a diagonal
+    return torch.where(places > 0, places - 1, tracer.program.constant(0.0))
+
+
+def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    if "reduce" in options:
+        raise tracer.refuse("scatter with an operation")
+    cells, (dim, index), p = tracer.cells(args[0]), args[1:3], tracer.program
+    source = tracer.cells(args[3]).expand(index.shape)
+    if tracer.numbers(tracer.cells(index)) is not None:
+        return cells.scatter(dim, index, source)
+    found = cells.movedim(dim, -1).clone()
+    chosen, values = (x.movedim(dim, -1) for x in (tracer.cells(index), source))
+    for at in product(*map(range, chosen.shape)):
+        for j in range(found.shape[-1]):
+            hit = p.apply("eq", int(chosen[at]), p.constant(float(j)))
+            there = (*at[:-1], j)
+            found[there] = p.select(hit, int(values[at]), int(found[there]))
+    return found.movedim(-1, dim)
+
+
+def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
+    filling = tracer.program.constant(float(args[2]) if len(args) > 2 else 0.0)
+    return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
+
+
+INDEXED = ("gather", "index_select")
+PLAIN = (
+    "cat stack flip roll repeat expand_copy slice_scatter select_scatter unfold_copy view_copy permute_copy "
+    "_unsafe_view alias_copy clone contiguous lift_fresh lift_fresh_copy"
+).split()
+RULES: dict[str, Rule] = {
+    **dict.fromkeys(("clamp", "clamp_min"), _clamp),
+    "zero": lambda tracer, args, options, out: tracer.cells(0.0),
+    "_to_copy": _convert,
+    "sum": _sum,
+    "amax": _fold("maximum"),
+    "amin": _fold("minimum"),
+    "prod": _fold("mul"),
+    "mm": lambda tracer, args, options, out: matrix_product(tracer, *map(tracer.cells, args)),
+    "addmm": _addmm,
+    "index": _index,
+    "_linalg_solve_ex": _solve,
+    "linalg_lu_solve": _solve_again,
+    "linalg_inv_ex": _invert,
+    "_linalg_check_errors": lambda tracer, args, options, out: [],
+    **{name: _copy_by(name) for name in (*PLAIN, *INDEXED)},
+    **dict.fromkeys(("copy", "fill"), _overwrite),
+    "diag_embed": _diag_embed,
+    "scatter": _scatter,
+    **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),
+    "constant_pad_nd": _pad,
+}
+
+# Operators as torch code of simpler ones
+
+
+def _mean(x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
+    total = x.sum(dim, keepdim)
+    return total / (x.numel() // max(1, total.numel()))
+
+
+def _variance(x: Tensor, dim: Any = None, correction: int | float | None = None, *, keepdim: bool = False) -> Tensor:
+    deviation = x - _mean(x, dim, keepdim=True)
+    total = (deviation * deviation).sum(dim, keepdim)
+    return total / max(0.0, x.numel() / max(1, total.numel()) - (1.0 if correction is None else correction))
+
+
+def _scatter_add(x: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
+    places: list[Tensor | None] = [*torch.meshgrid(*map(torch.arange, index.shape), indexing="ij")]
+    places[dim] = index
+    return x.index_put(places, source[tuple(map(slice, index.shape))], accumulate=True)
+
+
+def _bucketize(x: Any, knots: Tensor, *, out_int32: bool = False, right: bool = False) -> Tensor:
+    above = (torch.gt if right else torch.ge)(knots, torch.as_tensor(x).unsqueeze(-1))
+    return (~above).sum(-1)  # NaN is above nothing
+
+
+def _cumulative(step: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+    return lambda x, dim: torch.stack([*accumulate(x.unbind(dim), step)], dim)
+
+
+def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Callable[..., Any]:
+    """Greatest or least number of all, of two tensors, or of each row with its first place; NaN is both."""
+
+    def found(x: Tensor, other: Any = None, keepdim: bool = False) -> Any:
+        if other is None or isinstance(other, Tensor):
+            return of_all(x) if other is None else of_two(x, other)
+        value = of_all(x, other, keepdim=True)
+        place = (~((x == value) | x.isnan())).double().cumprod(other).sum(other, keepdim=True).long()
+        return (value, place) if keepdim else (value.squeeze(other), place.squeeze(other))
+
+    return found
+
+
+DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
+    "mean": _mean,
+    "var": _variance,
+    "scatter_add": _scatter_add,
+    "bucketize": _bucketize,
+    "searchsorted": lambda knots, x, side="", **how: _bucketize(x, knots, **{"right": side == "right", **how}),
+    "cumsum": _cumulative(torch.add),
+    "cumprod": _cumulative(torch.mul),
+    "max": _extreme(torch.amax, torch.maximum),
+    "min": _extreme(torch.amin, torch.minimum),
+    "clamp_max": lambda x, limit: torch.clamp(x, max=limit),
+    "masked_fill": lambda x, mask, value: torch.where(mask, value, x),
+    "deg2rad": lambda x: x * (math.pi / 180.0),
+    "rsub": lambda a, b, alpha=1: -(alpha * a) + b,
+    "bmm": lambda a, b: torch.stack([x @ y for x, y in zip(a, b, strict=True)]),
+    "slice_backward": lambda x, sizes, *place: x.new_zeros(sizes).slice_scatter(x, *place),
+    "select_backward": lambda x, sizes, *place: x.new_zeros(sizes).select_scatter(x, *place),
+}
+"""Operators that are common enough to do without the tables of torch."""
+
+
+@cache
+def decompositions_of_torch() -> dict[Any, Callable[..., Any]]:
+    """The ways in which torch computes operators by simpler ones."""
+    # These tables take a third of a second to import, and most code needs none of them.
+    from torch._decomp import core_aten_decompositions, decomposition_table
+
+    return {**decomposition_table, **core_aten_decompositions()}
+
+
+def new_tracer(straight: int = STRAIGHT) -> Tracer:
+    """A tracer with all translations."""
+    return Tracer(RULES, DECOMPOSITIONS, decompositions_of_torch, straight)

@@ -1,0 +1,491 @@
+"""Machine code of an interval and of its reverse sweep: traced, compared with torch, and kept for its kind."""
+
+import ctypes
+import os
+import threading
+import warnings
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache, cached_property
+from itertools import accumulate, chain, islice
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from rt_torchrl.programs.contract import Executed, Guard, Holdings, ImpureError, guards_of, inputs_of, require_pure
+from rt_torchrl.programs.machine_code import Lanes, ObjectCode, lanes_of_this_machine, march_text, sweep_text
+from rt_torchrl.programs.program import UntraceableError
+from rt_torchrl.programs.rules import new_tracer
+from rt_torchrl.programs.tracer import STRAIGHT, Tracer
+from rt_torchrl.trajectories.engines.interval import Drive, with_weights
+
+X = (ctypes.c_void_p, *[ctypes.c_int64] * 3)
+MARCH = (*X, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
+SWEEP = (*X, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 4, ctypes.c_int64)
+"""Types of the arguments of :func:`march_text` and :func:`sweep_text`."""
+AGREEMENT = 1e-8
+"""Greatest difference between machine code and torch, relative to the largest value of a signal."""
+ROUNDING = 1e-13
+"""Greatest difference of gradients by weights, relative to the largest of all gradients: behind a saturated function,
+such as 1 − tanh², nothing is left of a gradient but its rounding."""
+TRIES = 3
+"""Number of points without a number by torch after which an interval is left to torch."""
+KEPT = 256
+"""Number of kinds of intervals whose machine code is kept."""
+ROWS = 4
+"""Number of realisations with which an interval is asked that does not become machine code."""
+NUDGE = 1e-3
+"""Relative change of the signals of a point, so that no two rows are equal."""
+
+
+class UncomparedError(UntraceableError):
+    """Where torch finds no numbers, machine code has nothing to be compared with."""
+
+
+class Inputs:
+    """The tensors of an interval that its machine code reads, as long as no others take their places.
+
+    Args:
+        interval: the interval.
+    """
+
+    def __init__(self, interval: nn.Module):
+        self._all = tuple(inputs_of(interval).values())
+        self.learned = [w for w in self._all if w.requires_grad]
+        self.sizes = [w.numel() for w in self.learned]
+
+    @cached_property
+    def _arrays(self) -> list[np.ndarray]:
+        """The same memory in NumPy."""
+        return [w.detach().numpy() for w in self._all]
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        return [*accumulate(w.numel() for w in self._all)]
+
+    def row(self, read: Iterable[int] | None = None) -> np.ndarray:
+        """The present numbers of all of them as one row, or of those that are read."""
+        found = np.empty(max(1, *self._ends, 1))
+        for k in range(len(self._all)) if read is None else read:
+            x = self._arrays[k]
+            found[self._ends[k] - x.size : self._ends[k]] = x.ravel()
+        return found
+
+    def split(self, gradients: np.ndarray) -> list[Tensor]:
+        """A row of gradients by the learned weights, in their own shapes."""
+        parts = (gradients[end - n : end] for n, end in zip(self.sizes, accumulate(self.sizes), strict=True))
+        return [torch.from_numpy(part.reshape(w.shape)) for part, w in zip(parts, self.learned, strict=True)]
+
+
+# Lanes: realisations side by side in the vectors of the processor, and groups of them among threads
+
+
+class Group(NamedTuple):
+    """Realisations ``first`` ... ``last`` − 1 in the lanes of a vector; the last one also fills lanes that are left."""
+
+    first: int
+    last: int
+    lanes: int
+
+    @property
+    def live(self) -> int:
+        """Number of lanes with a realisation of their own."""
+        return self.last - self.first
+
+    def gather(self, *arrays: np.ndarray) -> np.ndarray:
+        """Rows ``n batch signals`` of arrays, side by side as ``n signals lanes``."""
+        found, first = np.empty((len(arrays[0]), sum(x.shape[-1] for x in arrays), self.lanes)), 0
+        for x in arrays:
+            last = first + x.shape[-1]
+            found[:, first:last, : self.live] = x[:, self.first : self.last].transpose(0, 2, 1)
+            first = last
+        found[:, :, self.live :] = found[:, :, self.live - 1 : self.live]
+        return found
+
+    def scatter(self, lanes: np.ndarray, array: np.ndarray) -> None:
+        """Put ``n signals lanes`` into the rows of an array ``n batch signals``."""
+        array[:, self.first : self.last] = lanes[:, :, : self.live].transpose(0, 2, 1)
+
+
+def signals_of(drive: Iterable[Tensor]) -> np.ndarray:
+    """The address of every signal of tensors ``n batch signals``, and the bytes to the next realisation and row."""
+    found = []
+    for x in drive:
+        step, lane, signal = x.stride()
+        first, lane = x.data_ptr(), lane if x.shape[1] > 1 else 0  # one row for all realisations
+        found += [(first + 8 * signal * j, 8 * lane, 8 * step) for j in range(x.shape[2])]
+    return np.array(found, np.int64).reshape(-1, 3)
+
+
+def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> None:
+    """Do the work of every group, on as many threads as torch may use; whoever is free takes the next group."""
+    starts = range(0, batch, lanes)
+    groups = iter([Group(first, min(first + lanes, batch), lanes) for first in starts])
+
+    def share() -> None:
+        for group in groups:
+            work(group)
+
+    others = min(torch.get_num_threads(), len(starts)) - 1
+    helping = [_pool(others).submit(share) for _ in range(others)]
+    try:
+        share()
+    finally:  # nobody may still write into the arrays of a call that has ended
+        if helping:
+            wait(helping)
+    for thread in helping:
+        thread.result()  # raises what it raised
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="rt_torchrl-native")
+
+
+if hasattr(os, "register_at_fork"):  # threads do not live on in a forked process
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+# Points at which an interval is asked
+
+
+class Point(NamedTuple):
+    """States and drive of one interval for a few realisations, at which code is traced and compared."""
+
+    state: Tensor
+    drive: Drive
+
+    def in_lanes(self) -> tuple[tuple[np.ndarray, int, int, int], np.ndarray]:
+        """Drive, as machine code takes it, and states ``1 n_s lanes``, one realisation in each lane."""
+        lanes, (t, *rest) = Group(0, len(self.state), len(self.state)), self.drive
+        signals = signals_of(x.unsqueeze(0) for x in (t.unsqueeze(-1), *rest))
+        return (signals, 0, lanes.last - 1, 0), lanes.gather(self.state.unsqueeze(0).numpy())
+
+    def rows(self, chosen: Tensor) -> "Point":
+        """Some of the realisations."""
+        return Point(self.state[chosen], Drive(*(x[chosen] for x in self.drive)))
+
+
+@torch.no_grad()
+def point_of(initial_state: Tensor, drive: Drive, count: int, sums: int = 0) -> Point:
+    """States and drive of one interval for a number of rows, near the initial states and at times over the whole drive.
+
+    Behind the states are the sums of the interval, which begin with zero.
+    """
+    n, batch, row = len(drive.t), len(initial_state), torch.arange(count, device=initial_state.device)
+    at = (row * n) // count
+    t = drive.t[at, row % batch if drive.t.shape[1] > 1 else 0]
+    driving = (_nudged(x[at, row % batch]) for x in (drive.exogenous, drive.command))
+    return Point(_nudged(functional.pad(initial_state.detach()[row % batch], (0, sums))), Drive(t, *driving))
+
+
+def _nudged(x: Tensor) -> Tensor:
+    """Rows of which no two are equal."""
+    share = torch.arange(len(x), device=x.device).unsqueeze(-1) / len(x)
+    return x + NUDGE * share * (x.abs() + (x == 0.0))
+
+
+# Machine code of one kind of interval
+
+
+class IntervalCode:
+    """The machine code of one kind of interval: ``march(x, s, w, n)`` and, once it is prepared, the reverse sweep.
+
+    :mod:`rt_torchrl.programs.machine_code` describes both functions.
+
+    Args:
+        interval: the map Φ; its attribute ``straight``, if it has one, is that of the :class:`Tracer`.
+        point: a point at which it is traced, and compared with torch.
+        lanes: lanes of the processor.
+        holdings: what the interval holds.
+
+    Raises:
+        UntraceableError: if the interval cannot become a program, reads what may change unnoticed, or its program
+            differs from torch.
+    """
+
+    def __init__(self, interval: nn.Module, point: Point, lanes: Lanes, holdings: Holdings | None = None):
+        self.point, self.lanes = point, lanes
+        self.sweeps: dict[bool, ObjectCode] = {}
+        """The reverse sweeps that have been prepared, without and with the gradients by the drive."""
+        self.guards: tuple[Guard, ...] = ()
+        """Constants outside of the interval that its code has read."""
+        self._executed, holdings = Executed(), holdings or Holdings(interval)
+        tracer = new_tracer(getattr(interval, "straight", STRAIGHT))
+        state, drive, weights = _traced_inputs(tracer, interval, point)
+        with torch.no_grad(), tracer.following():
+            end = with_weights(interval, weights, state, drive)
+        if end.shape != state.shape:
+            raise UntraceableError(f"states of shape {tuple(state.shape)} become {tuple(end.shape)} in an interval")
+        self.sizes = {"x": sum(x.numel() for x in drive), "s": state.shape[-1]}
+        self.read = _read_by(tracer, interval, tracer.outputs(end))
+        """Numbers of the inputs that the code reads, of which a large table may not be one."""
+        self.march = ObjectCode(march_text(tracer.program, tracer.outputs(end), self.sizes, lanes), "march", MARCH)
+        x, start = point.in_lanes()
+        states = np.concatenate([start, start])
+        self.march(*x, states, Inputs(interval).row(), 1)
+        with torch.no_grad(), self._executed.noted():
+            exact = interval(*point).numpy()
+        self.guards = guards_of(interval, holdings, self._executed)
+        require_equal("the end state", states[1].T, exact, point.state.numpy())
+
+    def prepare_sweep(self, interval: nn.Module, driven: bool, holdings: Holdings | None = None) -> None:
+        """Make the reverse sweep of an interval of this kind, unless it is there.
+
+        Args:
+            interval: the interval.
+            driven: whether the sweep gives the gradients by the drive too.
+            holdings: what the interval holds.
+
+        Raises:
+            UntraceableError: if it cannot become a program, or the program differs from torch.
+        """
+        if driven in self.sweeps:
+            return
+        tracer = new_tracer()
+        state, drive, weights = _traced_inputs(tracer, interval, self.point)
+        costate = torch.ones_like(state)
+        tracer.input(costate, "l")
+        learned = [weights[name] for name, w in interval.named_parameters() if w.requires_grad]
+        parts = [state], [*drive] if driven else [], learned
+        leaves = [leaf.requires_grad_() for part in parts for leaf in part]
+        with torch.enable_grad(), tracer.following():
+            found = _gradients(with_weights(interval, weights, state, drive), leaves, costate)
+        values = map(tracer.outputs, found)
+        outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
+        code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
+        self.read |= _read_by(tracer, interval, chain.from_iterable(outputs))
+        self._compare_sweep(code, interval, driven)
+        self.guards = guards_of(interval, holdings or Holdings(interval), self._executed)
+        self.sweeps[driven] = code
+
+    def _compare_sweep(self, sweep: ObjectCode, interval: nn.Module, driven: bool) -> None:
+        inputs, (x, states) = Inputs(interval), self.point.in_lanes()
+        costate = 1.0 + 0.1 * np.arange(states[0].size, dtype=float).reshape(states[0].shape)
+        by_state, by_drive = costate.copy(), np.zeros((1, self.sizes["x"], self.lanes.number))
+        by_weights = np.zeros((sum(inputs.sizes), self.lanes.number))
+        sweep(*x, states, np.zeros_like(states), 0, by_state, inputs.row(), by_drive, by_weights, 1)
+        rows = torch.ones(len(self.point.state), dtype=torch.bool)
+        exact = self._exactly(interval, inputs, rows, costate)
+        known = exact[0].isfinite().all(-1) & exact[1].isfinite().all(-1)
+        if not known.all():  # such as where(x > 0, sqrt(x), 0): compared where torch has a gradient
+            rows = known
+            if not rows.any():
+                raise UncomparedError(
+                    f"torch has no finite gradient of an interval from the state {self.point.state[0].tolist()}. A "
+                    "branch of torch.where that is not taken may have none: give it an argument for which it has one, "
+                    "torch.sqrt(torch.where(x > 0, x, 1)) in the place of torch.sqrt(x)"
+                )
+            exact = self._exactly(interval, inputs, rows, costate)
+        at = rows.numpy()
+        found = [by_state.T[at], by_drive[0].T[at] if driven else exact[1]]
+        found += inputs.split(by_weights[:, at].sum(-1))
+        largest = max((x.abs().amax().item() for x in exact if x.numel()), default=0.0)
+        names = ["state", "drive", *(name for name, w in interval.named_parameters() if w.requires_grad)]
+        for name, part, exactly in zip(names, found, exact, strict=True):
+            floor = np.full(exactly.shape, ROUNDING / AGREEMENT * largest)
+            require_equal(f"the gradient by {name}", np.asarray(part), exactly.numpy(), floor)
+
+    def _exactly(self, interval: nn.Module, inputs: Inputs, rows: Tensor, costate: np.ndarray) -> list[Tensor]:
+        """The gradients by states, drive and weights that torch computes for some realisations."""
+        point = self.point.rows(rows)
+        leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
+        with torch.enable_grad(), self._executed.noted():
+            end = interval(leaves[0], Drive(*leaves[1:]))
+            given = torch.from_numpy(costate.T)[rows]
+            state, t, *rest = _gradients(end, [*leaves, *inputs.learned], given)
+        return [state, torch.cat([t.unsqueeze(-1), *rest[:2]], -1), *rest[2:]]
+
+
+def _gradients(end: Tensor, leaves: list[Tensor], costate: Tensor) -> Sequence[Tensor]:
+    """The products of the co-state of an end with its Jacobians by the leaves."""
+    if not end.requires_grad:
+        return [torch.zeros_like(leaf) for leaf in leaves]
+    return torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
+
+
+def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
+    """Refuse machine code that differs from torch.
+
+    Raises:
+        UntraceableError: if a number differs by more than :data:`AGREEMENT` of the largest finite number of its column.
+        UncomparedError: if it differs only where torch finds no numbers.
+    """
+    sizes = np.abs(np.where(np.isfinite(exact), exact, 0.0)) + np.abs(np.where(np.isfinite(scale), scale, 0.0))
+    equal = np.isclose(found, exact, rtol=0.0, atol=AGREEMENT * sizes.max(0, initial=0.0) + 1e-300, equal_nan=True)
+    wrong = ~equal & np.isfinite(exact) if (~equal & np.isfinite(exact)).any() else ~equal
+    if wrong.any():
+        kind = UntraceableError if np.isfinite(exact[wrong]).all() else UncomparedError
+        raise kind(
+            f"{what} differs from what torch computes, for example {found[wrong][0]} instead of {exact[wrong][0]}. A "
+            "number has left torch where tracing cannot follow it, such as by .numpy()"
+        )
+
+
+def _traced_inputs(tracer: Tracer, interval: nn.Module, point: Point) -> tuple[Tensor, Drive, dict[str, Tensor]]:
+    """State, drive and parameters as inputs of a program, of the last realisation; buffers are inputs themselves.
+
+    A number that code takes from the first realisation of all then differs from the one that was traced.
+    """
+    state, drive = point.state[-1:].clone(), Drive(*(x[-1:].clone() for x in point.drive))
+    tracer.input(state, "s")
+    for x in drive:
+        tracer.input(x, "x")
+    weights = {}
+    for name, w in inputs_of(interval).items():
+        if w.dtype != torch.float64:
+            raise UntraceableError(f"{name} is in {w.dtype}; trajectories need torch.float64")
+        if isinstance(w, nn.Parameter):
+            w = weights[name] = w.detach().clone()
+        tracer.weight(w)
+    return state, drive, weights
+
+
+def _read_by(tracer: Tracer, interval: nn.Module, outputs: Iterable[int]) -> set[int]:
+    """The numbers of the inputs of an interval that outputs of a program depend on."""
+    p = tracer.program
+    firsts = {p.operations[k].attributes[0] for k in p.needed(outputs) if p.operations[k].name == "weights"}
+    sizes = [x.numel() for x in inputs_of(interval).values()]
+    return {
+        k for k, (end, size) in enumerate(zip(accumulate(sizes), sizes, strict=True)) if size and end - size in firsts
+    }
+
+
+# Kinds of intervals
+
+_known: "WeakKeyDictionary[nn.Module, tuple[Holdings, Inputs]]" = WeakKeyDictionary()
+"""What an interval holds, as long as it holds that."""
+_kept: "OrderedDict[tuple[object, ...], tuple[IntervalCode | UntraceableError, tuple[object, ...]]]" = OrderedDict()
+"""The machine code of each kind of interval, or why there is none, with the objects that are known by address."""
+_modes: "WeakKeyDictionary[nn.Module, tuple[bool, ...]]" = WeakKeyDictionary()
+"""The modes, training or evaluation, of the modules of an interval when it was found to be a function."""
+_tries = Counter[tuple[object, ...]]()
+_lock = threading.RLock()
+
+
+def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[IntervalCode, Inputs] | None:
+    """The machine code of an interval with its inputs; None where there is none.
+
+    There is none for an interval that is not on the CPU or, with one warning, cannot become machine code. Where the
+    first states or weights are no numbers, there is none for this call. Where a gradient is wanted, the sweep is
+    prepared too: later the interval may be another one.
+
+    Raises:
+        ImpureError: if the interval is no function, or mixes realisations.
+    """
+    if initial_state.device.type != "cpu":
+        return None
+    with _lock:
+        known = _known.get(interval)
+        if known is None or not known[0].unchanged(interval):
+            known = _known[interval] = Holdings(interval), Inputs(interval)
+        (holdings, inputs), sums = known, getattr(interval, "sums", 0)
+        widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
+        key = (holdings.digest, lanes_of_this_machine(), *widths)
+        found, alive = _kept.get(key, (None, tuple(holdings.alive)))
+        if isinstance(found, IntervalCode) and not _as_noted(found, holdings):
+            found, alive = None, tuple(holdings.alive)
+        driven = any(x.requires_grad for x in drive)
+        wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
+        if found is None or (isinstance(found, IntervalCode) and wanted and driven not in found.sweeps):
+            if not (np.isfinite(inputs.row()).all() and initial_state.isfinite().all()):
+                return None  # nothing to compare with; the next call may have numbers
+            point = point_of(initial_state, drive, lanes_of_this_machine().number, sums)
+            found = _made(found, key, interval, point, holdings, driven if wanted else None)
+            if found is None:
+                return None
+            _kept[key] = found, alive
+            while len(_kept) > KEPT:
+                _kept.popitem(last=False)
+        _kept.move_to_end(key)
+        if isinstance(found, UntraceableError):
+            return None
+        if not holdings.guarded(found.guards):
+            holdings.guard(interval, found.guards)
+        return found, inputs
+
+
+def _made(
+    code: IntervalCode | None,
+    key: tuple[object, ...],
+    interval: nn.Module,
+    point: Point,
+    holdings: Holdings,
+    driven: bool | None,
+) -> IntervalCode | UntraceableError | None:
+    """The machine code with a sweep (None for none), or why there is none; None if the next call is to try again."""
+    try:
+        if code is None:
+            require_pure(interval, *point)
+            code = IntervalCode(interval, point, lanes_of_this_machine(), holdings)
+        if driven is not None:
+            code.prepare_sweep(interval, driven, holdings)
+    except ImpureError:
+        raise
+    except Exception as error:  # code that is traced may raise anything, such as for one realisation alone
+        _tries[key] += 1
+        if isinstance(error, UncomparedError) and _tries[key] < TRIES:
+            return None
+        found = _reason(error)
+        warnings.warn(f"engine 'autograd' takes the place of 'native': {found}.", stacklevel=2)
+        return found
+    return code
+
+
+def _as_noted(code: IntervalCode, holdings: Holdings) -> bool:
+    """Whether constants outside of the interval are what they were; those that are compared are."""
+    return holdings.guarded(code.guards) or all(guard.holds() for guard in code.guards)
+
+
+def _reason(error: Exception) -> UntraceableError:
+    """Why there is no machine code, without the traceback, which would keep the traced tensors."""
+    if isinstance(error, UntraceableError):
+        return error.with_traceback(None)
+    return UntraceableError(f"an interval of one realisation raises {type(error).__name__}: {str(error).rstrip('.')}")
+
+
+def require_pure_once(interval: nn.Module, initial_state: Tensor, drive: Drive) -> None:
+    """Refuse what is no function, for an engine that does not trace: when it is new or a module changed its mode.
+
+    Raises:
+        ImpureError: as :func:`require_pure`.
+    """
+    modes = tuple(module.training for module in interval.modules())
+    if _modes.get(interval) != modes:
+        require_pure(interval, *point_of(initial_state, drive, ROWS))
+        _modes[interval] = modes
+
+
+def require_pure_policy(policy: nn.Module, observation: Tensor) -> None:
+    """The same of a policy alone, that steps a system.
+
+    Args:
+        policy: the policy.
+        observation: observations like those that it meets, ``batch n_o``.
+
+    Raises:
+        ImpureError: as :func:`require_pure`.
+    """
+    modes = tuple(module.training for module in policy.modules())
+    if _modes.get(policy) != modes:
+        nothing = observation.new_zeros(1, len(observation), 0)
+        rows = point_of(observation, Drive(observation.new_zeros(1, 1), nothing, nothing), ROWS).state
+        require_pure(_Answer(policy), rows)
+        _modes[policy] = modes
+
+
+class _Answer(nn.Module):
+    """What a policy answers, as if it were an interval."""
+
+    def __init__(self, policy: nn.Module):
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, observation: Tensor) -> Tensor:
+        answer: Tensor = self.policy(observation)
+        return answer
