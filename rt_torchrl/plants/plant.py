@@ -100,21 +100,12 @@ class Plant(nn.Module, ABC):
         self.n_steps = whole_steps(self.name, dt, horizon)
         self.dt = float(dt)
         self.closure = closure
-        self.observed = self.chosen(observe)
+        self.observed = chosen(self.name, observe, self.measurements, self.observation_sets)
         self.previews = tuple(m.read for m in self.observed if isinstance(m.read, Preview))
         if self.observed:
             self.observations = tuple(measurement.observation for measurement in self.observed)
         if self.previews:
             self.inputs = (*self.inputs, *(m.signal for m in self.observed if m.read in self.previews))
-
-    @classmethod
-    def chosen(cls, observe: Sequence[str]) -> tuple[Measurement, ...]:
-        """The measurements that ``observe`` names.
-
-        Raises:
-            ValueError: if there is no such measurement or set.
-        """
-        return chosen(cls.name, observe, cls.measurements, cls.observation_sets)
 
     @property
     def acting_inputs(self) -> tuple[Signal, ...]:
@@ -146,7 +137,7 @@ class Plant(nn.Module, ABC):
         """Length of an episode T_o [s]."""
         return self.n_steps * self.dt
 
-    # The system
+    # Dynamics
 
     @abstractmethod
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
@@ -179,7 +170,7 @@ class Plant(nn.Module, ABC):
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
         return read
 
-    # The control problem
+    # Task
 
     def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         """The observation of the policies, scaled to order one, such as tracking errors.
@@ -298,7 +289,7 @@ class Plant(nn.Module, ABC):
         ahead = [preview.shifted(exogenous, self.dt) for preview in self.previews]
         return torch.cat([exogenous, torch.stack(ahead, -1)], -1) if ahead else exogenous
 
-    # Randomness, always from the generator that is passed in
+    # Draws, always from the generator that is passed in
 
     @abstractmethod
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
