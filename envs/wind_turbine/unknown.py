@@ -17,7 +17,7 @@ from rt_torchrl.plants.coefficients import ScaledCoefficients
 from rt_torchrl.plants.extension import Extension, System, combined, replaced, require_systems
 from rt_torchrl.plants.neural_residual import NeuralResidual
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.shapes import Action, Input, Inputs, State, Time
+from rt_torchrl.plants.shapes import Action, Hidden, Input, Inputs, State, Time
 from rt_torchrl.plants.signal import Signal
 
 PITCH_LAG = 0.7
@@ -78,7 +78,7 @@ class LaggedInflow(Extension):
         accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
         return torch.cat([accelerated, field[..., 1:], rate.unsqueeze(-1)], -1)
 
-    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 1"]:
+    def rest(self, base: State) -> Hidden:
         plant: Any = self.base
         speed, wind, pitch = base[..., 0], base[..., 2], base[..., 5]
         if self.of == "torque":
