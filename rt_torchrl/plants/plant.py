@@ -100,12 +100,21 @@ class Plant(nn.Module, ABC):
         self.n_steps = whole_steps(self.name, dt, horizon)
         self.dt = float(dt)
         self.closure = closure
-        self.observed = chosen(self.name, observe, self.measurements, self.observation_sets)
+        self.observed = self.chosen(observe)
         self.previews = tuple(m.read for m in self.observed if isinstance(m.read, Preview))
         if self.observed:
             self.observations = tuple(measurement.observation for measurement in self.observed)
         if self.previews:
             self.inputs = (*self.inputs, *(m.signal for m in self.observed if m.read in self.previews))
+
+    @classmethod
+    def chosen(cls, observe: Sequence[str]) -> tuple[Measurement, ...]:
+        """The measurements that ``observe`` names.
+
+        Raises:
+            ValueError: if there is no such measurement or set.
+        """
+        return chosen(cls.name, observe, cls.measurements, cls.observation_sets)
 
     @property
     def acting_inputs(self) -> tuple[Signal, ...]:
