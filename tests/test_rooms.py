@@ -1,6 +1,7 @@
 """The rooms of the library stand above each other, as ``pyproject.toml`` and the contributing page say."""
 
 import ast
+import graphlib
 import re
 import subprocess
 import sys
@@ -32,6 +33,21 @@ def test_no_module_of_the_library_imports_from_its_top():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module == "rt_torchrl":
                 assert {alias.name for alias in node.names} <= rooms, path
+
+
+@pytest.mark.parametrize("plant", ["cascaded_tanks", "cryogenic_tank", "flapping_wing", "pendulum"])
+def test_the_parts_of_a_plant_import_each_other_in_one_order(plant):
+    """Also where an import stands in a function; import-linter takes ``rt_torchrl.envs`` for one module."""
+    imported, place = {}, f"rt_torchrl.envs.{plant}"
+    for path in (ROOT / "envs" / plant).glob("*.py"):
+        parts = imported.setdefault(path.stem, set())
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module == place:
+                parts |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{place}."):
+                parts.add(node.module.removeprefix(f"{place}."))
+    order = list(graphlib.TopologicalSorter(imported).static_order())  # raises if there is none
+    assert {"plant", "__init__"} <= set(order)
 
 
 def test_contributors_read_the_same_order():
