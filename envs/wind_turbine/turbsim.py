@@ -43,18 +43,9 @@ class WindRecord:
             array = array_of(f"{self.source}: {field}", getattr(self, field))
             array.setflags(write=False)
             object.__setattr__(self, field, array)
-        if self.time.ndim != 1 or self.time.shape != self.speed.shape:
-            raise ValueError(
-                f"{self.source}: time has shape {self.time.shape} and speed {self.speed.shape}; "
-                "pass two vectors of equal length."
-            )
-        if len(self.time) < 2:
-            raise ValueError(
-                f"{self.source}: holds {len(self.time)} wind samples, at least 2 are needed; "
-                "check that the file was written to its end."
-            )
-        self._check_speed()
-        self._check_time()
+        fault = self._fault_of_shape() or self._fault_of_speed() or self._fault_of_time()
+        if fault:
+            raise ValueError(f"{self.source}: {fault}")
 
     @property
     def duration(self) -> float:
@@ -66,45 +57,45 @@ class WindRecord:
         """Mean sampling interval [s], which averages out the rounding of printed times."""
         return self.duration / (len(self.time) - 1)
 
-    def _check_speed(self) -> None:
+    def _fault_of_shape(self) -> str:
+        if self.time.ndim != 1 or self.time.shape != self.speed.shape:
+            return f"time has shape {self.time.shape} and speed {self.speed.shape}; pass two vectors of equal length."
+        if len(self.time) < 2:
+            return f"holds {len(self.time)} wind samples; at least 2 are needed: is the file written to its end?"
         if not np.isfinite(self.time).all():
-            at = int(np.argmin(np.isfinite(self.time)))
-            raise ValueError(
-                f"{self.source}: time of sample {at} is {self.time[at]}; all must be finite. Write the file again."
-            )
-        gap = "must be finite. Fill the gap by interpolation or cut the record there."
-        sign = "must not be negative. Check its sign and the wind direction, which is 0 deg along the rotor axis."
-        unit = f"must not exceed {GREATEST_SPEED:g} m/s. Check its unit, and that the file is whole."
-        faults = (~np.isfinite(self.speed), gap), (self.speed < 0, sign), (self.speed > GREATEST_SPEED, unit)
-        for bad, remedy in faults:
-            if bad.any():
-                at = int(np.argmax(bad))
-                where, speed = self.time[at], self.speed[at]
-                raise ValueError(f"{self.source}: wind speed at t = {where:g} s is {speed:g} m/s; it {remedy}")
+            at = np.argmin(np.isfinite(self.time))
+            return f"time of sample {at} is {self.time[at]}; all must be finite. Write the file again."
+        return ""
 
-    def _check_time(self) -> None:
+    def _fault_of_speed(self) -> str:
+        faults = {
+            "be finite. Fill the gap by interpolation or cut the record there.": ~np.isfinite(self.speed),
+            "not be negative. Check its sign and the direction, 0 deg along the rotor axis.": self.speed < 0,
+            f"not exceed {GREATEST_SPEED:g} m/s. Check its unit, and that the file is whole.": self.speed
+            > GREATEST_SPEED,
+        }
+        for demand, bad in faults.items():
+            if bad.any():
+                at = np.argmax(bad)
+                return f"wind speed at t = {self.time[at]:g} s is {self.speed[at]:g} m/s; it must {demand}"
+        return ""
+
+    def _fault_of_time(self) -> str:
         steps = np.diff(self.time)
-        if (steps <= 0).any():
-            at = int(np.argmax(steps <= 0))
-            raise ValueError(
-                f"{self.source}: time goes from {self.time[at]:g} s to {self.time[at + 1]:g} s; it must "
-                "increase. Sort the samples and drop repeated ones."
-            )
         step = float(np.median(steps))
+        if (steps <= 0).any():
+            before, after = self.time[np.argmax(steps <= 0) :][:2]
+            return f"time goes from {before:g} s to {after:g} s; it must increase. Sort the samples, drop doubles."
         # Two times rounded to 1 ms give a step that is off by up to 1 ms; below 2 ms this would hide a missing sample.
         uneven = np.abs(steps - step) > min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
         if not uneven.any():
-            return
+            return ""
         where, odd = self.time[np.argmax(uneven)], steps[np.argmax(uneven)]
+        found = f"after t = {where:g} s, {odd:g} s instead of {step:g} s"
         if odd > 1.5 * step:
-            raise ValueError(
-                f"{self.source}: gap after t = {where:g} s, where {round(odd / step) - 1} samples are missing (step "
-                f"{odd:g} s instead of {step:g} s). Fill it by interpolation or cut the record there."
-            )
-        raise ValueError(
-            f"{self.source}: unequal time step after t = {where:g} s, {odd:g} s instead of {step:g} s. "
-            "Resample the record to equal steps."
-        )
+            missing = round(odd / step) - 1
+            return f"gap {found}: {missing} samples are missing. Fill it by interpolation or cut the record there."
+        return f"unequal time step {found}. Resample the record to equal steps."
 
 
 def read_wind(path: str | os.PathLike[str]) -> WindRecord:
@@ -121,8 +112,7 @@ def read_wind(path: str | os.PathLike[str]) -> WindRecord:
     if suffix not in readers:
         raise ValueError(
             f"{path}: suffix {suffix!r} is no wind format read here; pass TurbSim output, hub-height text '.hh' "
-            "(WrADHH) or binary full field '.bts' (WrADFF). A file in the .hh format under another name can go to "
-            "read_hh."
+            "(WrADHH; under another name by read_hh) or binary full field '.bts' (WrADFF)."
         )
     if not Path(path).is_file():
         raise ValueError(f"{path} is no file; give the path of TurbSim output.")
@@ -161,18 +151,14 @@ def read_hh(path: str | os.PathLike[str]) -> WindRecord:
 
 
 def _numbers(fields: list[str], where: str) -> list[float]:
-    remedy = "Correct the line, or begin it with '!' if it is a comment."
     if len(fields) < 8:
-        raise ValueError(f"{where}: {len(fields)} columns, but 8 are needed: {COLUMNS}. {remedy}")
+        raise ValueError(f"{where}: {len(fields)} columns, but 8 are needed: {COLUMNS}. Complete the line.")
     try:
         values = [float(field) for field in fields[:8]]
     except ValueError as error:
-        raise ValueError(f"{where}: {error}; 8 numbers are needed. {remedy}") from None
-    for field, value in zip(fields, values, strict=False):
-        if not math.isfinite(value):
-            raise ValueError(
-                f"{where}: value {field!r} is not finite. Fill the gap by interpolation or cut the record there."
-            )
+        raise ValueError(f"{where}: {error}; begin the line with '!' if it is a comment.") from None
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}: value {fields[int(np.argmin(np.isfinite(values)))]!r} is not finite. Fill the gap.")
     return values
 
 

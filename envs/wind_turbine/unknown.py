@@ -4,12 +4,13 @@ Parameters without a source are engineering guesses.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from rt_torchrl.plants.extensions.actuator_coefficients import ActuatorCoefficients
 from rt_torchrl.plants.extensions.catalogue import System, combined, require_systems
@@ -83,7 +84,7 @@ class LaggedInflow(Extension):
         accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
         return torch.cat([accelerated, field[..., 1:], rate.unsqueeze(-1)], -1)
 
-    def rest(self, base: State) -> State:
+    def rest(self, base: Float[Tensor, "*batch n_b"]) -> Float[Tensor, "*batch 1"]:
         plant: Any = self.base
         speed, wind, pitch = base[..., 0], base[..., 2], base[..., 5]
         if self.of == "torque":
@@ -187,20 +188,7 @@ SYSTEMS: dict[str, System] = {
 """What the real turbine has beside its twin, by the names of ``--unknown``."""
 SYSTEMS["all"] = {**SYSTEMS["inflow"], **SYSTEMS["torque_loss"], **SYSTEMS["anemometer_low"], **SYSTEMS["pitch"]}
 
-
-def require_unknown(names: Sequence[str]) -> None:
-    """Refuse names that do not exist, or change the same part.
-
-    Raises:
-        ValueError: if there are such names.
-    """
-    require_systems(names, SYSTEMS)
-
-
-def unknown(plant: Plant, names: Sequence[str]) -> Plant:
-    """The real turbine that has all that the names say; its twin is ``plant``.
-
-    Raises:
-        ValueError: if a name does not exist, or two of them change the same part.
-    """
-    return combined(plant, names, SYSTEMS, PARTS)
+require_unknown = partial(require_systems, systems=SYSTEMS)
+"""Refuses names that do not exist, or change the same part."""
+unknown = partial(combined, systems=SYSTEMS, parts=PARTS)
+"""``unknown(plant, names)`` is the real turbine that has all that the names say; its twin is ``plant``."""
