@@ -24,6 +24,7 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 record_log = recipe("record_log")
 policy_law, recorded = record_log.policy_law, record_log.recorded
@@ -234,7 +235,8 @@ def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
         flown = Rollout(plant, plant.closure)(start, nothing, (2.0 * torque).clamp(-5.0, 5.0))
     noise = 0.005 * torch.randn(flown.states.shape, generator=generator, dtype=torch.float64)
     sensors = sensors_of(plant, [state.name for state in plant.states])
-    records = sensor_records(plant, sensors, flown._replace(states=flown.states + noise))
+    noisy = flown._replace(states=flown.states + noise)
+    records = sensor_records(plant, sensors, noisy)
 
     def estimation(segment):
         twin = DigitalTwin(plant, Joints(torch.tensor([1.0, 0.6, 0.5, 0.5])))
@@ -249,6 +251,12 @@ def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
         assert after.rms.tolist() == pytest.approx([0.005] * 4, rel=0.2)
     whole = estimation(0).run(records)
     assert whole.noise["first"] > 1.0 and any("does not explain first" in text for text in whole.warnings())
+    # Step 4 does the same from the first samples as they are.
+    for segment, close in ((None, True), (0, False)):
+        closure = Joints(torch.tensor([1.0, 0.6, 0.5, 0.5]))
+        config = AssimilationConfig(iterations=60, inputs="record", method="levenberg_marquardt", segment=segment)
+        Assimilation(DigitalTwin(plant, closure), config).update(noisy.each(), [], 1, generator)
+        assert torch.allclose(closure.coefficients, plant.closure.coefficients, rtol=0.05) is close
     # A twin that explains the readings over whole records is fitted over these.
     calm = [record.part(0, 20, plant.dt) for record in records]
     assert estimation(None).run(calm).segment == 0

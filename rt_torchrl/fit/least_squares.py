@@ -306,7 +306,7 @@ class Estimation:
     def _longest(self, records: Sequence[SensorRecord], belief: BeliefPrior | None) -> _Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
         closure, scatter = self.twin.closure, scatter_of(self.sensors, records)
-        start, tried, errors = copy.deepcopy(closure.state_dict()), [], []
+        start, tried, errors = copy.deepcopy(closure.state_dict()), list[_Minimum](), list[Tensor]()
         given = scatter.new_tensor([APART * (sensor.noise or 0.0) for sensor in self.sensors])
         enough = torch.maximum(EXPLAINED * scatter, given)
         free, length = int((self.spread > 0.0).sum()), 0

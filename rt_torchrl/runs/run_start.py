@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from rt_torchrl.control.acting import ActingController
 from rt_torchrl.control.classical import ClassicalController
@@ -177,7 +177,9 @@ def _of_log(path: Path, config: RunConfig, physics: Plant) -> MakesStart:
 
 def on(device: torch.device, record: Trajectory) -> Trajectory:
     """The record on a device."""
-    return Trajectory(*(part.to(device) if isinstance(part, Tensor) else part for part in record))
+    states, actions, exogenous, start, seen = record
+    seen = None if seen is None else seen.to(device)
+    return Trajectory(states.to(device), actions.to(device), exogenous.to(device), start, seen)
 
 
 def _device_of(*modules: nn.Module) -> torch.device:
