@@ -167,7 +167,7 @@ def main(config: Config) -> None:
     write_results(folder / "metrics.json", metrics)
     save_tensors(folder / "weights.pt", {"closure": closure.state_dict()})
     drawn = {
-        "twin_and_log": charts.twin_and_sensors(plant.dt, sensors, *records, found),
+        "twin_and_log": charts.twin_and_sensors(found),
         "weights": charts.weights(found.estimate),
         "correlations": charts.correlations(found.estimate.uncertainty),
     }
@@ -184,6 +184,7 @@ def metrics_of(found: Identified) -> dict[str, Any]:
     estimate = found.estimate
     sensors, states = estimate.likelihood.sensors, estimate.likelihood.plant.states
     summary: dict[str, Any] = {"iterations": estimate.iterations, "prior": estimate.stiffness}
+    summary["segment"] = estimate.segment
     for side in ("training", "held_out"):
         before, after = (map(_number, judged.rms.tolist()) for judged in getattr(found, side))
         each = zip(sensors, before, after, strict=True)
@@ -207,7 +208,7 @@ def metrics_of(found: Identified) -> dict[str, Any]:
         {state.name: [value, _number(error)] for state, value, error in zip(states, *pair, strict=True)}
         for pair in zip(first, scatter, strict=True)
     ]
-    return summary | {"warnings": estimate.uncertainty.warnings()}
+    return summary | {"warnings": estimate.warnings()}
 
 
 def held_back(plant: Plant, segments: list[Trajectory]) -> dict[str, float]:

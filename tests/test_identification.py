@@ -15,12 +15,16 @@ from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation, identify
 from rt_torchrl.fit.log import SensorLog, checked
-from rt_torchrl.fit.record import sensor_record
+from rt_torchrl.fit.record import sensor_record, sensor_records
 from rt_torchrl.fit.resampling import filled, hold_out, initial_spread, logged_readings, resample, sensors_in
 from rt_torchrl.fit.sensors import sensors_of, state_sensors
+from rt_torchrl.plants.closures import PositiveCoefficients
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import Signal
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 record_log = recipe("record_log")
 policy_law, recorded = record_log.policy_law, record_log.recorded
@@ -118,7 +122,7 @@ def test_the_oracle_plant_is_identified_from_a_jittered_log(identified):
 
 def test_figures_show_the_log_the_twin_and_what_was_held_out(identified):
     plant, _, (training, held_out), found = identified
-    figure = charts.twin_and_sensors(plant.dt, found.estimate.likelihood.sensors, training, held_out, found)
+    figure = charts.twin_and_sensors(found)
     ax = figure.axes[0]
     drawn = np.concatenate([line.get_ydata() for line in ax.lines if line.get_label() == "read"])
     expected = torch.cat([record.readings[:, 0] for record in (*training, *held_out)]).numpy()
@@ -182,3 +186,77 @@ def test_a_log_with_rows_left_out_gives_the_true_weights_within_their_errors():
     for (name, value), true in zip(found.after.items(), np.ravel(plant.true_closure), strict=True):
         # The errors are below 0.001; where a force is held over what it was not, they are 0.02.
         assert abs(value - true) < 4.0 * errors[name] < 0.01
+
+
+class Joints(PositiveCoefficients):
+    """Mass and length of the second rod over those of the first, and friction of both joints."""
+
+    names = {"mass": "-", "length": "-", "joint": "1/s", "base": "1/s"}
+    true_coefficients = (0.5, 1.0, 0.05, 0.1)
+
+
+class DoublePendulum(Plant):
+    """Two point masses on rods of which the first is 1 m long, with a torque at the base; angles are from upright."""
+
+    name = "double_pendulum"
+    states = tuple(
+        Signal(symbol=name[:3], name=name, unit=unit)
+        for name, unit in (("first", "rad"), ("second", "rad"), ("rate_first", "rad/s"), ("rate_second", "rad/s"))
+    )
+    actions = (Signal(symbol="a", name="torque", unit="N m", low=-5.0, high=5.0),)
+    inputs = ()
+    observations = states
+
+    def __init__(self):
+        super().__init__(dt=0.05, horizon=10.0, closure=Joints.true())
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        a, b, u, v = state.unbind(-1)
+        m, length, joint, base = closure(state).unbind(-1)
+        c, s, g = torch.cos(a - b), torch.sin(a - b), 9.81
+        first = (1.0 + m) * g * torch.sin(a) - m * length * s * v**2 + action[..., 0] - base * u - joint * (u - v)
+        second = m * length * (g * torch.sin(b) + s * u**2) - joint * (v - u)
+        cross, own = m * length * c, m * length**2
+        det = (1.0 + m) * own - cross**2
+        return torch.stack([u, v, (own * first - cross * second) / det, ((1.0 + m) * second - cross * first) / det], -1)
+
+    def draw_initial_state(self, batch, generator):
+        return 0.3 * torch.randn(batch, 4, generator=generator, dtype=torch.float64)
+
+    observe = running_cost = draw_exogenous = make_closure = None
+
+
+def test_an_unstable_system_is_identified_over_segments_that_the_data_choose():
+    """Over whole records of a double pendulum no weights replay what was read; over segments the true ones do."""
+    plant, generator = DoublePendulum(), torch.Generator().manual_seed(0)
+    torque = torch.randn(3, 40, 1, generator=generator, dtype=torch.float64).repeat_interleave(5, 1)
+    start, nothing = plant.draw_initial_state(3, generator), torch.zeros(3, 200, 0).double()
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure)(start, nothing, (2.0 * torque).clamp(-5.0, 5.0))
+    noise = 0.005 * torch.randn(flown.states.shape, generator=generator, dtype=torch.float64)
+    sensors = sensors_of(plant, [state.name for state in plant.states])
+    noisy = flown._replace(states=flown.states + noise)
+    records = sensor_records(plant, sensors, noisy)
+
+    def estimation(segment):
+        twin = DigitalTwin(plant, Joints(torch.tensor([1.0, 0.6, 0.5, 0.5])))
+        return Estimation(twin, sensors, config=EstimationConfig(segment=segment))
+
+    found = identify(estimation(None), records[:2], records[2:])
+    errors, estimate = found.estimate.uncertainty.standard_errors(), found.estimate
+    assert estimate.segment == 22 and "segments of 22 control intervals (1.1 s)" in estimate.warnings()[0]
+    for name, true in zip(Joints.names, Joints.true_coefficients, strict=True):
+        assert abs(estimate.after[name] - true) < 4.0 * errors[name] < 0.02 * true
+    for _, after in (found.training, found.held_out):
+        assert after.rms.tolist() == pytest.approx([0.005] * 4, rel=0.2)
+    whole = estimation(0).run(records)
+    assert whole.noise["first"] > 1.0 and any("does not explain first" in text for text in whole.warnings())
+    # Step 4 does the same from the first samples as they are.
+    for segment, close in ((None, True), (0, False)):
+        closure = Joints(torch.tensor([1.0, 0.6, 0.5, 0.5]))
+        config = AssimilationConfig(iterations=60, inputs="record", method="levenberg_marquardt", segment=segment)
+        Assimilation(DigitalTwin(plant, closure), config).update(noisy.each(), [], 1, generator)
+        assert torch.allclose(closure.coefficients, plant.closure.coefficients, rtol=0.05) is close
+    # A twin that explains the readings over whole records is fitted over these.
+    calm = [record.part(0, 20, plant.dt) for record in records]
+    assert estimation(None).run(calm).segment == 0

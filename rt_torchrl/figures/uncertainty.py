@@ -1,7 +1,5 @@
 """Figures of an identification from sensors: readings and replays, correlations, ellipses, intervals of a curve."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -18,22 +16,16 @@ from rt_torchrl.figures.style import (
     with_unit,
 )
 from rt_torchrl.fit.least_squares import Estimate, Identified, Judgement
-from rt_torchrl.fit.record import SensorRecord
-from rt_torchrl.fit.sensors import Sensor
 from rt_torchrl.fit.uncertainty import Band, Uncertainty
 
 
-def twin_and_sensors(
-    dt: float,
-    sensors: Sequence[Sensor],
-    training: Sequence[SensorRecord],
-    held_out: Sequence[SensorRecord],
-    found: Identified,
-) -> Figure:
+def twin_and_sensors(found: Identified) -> Figure:
     """What every sensor has read over time, and what the twin says it reads, after the estimation; held out is shaded.
 
     The notes give the root mean square errors on the held-out records.
     """
+    sensors, dt = found.estimate.likelihood.sensors, found.estimate.likelihood.plant.dt
+    training, held_out = found.training[1].records, found.held_out[1].records
     begin, last = training[0].start, held_out[-1].start
     unit, length = time_unit(last + dt * len(held_out[-1].actions) - begin)
     size = (9.0, 1.2 + 2.2 * len(sensors))

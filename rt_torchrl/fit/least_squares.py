@@ -9,6 +9,9 @@ The descent over all unknowns and the levels take turns, until the levels rest:
 with N_j samples of sensor j out of N, p unknowns that the data determine, and γ of them among the weights of
 perceptrons (MacKay, Neural Computation 4 (1992) 415). Step 4 of a training takes the same residuals, with the known
 noise of :func:`rt_torchrl.fit.sensors.state_sensors`.
+
+Over a whole record of an unstable system the twin explodes whatever its weights are, and J prefers wrong ones. Records
+are then cut into segments with first states of their own (multiple shooting), whose length the data choose.
 """
 
 import copy
@@ -23,7 +26,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.fit.likelihood import Biases, InitialStates, Likelihood
 from rt_torchrl.fit.prior import BeliefPrior, WeightPrior
-from rt_torchrl.fit.record import SensorRecord
+from rt_torchrl.fit.record import SensorRecord, segments
 from rt_torchrl.fit.sensors import Sensor, state_places
 from rt_torchrl.fit.uncertainty import Errors, Uncertainty, inverse_information, named_values
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt
@@ -46,6 +49,14 @@ LEAST_NOISE = 1e-9
 """Least noise level, as a share of its first guess; less is rounding."""
 STIFFNESS = (1e-6, 1e8)
 """Range of the prior's stiffness Λ where the data choose it."""
+EXPLAINED = 0.1
+"""RMS error of a sensor, as a share of the scatter of its readings, below which a twin explains them."""
+APART = 3.0
+"""Ratio of RMS errors over longer and shorter segments above which the twin has left the longer ones."""
+SHORTENED = 3
+"""Factor from one length of segments to the next shorter one."""
+MOST_UNKNOWNS = 1000
+"""Greatest number of first states of segments; the normal equations hold its square."""
 
 
 class Fitted(Protocol):
@@ -119,6 +130,10 @@ class EstimationConfig:
         starts: number of first weights that the descent begins with. Beside the present ones these are the present ones
             and the best ones so far in turns, moved at random: one sensor may leave several local minima.
         errors: formula of the standard errors: ``fisher`` for white noise, or ``robust`` for residuals with memory.
+        segment: number of control intervals of the segments that records are cut into, each with a first state of its
+            own (multiple shooting); 0 for whole records. None lets the data choose: whole records, unless the twin
+            leaves them where it follows shorter segments, as it does with an unstable system; then the longest segments
+            that it follows as well as the shortest ones.
     """
 
     iterations: int = 30
@@ -126,9 +141,12 @@ class EstimationConfig:
     prior: float | None = 0.0
     starts: int = 1
     errors: Errors = "fisher"
+    segment: int | None = None
 
     def __post_init__(self) -> None:
         check_options(self)
+        if self.segment is not None and self.segment < 0:
+            raise ValueError(f"segment={self.segment} of the estimation must not be negative; 0 takes whole records.")
         for argument in ("iterations", "rounds", "starts"):
             if getattr(self, argument) < 1:
                 raise ValueError(f"{argument}={getattr(self, argument)} of the estimation must be at least 1.")
@@ -148,6 +166,7 @@ class Estimate(NamedTuple):
         likelihood: the likelihood at its minimum.
         uncertainty: standard errors, intervals and warnings.
         iterations: number of trial steps.
+        segment: number of control intervals of the segments that the records were cut into; 0 for whole records.
     """
 
     before: dict[str, float]
@@ -159,14 +178,37 @@ class Estimate(NamedTuple):
     likelihood: Likelihood
     uncertainty: Uncertainty
     iterations: int
+    segment: int = 0
+
+    def warnings(self) -> list[str]:
+        """What a user must know before using the estimate, in plain words; empty if there is nothing."""
+        found, dt = [], self.likelihood.plant.dt
+        if self.segment:
+            found.append(
+                "over whole records the twin leaves what was read, as that of an unstable system does: it was fitted "
+                f"over segments of {self.segment} control intervals ({self.segment * dt:g} s), as all errors here are"
+            )
+        rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
+        for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
+            if error > 5.0 * EXPLAINED * size > 0.0:
+                found.append(
+                    f"the twin does not explain {sensor.name}: its RMS error is {error:.3g} {sensor.measurement.unit}, "
+                    f"and the readings scatter by {size:.3g}. Check columns and units, the inputs that act on the "
+                    "system, and what the plant leaves out; then try other first weights (starts)"
+                )
+        if self.before and all(self.after[name] == value for name, value in self.before.items()):
+            found.append("no weight has moved: the fit has found no step that lowers its cost. Try other first weights")
+        return found + self.uncertainty.warnings()
 
 
 class _Minimum(NamedTuple):
-    """A likelihood at its minimum, its cost, and the number of trial steps."""
+    """A likelihood at its minimum, its cost, the number of trial steps, and the weights there."""
 
     likelihood: Likelihood
     best: float
     iterations: int
+    weights: dict[str, Tensor] = {}
+    segment: int = 0
 
 
 class Estimation:
@@ -226,15 +268,11 @@ class Estimation:
         closure = self.twin.closure
         before = {name: value.item() for name, value in named_values(closure).items()}
         self._require_process(records)
-        prior = WeightPrior(closure, 1.0 if self.config.prior is None else self.config.prior)
-        prior = prior if belief is None else belief
-        tried = multi_start(closure, self.config.starts, lambda number: self._both_ways(records, prior, number))
-        likelihood, iterations = min(tried, key=lambda one: one.best).likelihood, sum(one.iterations for one in tried)
-        for _ in range(self.config.rounds):
-            rest = self._follow_residuals(likelihood)
-            iterations += self._descended(likelihood).iterations
-            if rest:
-                break
+        if self.config.segment is None and self.process is None and all(r.course is not None for r in records):
+            found = self._longest(records, belief)
+        else:
+            found = self._minimum(records, belief, self.config.segment or 0)
+        likelihood, prior = found.likelihood, found.likelihood.prior
         names = [sensor.name for sensor in self.sensors]
         return Estimate(
             before,
@@ -242,11 +280,54 @@ class Estimation:
             dict(zip(names, likelihood.noise.tolist(), strict=True)),
             dict(zip(names, likelihood.biases().tolist(), strict=True)),
             likelihood.initial().detach(),
-            prior.stiffness,
+            0.0 if prior is None else prior.stiffness,
             likelihood,
             Uncertainty(likelihood, errors=self.config.errors),
-            iterations,
+            found.iterations,
+            found.segment,
         )
+
+    def _minimum(self, records: Sequence[SensorRecord], belief: BeliefPrior | None, length: int) -> _Minimum:
+        """Fit records, or segments of a length, from the present weights, with the noise levels that they leave."""
+        closure, config = self.twin.closure, self.config
+        if length:
+            records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
+        prior = WeightPrior(closure, 1.0 if config.prior is None else config.prior) if belief is None else belief
+        tried = multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number))
+        found, iterations = min(tried, key=lambda one: one.best), sum(one.iterations for one in tried)
+        for _ in range(config.rounds):
+            rest = self._follow_residuals(found.likelihood)
+            iterations += self._descended(found.likelihood).iterations
+            if rest:
+                break
+        weights = copy.deepcopy(closure.state_dict())
+        return found._replace(iterations=iterations, weights=weights, segment=length)
+
+    def _longest(self, records: Sequence[SensorRecord], belief: BeliefPrior | None) -> _Minimum:
+        """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
+        closure, scatter = self.twin.closure, scatter_of(self.sensors, records)
+        start, tried, errors = copy.deepcopy(closure.state_dict()), list[_Minimum](), list[Tensor]()
+        given = scatter.new_tensor([APART * (sensor.noise or 0.0) for sensor in self.sensors])
+        enough = torch.maximum(EXPLAINED * scatter, given)
+        free, length = int((self.spread > 0.0).sum()), 0
+        diverged: FloatingPointError | None = None
+        most = min(MOST_UNKNOWNS, sum(int(record.seen.sum()) for record in records) // 2)
+        while not errors or not (errors[-1] <= enough).all():
+            closure.load_state_dict(start)
+            try:
+                tried.append(self._minimum(records, belief, length))
+                errors.append(judged(tried[-1].likelihood).rms)
+            except FloatingPointError as error:
+                diverged = diverged or error
+            length = (length or max(len(record.actions) for record in records)) // SHORTENED
+            if length < 2 or free * sum(-(-len(record.actions) // length) for record in records) > most:
+                break
+        if diverged is not None and not tried:
+            raise diverged
+        least = torch.stack(errors).amin(0)
+        found = next(fit for fit, error in zip(tried, errors, strict=True) if (error <= APART * least).all())
+        closure.load_state_dict(found.weights)
+        return found._replace(iterations=sum(fit.iterations for fit in tried))
 
     def likelihood(
         self,
@@ -346,6 +427,8 @@ class Estimation:
         """Set noise levels and prior by the residuals; whether they rest."""
         blocks = likelihood.residuals()
         equations = likelihood.normal_equations(blocks)
+        if not equations.matrix.isfinite().all():
+            raise FloatingPointError("the derivatives of finite states overflow")
         inverse = inverse_information(equations.matrix).matrix
         rest, n, prior = True, likelihood.weight_count, likelihood.prior
         determined = likelihood.count - likelihood.held_back(inverse)
@@ -367,8 +450,8 @@ class Estimation:
         return rest
 
 
-def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
-    """Noise levels that are given; for others a share of the scatter of the readings.
+def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """RMS difference of each sensor's readings from its first one.
 
     Raises:
         ValueError: if there is no record, or a sensor has no sample.
@@ -376,16 +459,29 @@ def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> F
     if not records:
         raise ValueError("records=[] of the estimation must hold at least one record.")
     readings = torch.cat([record.readings for record in records])
-    levels = []
+    found = []
     for sensor, values in zip(sensors, readings.T, strict=True):
         seen = values[~values.isnan()]
         if not len(seen):
             raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
         origin = seen[:1].expand_as(seen)
-        scatter = differences([sensor.measurement], (seen - 0.0)[:, None], origin[:, None]).square().mean().sqrt()
-        guess = FIRST_NOISE * scatter.item() or 1e-6 * max(abs(origin[0].item()), 1.0)
+        change = differences([sensor.measurement], seen[:, None], origin[:, None])
+        found.append(change.square().mean().sqrt())
+    return torch.stack(found)
+
+
+def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
+    """Noise levels that are given; for others a share of the scatter of the readings.
+
+    Raises:
+        ValueError: if there is no record, or a sensor has no sample.
+    """
+    scatter, levels = scatter_of(sensors, records), []
+    size = torch.cat([record.readings for record in records]).nan_to_num().abs().amax(0)
+    for sensor, change, largest in zip(sensors, scatter.tolist(), size.tolist(), strict=True):
+        guess = FIRST_NOISE * change or 1e-6 * max(largest, 1.0)
         levels.append(guess if sensor.noise is None else sensor.noise)
-    return readings.new_tensor(levels)
+    return scatter.new_tensor(levels)
 
 
 def usual_sizes(
@@ -408,16 +504,18 @@ def usual_sizes(
 
 
 class Judgement(NamedTuple):
-    """Result of a twin on records: RMS errors of the sensors, and the readings that it replays."""
+    """Result of a twin on records: RMS errors of the sensors, the readings that it replays, and the records."""
 
     rms: Float[Tensor, " n_y"]
     readings: list[Tensor]
+    records: list[SensorRecord]
 
 
 class Identified(NamedTuple):
     """Result of an identification: the estimate, and how well the twin replays both kinds of records.
 
-    ``autocorrelation`` holds the correlation of neighbouring residuals of each sensor, near 0 for white noise.
+    Where the estimate is over segments, so are the errors. ``autocorrelation`` holds the correlation of neighbouring
+    residuals of each sensor, near 0 for white noise.
     """
 
     estimate: Estimate
@@ -433,13 +531,18 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
         ValueError: if a sensor has no sample in the training records.
         DivergenceError: if the twin diverges under the weights that it starts from.
     """
-    first = first_noise(estimation.sensors, training)
-    before = [judged(estimation.fit_initial_states(records, first)) for records in (training, held_out)]
+    closure, dt = estimation.twin.closure, estimation.twin.plant.dt
+    start = copy.deepcopy(closure.state_dict())
     estimate = estimation.run(training)
-    after = [
-        judged(estimate.likelihood),
-        judged(estimation.fit_initial_states(held_out, estimate.likelihood.noise)),
-    ]
+    noise, length, found = estimate.likelihood.noise, estimate.segment, copy.deepcopy(closure.state_dict())
+    sides = [estimate.likelihood.records, list(held_out)]
+    if length:
+        sides[1] = [part for record in held_out for part in segments(record, length, dt)]
+    after = [judged(estimate.likelihood), judged(estimation.fit_initial_states(sides[1], noise))]
+    closure.load_state_dict(start)
+    first = first_noise(estimation.sensors, training)
+    before = [judged(estimation.fit_initial_states(records, first)) for records in sides]
+    closure.load_state_dict(found)
     on_training, on_held_out = zip(before, after, strict=True)
     return Identified(estimate, on_training, on_held_out, autocorrelation(estimate.likelihood))
 
@@ -449,11 +552,10 @@ def judged(likelihood: Likelihood) -> Judgement:
     try:
         blocks = likelihood.residuals()
     except DivergenceError:
-        return Judgement(
-            torch.full_like(likelihood.noise, torch.inf), [r.readings * torch.nan for r in likelihood.records]
-        )
+        unknown = [record.readings * torch.nan for record in likelihood.records]
+        return Judgement(torch.full_like(likelihood.noise, torch.inf), unknown, likelihood.records)
     squares = torch.stack([(block.values * likelihood.noise).square().sum((0, 1)) for block in blocks]).sum(0)
-    return Judgement((squares / likelihood.samples).sqrt(), likelihood.simulated())
+    return Judgement((squares / likelihood.samples).sqrt(), likelihood.simulated(), likelihood.records)
 
 
 def autocorrelation(likelihood: Likelihood) -> Float[Tensor, " n_y"]:

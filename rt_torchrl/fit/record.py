@@ -25,6 +25,7 @@ class SensorRecord(NamedTuple):
         guess: first guess of the state in t_0.
         start: time t_0 on the plant's clock [s].
         follows: whether the record begins where the one before it in a list ends, up to process noise.
+        course: guesses of the states in all samples, from which parts of the record begin; None if there are none.
     """
 
     readings: Float[Tensor, "n+1 n_y"]
@@ -33,6 +34,7 @@ class SensorRecord(NamedTuple):
     guess: Float[Tensor, " n_s"]
     start: float = 0.0
     follows: bool = False
+    course: Float[Tensor, "n+1 n_s"] | None = None
 
     @property
     def seen(self) -> Bool[Tensor, "samples n_y"]:
@@ -45,15 +47,19 @@ class SensorRecord(NamedTuple):
         Args:
             first, last: numbers of intervals.
             dt: control interval [s].
-            guess: first guess of the state there; by default the record's own.
+            guess: first guess of the state there; by default that of the course, or else the record's own.
         """
-        held = slice(first, last)
+        held, samples = slice(first, last), slice(first, last + 1)
+        course = None if self.course is None else self.course[samples]
+        if guess is None:
+            guess = self.guess if course is None else course[0]
         return SensorRecord(
-            self.readings[first : last + 1],
+            self.readings[samples],
             self.actions[held],
             self.exogenous[held],
-            self.guess if guess is None else guess,
+            guess,
             self.start + first * dt,
+            course=course,
         )
 
 
@@ -71,8 +77,8 @@ def sensor_records(plant: Plant, sensors: Sequence[Sensor], batch: Trajectory) -
     readings = read(sensors, plant, t, states, held_to_the_end(exogenous))
     if seen is not None:
         readings = torch.where(seen.unsqueeze(-1), readings, torch.nan)
-    each = zip(readings, actions, exogenous, states[:, 0], first.tolist(), strict=True)
-    return [SensorRecord(*parts) for parts in each]
+    each = zip(readings, actions, exogenous, states, first.tolist(), strict=True)
+    return [SensorRecord(y, a, z, course[0], start, course=course) for y, a, z, course, start in each]
 
 
 def chained(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
@@ -100,6 +106,11 @@ def chained(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
             part = part._replace(readings=readings, follows=True)
         parts.append(part)
     return parts
+
+
+def segments(record: SensorRecord, length: int, dt: float) -> list[SensorRecord]:
+    """A record cut into segments, each with a first state of its own (multiple shooting); see :func:`chained`."""
+    return [part._replace(follows=False) for part in chained(record, length, dt)]
 
 
 def held_to_the_end(exogenous: Float[Tensor, "*batch n n_z"]) -> Float[Tensor, "*batch samples n_z"]:

@@ -273,7 +273,8 @@ def logged_readings(
     rows = _around(log, grid)
     values = [_samples(one.measurement, log.times[rows], log.columns[one.name][rows], grid, gap) for one in sensors]
     readings = torch.from_numpy(np.stack(values, -1))
-    return SensorRecord(readings, segment.actions, segment.exogenous, segment.states[0], float(segment.start))
+    states = segment.states
+    return SensorRecord(readings, segment.actions, segment.exogenous, states[0], float(segment.start), course=states)
 
 
 def _around(log: SensorLog, grid: Float[np.ndarray, " samples"]) -> slice:

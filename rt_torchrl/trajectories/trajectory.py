@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rt_torchrl.plants.plant import Plant, flight_costs
@@ -82,6 +82,12 @@ class Trajectory(NamedTuple):
             (first.unsqueeze(-1) + time).flatten(),
             None if seen is None else pieces(seen),
         )
+
+    def rows(self, chosen: Int[Tensor, " m"]) -> "Trajectory":
+        """Some trajectories of a batch, of which one may be there several times."""
+        start = self.start[chosen] if isinstance(self.start, Tensor) else self.start
+        seen = None if self.seen is None else self.seen[chosen]
+        return Trajectory(self.states[chosen], self.actions[chosen], self.exogenous[chosen], start, seen)
 
     def each(self) -> "list[Trajectory]":
         """The trajectories of a batch, one by one."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rt_torchrl.fit.least_squares import NOISE_TOLERANCE, Estimation, multi_start
+from rt_torchrl.fit.least_squares import APART, EXPLAINED, NOISE_TOLERANCE, SHORTENED, Estimation, multi_start
 from rt_torchrl.fit.likelihood import Likelihood
 from rt_torchrl.fit.prior import WeightPrior
 from rt_torchrl.fit.record import SensorRecord, sensor_records
@@ -48,7 +48,8 @@ class AssimilationConfig:
         segment: number of control intervals after which the replay starts again from the measured state (multiple
             shooting); 0 replays whole records, as in the paper. Over short segments the states are nearly linear in the
             weights, so a closure with many weights fits the record in a few steps. The J_p that descends is then the
-            mean over the segments.
+            mean over the segments. None lets the data choose: whole records, unless the twin leaves them where it
+            follows shorter segments, as with an unstable system; J_p is then told over the segments that are chosen.
         initial: first state of a replay: ``measured`` for the first reading of the sensors, as in the paper, or
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
             that forgets slowly carries the error of the first reading through the whole record, and the weights would
@@ -74,7 +75,7 @@ class AssimilationConfig:
     method: Literal["gradient", "levenberg_marquardt"] = "gradient"
     starts: int = 1
     prior: float = 0.0
-    segment: int = 0
+    segment: int | None = 0
     initial: Literal["measured", "estimated"] = "measured"
     sensors: tuple[str, ...] = ()
     biased: tuple[str, ...] = ()
@@ -91,14 +92,14 @@ class AssimilationConfig:
             raise ValueError(f"stop_ratio={self.stop_ratio} must lie in [0, 1).")
         if not self.prior >= 0.0:
             raise ValueError(f"prior={self.prior} of the closure's weights must not be negative.")
-        if self.segment < 0:
+        if self.segment is not None and self.segment < 0:
             raise ValueError(f"segment={self.segment} control intervals must not be negative; 0 replays whole records.")
         if self.initial == "estimated" and (self.method, self.inputs) != ("levenberg_marquardt", "record"):
             raise ValueError(
                 f"initial='estimated' of the assimilation needs method='levenberg_marquardt' and inputs='record'; they "
                 f"are {self.method!r} and {self.inputs!r}."
             )
-        if self.sensors and (self.initial != "estimated" or self.segment):
+        if self.sensors and (self.initial != "estimated" or self.segment != 0):
             raise ValueError(
                 f"sensors={self.sensors} of the assimilation need initial='estimated' and segment=0; they are "
                 f"{self.initial!r} and {self.segment}."
@@ -137,7 +138,7 @@ class Assimilation:
     """
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig):
-        if config.segment > twin.plant.n_steps:
+        if (config.segment or 0) > twin.plant.n_steps:
             raise ValueError(
                 f"segment={config.segment} of the assimilation exceeds the {twin.plant.n_steps} control intervals of "
                 f"an episode of plant {twin.plant.name!r}; 0 replays whole records."
@@ -186,13 +187,35 @@ class Assimilation:
         whole = batch_of(records)
         if self.config.inputs == "realisations":
             sampled = torch.cat([process.sample(count, generator) for process in processes])
-            repeated = whole.mapped(lambda part: part.repeat_interleave(count, 0))
-            whole = repeated._replace(exogenous=self.twin.plant.with_previews(sampled))
+            rows = torch.arange(len(whole.states), device=sampled.device).repeat_interleave(count)
+            whole = whole.rows(rows)._replace(exogenous=self.twin.plant.with_previews(sampled))
+        if self.config.segment is None:
+            return self._descend_as_far_as_it_follows(whole)
         if not self.config.segment:
             return self._descend_anew(whole)
         before = self.cost_of(whole)
         found = self._descend_anew(whole.segments(min(self.config.segment, whole.actions.shape[1]), self.twin.plant.dt))
         return found._replace(start=before, best=self.cost_of(whole))
+
+    def _descend_as_far_as_it_follows(self, whole: Trajectory) -> Descended:
+        """Descend over whole records, or over the longest segments that the twin follows as well as shorter ones."""
+        closure, plant, length = self.twin.closure, self.twin.plant, whole.actions.shape[1]
+        start, centred = copy.deepcopy(closure.state_dict()), whole.states.mean(1, keepdim=True)
+        scatter = plant.discrepancy(whole.states, centred).mean().item()
+        replayed, tried = whole, list[tuple[Descended, float, dict[str, Tensor]]]()
+        while True:
+            found = self._descend_anew(replayed)
+            error = found.best / (replayed.actions.shape[1] * plant.dt)
+            tried.append((found, error, copy.deepcopy(closure.state_dict())))
+            length //= SHORTENED
+            if math.isnan(error) or error <= EXPLAINED**2 * scatter or length < 2:
+                break
+            closure.load_state_dict(start)
+            replayed = whole.segments(length, plant.dt)
+        least = min(error for _, error, _ in tried)
+        found, _, weights = next((one for one in tried if one[1] <= APART**2 * least), tried[0])
+        closure.load_state_dict(weights)
+        return found
 
     def _descend_anew(self, replayed: Trajectory) -> Descended:
         """Descend from the present closure, or from the first one if the twin diverges under the present one.

@@ -49,7 +49,7 @@ class SensorAssimilation(Assimilation):
         plant, config = self.twin.plant, self.config
         records = sensor_records(plant, self.sensors, replayed)
         first = FirstStates(plant, self.sensors)
-        records = [record._replace(guess=first.guess(record)) for record in records]
+        records = [record._replace(guess=first.guess(record), course=None) for record in records]
         estimation, records = self._task(records, first.spread)
         if not config.iterations:
             return Descended(float("nan"), float("nan"), float("nan"), 0)
