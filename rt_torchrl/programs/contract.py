@@ -61,6 +61,7 @@ OWN = __name__.partition(".")[0]
 GENERATED = "<@beartype"
 """Files of code that checks annotations at run time."""
 ATTRIBUTES = ("LOAD_ATTR", "LOAD_METHOD", "LOAD_SUPER_ATTR")
+ENVIRONMENT = ("environ", "environb", "getenv", "getenvb")
 MISSING = object()
 
 
@@ -307,8 +308,6 @@ class Executed:
         self.globals: dict[tuple[types.CodeType, int], dict[str, Any]] = {}
         self.variables: dict[types.CodeType, dict[str, Any]] = {}
         """Variables of enclosing functions that code has read."""
-        self.environment: types.CodeType | None = None
-        """Code that has read an environment variable, if there is any."""
 
     @contextmanager
     def noted(self) -> Iterator[None]:
@@ -324,21 +323,10 @@ class Executed:
 
     def _note(self, frame: types.FrameType, event: str, argument: object) -> None:
         code, held = frame.f_code, frame.f_globals
-        if event != "call" or (code, id(held)) in self.globals:
-            return
-        if code is _READS_ENVIRONMENT:
-            back = frame.f_back
-            while back is not None and back.f_globals.get("__name__") in ("os", "collections.abc"):
-                back = back.f_back
-            if back is not None and not _of_library(back.f_code, back.f_globals):
-                self.environment = back.f_code
-        elif not _of_library(code, held):
+        if event == "call" and (code, id(held)) not in self.globals and not _of_library(code, held):
             self.globals[code, id(held)] = held
             if code.co_freevars:
                 self.variables[code] = {x: frame.f_locals[x] for x in code.co_freevars if x in frame.f_locals}
-
-
-_READS_ENVIRONMENT = type(os.environ).__getitem__.__code__
 
 
 def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
@@ -353,8 +341,6 @@ def guards_of(root: nn.Module, holdings: Holdings, executed: Executed) -> tuple[
     Raises:
         UntraceableError: if a function reads what may change without notice; the message names both.
     """
-    if executed.environment is not None:
-        raise _refusal(executed.environment, "the environment (os.environ)")
     return tuple(_Reads(root, holdings, executed).guards.values())
 
 
@@ -396,6 +382,8 @@ class _Reads:
     def _take(self, code: types.CodeType, holder: Any, name: str, prefix: str) -> None:
         """Judge what code reads from a dictionary of globals, a class or a function, and its attributes."""
         value = _entries(holder)[name]
+        if value is os.environ or value is os.getenv or (value is os and {*ENVIRONMENT} & {*_names(code).attributes}):
+            raise _refusal(code, "the environment (os.environ)")
         if isinstance(value, types.ModuleType) and foreign(value.__name__):
             return  # such as torch
         followed = isinstance(value, (Tensor, np.ndarray)) and isinstance(holder, dict)  # by its numbers
@@ -410,19 +398,18 @@ class _Reads:
                 if attribute in _entries(further) and (not seen or (id(further), attribute) not in self.guards):
                     self._take(code, further, attribute, f"{inner}.")
 
-    def _class_attributes(self, x: object, named: Mapping[str, types.CodeType]) -> None:
+    def _class_attributes(self, x: object, named: dict[str, types.CodeType]) -> None:
         """Judge what the class of an object holds, if executed code has it or reads an attribute of its name."""
         kind = x if isinstance(x, type) else type(x)
         if foreign(kind.__module__):
             return
         own = {} if isinstance(x, type) else getattr(x, "__dict__", {})
-        methods = {name for owner in kind.__mro__ for name, f in vars(owner).items() if _code_of(f) in self._codes}
-        for name in {*named, *methods} - {*own}:
+        functions = {name: _function_of(f) for owner in kind.__mro__ for name, f in vars(owner).items()}
+        methods = {name: f.__code__ for name, f in functions.items() if f is not None and f.__code__ in self._codes}
+        for name, code in {name: code for name, code in (methods | named).items() if name not in own}.items():
             owner = next((k for k in kind.__mro__ if name in vars(k)), None)
             if owner is not None and not foreign(owner.__module__) and (id(owner), name) not in self.guards:
-                if not self._constant(vars(owner)[name]):
-                    raise _refusal(named[name], f"the class attribute {owner.__name__}.{name}", vars(owner)[name])
-                self.guards[id(owner), name] = Guard.on(owner, name)
+                self._take(code, owner, name, f"the class attribute {owner.__name__}.")
 
     def _variables(self, code: types.CodeType, variables: Mapping[str, object]) -> None:
         """Judge the defaults of a function, and the variables of the functions around it."""
@@ -514,11 +501,6 @@ def _function_of(x: Any) -> types.FunctionType | None:
     x = x.func if isinstance(x, functools.partial) else x
     x = getattr(x, "__wrapped__", x) if isinstance(x, functools._lru_cache_wrapper) else x
     return x if isinstance(x, types.FunctionType) else None
-
-
-def _code_of(x: object) -> types.CodeType | None:
-    function = _function_of(x)
-    return None if function is None else function.__code__
 
 
 def _refusal(code: types.CodeType, what: str, value: object = MISSING) -> UntraceableError:

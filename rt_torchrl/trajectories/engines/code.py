@@ -393,7 +393,7 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
         driven = any(x.requires_grad for x in drive)
         wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
         if found is None or (isinstance(found, IntervalCode) and wanted and driven not in found.sweeps):
-            if not (np.isfinite(inputs.row()).all() and initial_state.isfinite().all()):
+            if not all(bool(x.isfinite().all()) for x in (initial_state, *interval.parameters())):
                 return None  # nothing to compare with; the next call may have numbers
             point = point_of(initial_state, drive, lanes_of_this_machine().number, sums)
             found = _made(found, key, interval, point, holdings, driven if wanted else None)
