@@ -23,3 +23,9 @@ Actions = Float[Tensor, "batch n n_a"]
 """Applied actions of whole episodes."""
 Inputs = Float[Tensor, "batch n n_z"]
 """Exogenous inputs of whole episodes."""
+Starts = Float[Tensor, "batch n_s"]
+"""States at the starts of episodes or segments."""
+Start = float | Float[Tensor, " batch"]
+"""Times of these starts on the plant's clock [s], one for all or one for each."""
+Costs = Float[Tensor, " batch"]
+"""A cost per episode."""
