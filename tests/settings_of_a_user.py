@@ -1,4 +1,4 @@
-"""A module of settings, as users have it: what it holds changes in the table of ``test_what_may_change.py``."""
+"""A module of settings, as users have it: what it holds changes in the table of ``changes.py``."""
 
 import types
 

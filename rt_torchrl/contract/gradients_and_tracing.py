@@ -12,7 +12,7 @@ from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.programs.machine_code import lanes_of_this_machine
 from rt_torchrl.programs.program import UntraceableError
-from rt_torchrl.trajectories.engines.code import IntervalCode, UncomparedError, point_of
+from rt_torchrl.trajectories.engines.code import IntervalCode, point_of
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
 from rt_torchrl.trajectories.engines.parallel import linearise, raised_limits, without_warnings_of_libraries
 
@@ -279,8 +279,6 @@ def untraceable(calls: Calls) -> str | None:
     try:
         interval = CostInterval(Interval(plant, calls.closure, policy))
         IntervalCode(interval, point, lanes).prepare_sweep(interval, False)
-    except UncomparedError:
-        return None
     except Exception as error:
         return str(error) if isinstance(error, UntraceableError) else f"{type(error).__name__}: {_first_line(error)}"
     return None

@@ -29,3 +29,9 @@ Scalar = Float[Tensor, "*batch"]
 """A quantity per realisation."""
 Memory = Float[Tensor, "*batch n_m"]
 """The memory of a controller."""
+Starts = Float[Tensor, "batch n_s"]
+"""States at the starts of episodes or segments."""
+Start = float | Float[Tensor, " batch"]
+"""Times of these starts on the plant's clock [s], one for all or one for each."""
+Costs = Float[Tensor, " batch"]
+"""A cost per episode."""

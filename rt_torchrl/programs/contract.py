@@ -5,8 +5,8 @@ Whatever else code reads becomes a constant of it:
 
 - what a module holds, in attributes and in the lists, dictionaries, objects and tensors there: :class:`Holdings` has it
   by value, so that a change gives other code;
-- constants elsewhere, such as numbers, texts, tuples of these, functions and classes, which can only be replaced: a
-  :class:`Guard` notices that;
+- constants elsewhere, such as numbers, texts, tuples of these, functions and classes, which can only be replaced:
+  :class:`Outside` notices that;
 - what may change in its place elsewhere, such as a dictionary at the top of a module: it is refused by its name.
 """
 
@@ -24,7 +24,7 @@ import random
 import sys
 import threading
 import types
-from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet, Sequence
+from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
 from functools import lru_cache
 from itertools import chain
@@ -61,6 +61,7 @@ OWN = __name__.partition(".")[0]
 GENERATED = "<@beartype"
 """Files of code that checks annotations at run time."""
 ATTRIBUTES = ("LOAD_ATTR", "LOAD_METHOD", "LOAD_SUPER_ATTR")
+ENVIRONMENT = ("environ", "environb", "getenv", "getenvb")
 MISSING = object()
 
 
@@ -74,44 +75,6 @@ def inputs_of(module: nn.Module) -> dict[str, Tensor]:
     """The tensors that machine code takes as inputs, by name: parameters, then buffers in double precision."""
     buffers = {name: x for name, x in module.named_buffers() if x.dtype == torch.float64 and x.layout is torch.strided}
     return dict(module.named_parameters()) | buffers
-
-
-class Guard(NamedTuple):
-    """A constant outside of a module: where it is read, under which name, and what it was.
-
-    Args:
-        holder: dictionary, class or cell where it is; of a class without a name, the names of all attributes.
-        name: its name there.
-        value: the constant.
-        numbers: the numbers of a tensor or an array.
-    """
-
-    holder: Any
-    name: str
-    value: Any
-    numbers: bytes | None = None
-
-    @classmethod
-    def on(cls, holder: Any, name: str = "") -> "Guard":
-        """The guard of what is there now."""
-        value = cls(holder, name, None).now()
-        return cls(holder, name, value, _bytes(value) if isinstance(value, (Tensor, np.ndarray)) else None)
-
-    def now(self) -> object:
-        """What is there now."""
-        if isinstance(self.holder, types.CellType):
-            return self.holder.cell_contents
-        if not self.name:
-            return tuple(vars(self.holder)), self.holder.__mro__
-        return _entries(self.holder).get(self.name, MISSING)
-
-    def holds(self) -> bool:
-        """Whether the constant is what it was."""
-        now, kind = self.now(), type(self.value)
-        if isinstance(self.holder, type) and not self.name:
-            return now == self.value
-        same = now is self.value or (kind in VALUES and type(now) is kind and repr(now) == repr(self.value))
-        return same and (self.numbers is None or _bytes(now) == self.numbers)
 
 
 class Holdings:
@@ -133,13 +96,17 @@ class Holdings:
         self._inputs = {*map(id, inputs_of(root).values())}
         self._instances, self._mappings, self._sequences = list[Any](), list[Any](), list[Any]()
         self._empty, self._parts = list[Any](), list[tuple[Any, str]]()
-        self._tensors, self._constants, self._guards = list[Tensor](), list[Any](), list[Guard]()
+        self._tensors, self._constants = list[Tensor](), list[Any]()
         self._complete = True
         text = repr([self._read(obj) for obj in self.objects])  # which grow meanwhile
         self.digest = hashlib.sha256(text.encode(errors="surrogatepass")).digest()
         self.objects[0] = None
         self._views = [x.detach() for x in self._tensors]
-        self._note(root)
+        self._attributes = [x for x, _ in self._parts], [name for _, name in self._parts]
+        self._sizes_then, self._then = self._sizes(root), self._all(root)
+        self._addresses = self._then.tobytes()
+        self._graded = [x.requires_grad for x in self._tensors]
+        self._bytes = [*map(_bytes, self._constants)]
 
     def _mention(self, x: Any) -> object:
         """A value by its text, and any other object by its number, under which it is read."""
@@ -225,34 +192,8 @@ class Holdings:
 
     # Changes
 
-    def guard(self, root: nn.Module, guards: Sequence[Guard]) -> None:
-        """Compare constants outside of the module too, which are as they were noted."""
-        self._guards = [*guards]
-        self._note(root)
-
-    def guarded(self, guards: Sequence[Guard]) -> bool:
-        """Whether these constants are compared already."""
-        return len(guards) == len(self._guards) and all(map(is_, guards, self._guards))
-
-    def _note(self, root: nn.Module) -> None:
-        """Remember everything as it is now."""
-        cells = [guard.holder for guard in self._guards if isinstance(guard.holder, types.CellType)]
-        of_dicts = [guard for guard in self._guards if isinstance(guard.holder, dict)]
-        of_classes = [guard for guard in self._guards if isinstance(guard.holder, type) and guard.name]
-        self._classes = [guard.holder for guard in self._guards if isinstance(guard.holder, type) and not guard.name]
-        parts = [*self._parts, *((cell, "cell_contents") for cell in cells), *((k, "__mro__") for k in self._classes)]
-        self._attributes = [x for x, _ in parts], [name for _, name in parts]
-        self._globals = [guard.holder for guard in of_dicts], [guard.name for guard in of_dicts]
-        self._entries = [vars(guard.holder) for guard in of_classes], [guard.name for guard in of_classes]
-        self._numbered = [*self._constants, *(guard.value for guard in self._guards if guard.numbers is not None)]
-        self._sizes_then, self._then = self._sizes(root), self._all(root)
-        self._addresses = self._then.tobytes()
-        self._graded = [x.requires_grad for x in self._tensors]
-        self._bytes = [*map(_bytes, self._numbered)]
-
     def _sizes(self, root: nn.Module) -> list[int]:
-        held = chain(map(vars, (root, *self._instances)), self._mappings, self._sequences, map(vars, self._classes))
-        return [*map(len, held)]
+        return [*map(len, chain(map(vars, (root, *self._instances)), self._mappings, self._sequences))]
 
     def _all(self, root: nn.Module) -> np.ndarray:
         """All objects, in an order that stays; as long as the array lives, no other object takes their addresses."""
@@ -264,8 +205,6 @@ class Holdings:
             chain.from_iterable(map(_values, held)),
             chain.from_iterable(self._sequences),
             map(getattr, *self._attributes),
-            map(dict.get, *self._globals),
-            map(types.MappingProxyType.get, *self._entries),
         )
         return np.fromiter(objects, object)
 
@@ -279,7 +218,7 @@ class Holdings:
                 and self._all(root).tobytes() == self._addresses
                 and all(map(Tensor.is_set_to, self._tensors, self._views))
                 and [x.requires_grad for x in self._tensors] == self._graded
-                and [*map(_bytes, self._numbered)] == self._bytes
+                and [*map(_bytes, self._constants)] == self._bytes
             )
         except (AttributeError, ValueError):  # a variable of a function or a slot has lost its value
             return False
@@ -295,9 +234,38 @@ def _bytes(x: Any) -> bytes:
     return repr((x.shape, x.dtype)).encode() + x.tobytes()
 
 
-def _entries(holder: Any) -> Mapping[str, Any]:
-    """Attributes by name; those of a dictionary of globals are its entries."""
-    return holder if isinstance(holder, dict) else vars(holder)
+class Outside:
+    """Constants outside of a module, which can only be replaced.
+
+    Args:
+        places: dictionaries of globals and classes, each with a name of an entry; cells of functions; and classes with
+            an empty name, whose attributes and bases stay the same.
+    """
+
+    def __init__(self, places: Iterable[tuple[Any, str]] = ()):
+        dicts = [(holder, name) for holder, name in places if isinstance(holder, dict)]
+        classes = [(holder, name) for holder, name in places if isinstance(holder, type)]
+        cells = [holder for holder, _ in places if isinstance(holder, types.CellType)]
+        self._globals = [holder for holder, _ in dicts], [name for _, name in dicts]
+        self._entries = [vars(kind) for kind, name in classes if name], [name for _, name in classes if name]
+        whole = [kind for kind, name in classes if not name]
+        self._classes = [vars(kind) for kind in whole]
+        self._parts = [*cells, *whole], ["cell_contents"] * len(cells) + ["__mro__"] * len(whole)
+        self._then, self._names = [*self._now()], [*map(tuple, self._classes)]
+        self._numbered = [x for x in self._then if isinstance(x, (Tensor, np.ndarray))]
+        self._bytes = [*map(_bytes, self._numbered)]
+
+    def _now(self) -> Iterator[object]:
+        entries = map(types.MappingProxyType.get, *self._entries)
+        return chain(map(dict.get, *self._globals), entries, map(getattr, *self._parts))
+
+    def unchanged(self) -> bool:
+        """Whether all of them are what they were."""
+        try:
+            same = all(map(is_, self._now(), self._then)) and [*map(tuple, self._classes)] == self._names
+        except ValueError:  # a variable of a function has lost its value
+            return False
+        return same and [*map(_bytes, self._numbered)] == self._bytes
 
 
 class Executed:
@@ -307,8 +275,6 @@ class Executed:
         self.globals: dict[tuple[types.CodeType, int], dict[str, Any]] = {}
         self.variables: dict[types.CodeType, dict[str, Any]] = {}
         """Variables of enclosing functions that code has read."""
-        self.environment: types.CodeType | None = None
-        """Code that has read an environment variable, if there is any."""
 
     @contextmanager
     def noted(self) -> Iterator[None]:
@@ -324,21 +290,10 @@ class Executed:
 
     def _note(self, frame: types.FrameType, event: str, argument: object) -> None:
         code, held = frame.f_code, frame.f_globals
-        if event != "call" or (code, id(held)) in self.globals:
-            return
-        if code is _READS_ENVIRONMENT:
-            back = frame.f_back
-            while back is not None and back.f_globals.get("__name__") in ("os", "collections.abc"):
-                back = back.f_back
-            if back is not None and not _of_library(back.f_code, back.f_globals):
-                self.environment = back.f_code
-        elif not _of_library(code, held):
+        if event == "call" and (code, id(held)) not in self.globals and not _of_library(code, held):
             self.globals[code, id(held)] = held
             if code.co_freevars:
                 self.variables[code] = {x: frame.f_locals[x] for x in code.co_freevars if x in frame.f_locals}
-
-
-_READS_ENVIRONMENT = type(os.environ).__getitem__.__code__
 
 
 def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
@@ -347,22 +302,20 @@ def _of_library(code: types.CodeType, held: dict[str, Any]) -> bool:
     return foreign(name) or made
 
 
-def guards_of(root: nn.Module, holdings: Holdings, executed: Executed) -> tuple[Guard, ...]:
+def outside_of(root: nn.Module, holdings: Holdings, executed: Executed) -> Outside:
     """The constants that executed functions of a module read outside of it.
 
     Raises:
         UntraceableError: if a function reads what may change without notice; the message names both.
     """
-    if executed.environment is not None:
-        raise _refusal(executed.environment, "the environment (os.environ)")
-    return tuple(_Reads(root, holdings, executed).guards.values())
+    return Outside(_Reads(root, holdings, executed).places.values())
 
 
 class _Reads:
     """What executed functions read outside of a module."""
 
     def __init__(self, root: nn.Module, holdings: Holdings, executed: Executed):
-        self.guards: dict[tuple[int, str], Guard] = {}
+        self.places: dict[tuple[int, str], tuple[Any, str]] = {}
         self._held = {id(root), *map(id, holdings.objects)}  # whose changes the holdings notice
         self._functions: dict[types.CodeType, list[types.FunctionType]] = collections.defaultdict(list)
         self._codes = {code for code, _ in executed.globals}
@@ -371,7 +324,7 @@ class _Reads:
             self._note_function(x)
         classes = {kind for x in (root, *holdings.objects) for kind in (x if isinstance(x, type) else type(x)).__mro__}
         for kind in (kind for kind in classes if not foreign(kind.__module__)):
-            self.guards[id(kind), ""] = Guard.on(kind)
+            self.places[id(kind), ""] = kind, ""
             for value in vars(kind).values():
                 self._note_function(value)
         for (code, _), held in executed.globals.items():
@@ -395,34 +348,36 @@ class _Reads:
 
     def _take(self, code: types.CodeType, holder: Any, name: str, prefix: str) -> None:
         """Judge what code reads from a dictionary of globals, a class or a function, and its attributes."""
-        value = _entries(holder)[name]
+        value = (holder if isinstance(holder, dict) else vars(holder))[name]
+        if value is os.environ or value is os.getenv or (value is os and {*ENVIRONMENT} & {*_names(code).attributes}):
+            raise _refusal(code, "the environment (os.environ)")
         if isinstance(value, types.ModuleType) and foreign(value.__name__):
             return  # such as torch
         followed = isinstance(value, (Tensor, np.ndarray)) and isinstance(holder, dict)  # by its numbers
         if not followed and not self._constant(value):
             raise _refusal(code, f"{prefix}{name}", value)
         self._note_function(value)
-        seen = (id(holder), name) in self.guards
-        self.guards[id(holder), name] = Guard.on(holder, name)
+        seen = (id(holder), name) in self.places
+        self.places[id(holder), name] = holder, name
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
+            there = further if isinstance(further, dict) else vars(further)
             for attribute in _names(code).attributes:
-                if attribute in _entries(further) and (not seen or (id(further), attribute) not in self.guards):
+                if attribute in there and not (seen and (id(further), attribute) in self.places):
                     self._take(code, further, attribute, f"{inner}.")
 
-    def _class_attributes(self, x: object, named: Mapping[str, types.CodeType]) -> None:
+    def _class_attributes(self, x: object, named: dict[str, types.CodeType]) -> None:
         """Judge what the class of an object holds, if executed code has it or reads an attribute of its name."""
         kind = x if isinstance(x, type) else type(x)
         if foreign(kind.__module__):
             return
         own = {} if isinstance(x, type) else getattr(x, "__dict__", {})
-        methods = {name for owner in kind.__mro__ for name, f in vars(owner).items() if _code_of(f) in self._codes}
-        for name in {*named, *methods} - {*own}:
+        functions = {name: _function_of(f) for owner in kind.__mro__ for name, f in vars(owner).items()}
+        methods = {name: f.__code__ for name, f in functions.items() if f is not None and f.__code__ in self._codes}
+        for name, code in {name: code for name, code in (methods | named).items() if name not in own}.items():
             owner = next((k for k in kind.__mro__ if name in vars(k)), None)
-            if owner is not None and not foreign(owner.__module__) and (id(owner), name) not in self.guards:
-                if not self._constant(vars(owner)[name]):
-                    raise _refusal(named[name], f"the class attribute {owner.__name__}.{name}", vars(owner)[name])
-                self.guards[id(owner), name] = Guard.on(owner, name)
+            if owner is not None and not foreign(owner.__module__) and (id(owner), name) not in self.places:
+                self._take(code, owner, name, f"the class attribute {owner.__name__}.")
 
     def _variables(self, code: types.CodeType, variables: Mapping[str, object]) -> None:
         """Judge the defaults of a function, and the variables of the functions around it."""
@@ -440,7 +395,7 @@ class _Reads:
             if not functions or not self._constant(value):
                 raise _refusal(code, f"the variable {name} of the function around it", value)
             for cell in ((f.__closure__ or ())[code.co_freevars.index(name)] for f in functions):
-                self.guards[id(cell), ""] = Guard.on(cell)
+                self.places[id(cell), ""] = cell, ""
 
     def _note_function(self, x: object) -> None:
         """Note a function, and those that it wraps."""
@@ -514,11 +469,6 @@ def _function_of(x: Any) -> types.FunctionType | None:
     x = x.func if isinstance(x, functools.partial) else x
     x = getattr(x, "__wrapped__", x) if isinstance(x, functools._lru_cache_wrapper) else x
     return x if isinstance(x, types.FunctionType) else None
-
-
-def _code_of(x: object) -> types.CodeType | None:
-    function = _function_of(x)
-    return None if function is None else function.__code__
 
 
 def _refusal(code: types.CodeType, what: str, value: object = MISSING) -> UntraceableError:

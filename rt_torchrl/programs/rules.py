@@ -150,8 +150,8 @@ def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -
     given = [i for i in indices if i is not None]
     if all(tracer.numbers(tracer.cells(i)) is not None for i in given):
         places = torch.ops.aten.index.Tensor(torch.arange(target.numel()).view(target.shape), indices)
-        source = tracer.cells(values).expand(places.shape)
-        for place, value in zip(places.flatten().tolist(), source.flatten().tolist(), strict=True):
+        assigned = tracer.cells(values).expand(places.shape).flatten().tolist()
+        for place, value in zip(places.flatten().tolist(), assigned, strict=True):
             found[place] = p.apply("add", found[place], value) if added else value
         return in_shape(found, target.shape)
     rest = target.shape[len(given) :]

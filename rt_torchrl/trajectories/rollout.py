@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from rt_torchrl.plants.plant import Plant, final_cost
+from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.trajectories.engines import Autograd, GradientEngine, Native, OdeintAdjoint, Parallel
 from rt_torchrl.trajectories.engines.code import require_pure_once
 from rt_torchrl.trajectories.engines.interval import CostInterval, Drive, Interval
@@ -79,12 +80,7 @@ class Rollout:
         self._driven: tuple[tuple[object, ...], Drive, tuple[Tensor | None, ...]] | None = None
 
     def __call__(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        command: Float[Tensor, "batch n n_a"] | None = None,
-        *,
-        start: float | Float[Tensor, " batch"] = 0.0,
+        self, initial_state: Starts, exogenous: Inputs, command: Actions | None = None, *, start: Start = 0.0
     ) -> Trajectory:
         """The trajectory of ``n`` intervals.
 
@@ -110,13 +106,8 @@ class Rollout:
         return Trajectory(states.transpose(0, 1), applied.transpose(0, 1), exogenous, start)
 
     def costs(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        command: Float[Tensor, "batch n n_a"] | None = None,
-        *,
-        start: float | Float[Tensor, " batch"] = 0.0,
-    ) -> Float[Tensor, " batch"]:
+        self, initial_state: Starts, exogenous: Inputs, command: Actions | None = None, *, start: Start = 0.0
+    ) -> Costs:
         """J_a of each trajectory of :meth:`__call__`, as :func:`control_cost` gives it; quicker, and in less memory.
 
         Raises:
@@ -235,10 +226,10 @@ def all_finite(x: Tensor) -> bool:
 def require_finite(
     plant: Plant,
     ends: Float[Tensor, "n batch n_s"],
-    initial_state: Float[Tensor, "batch n_s"],
+    initial_state: Starts,
     modules: Sequence[nn.Module | None],
     *,
-    start: float | Float[Tensor, " batch"] = 0.0,
+    start: Start = 0.0,
     remedy: str = "Use a smaller dt, or weights nearer to ones that are known to work.",
 ) -> None:
     """Refuse a trajectory that has left the finite numbers.
@@ -267,9 +258,7 @@ def require_finite(
     )
 
 
-def drive_of(
-    plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: float | Float[Tensor, " batch"] = 0.0
-) -> Drive:
+def drive_of(plant: Plant, exogenous: Tensor, command: Tensor | None, *, start: Start = 0.0) -> Drive:
     """The drive, time first, of inputs and commands with the batch first; :class:`Rollout` explains ``start``."""
     batch, n = exogenous.shape[:2]
     t = start + plant.dt * torch.arange(n, dtype=torch.float64, device=exogenous.device).unsqueeze(-1)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Inputs, Start, Starts
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.engines.interval import Drive, Interval, with_weights
 from rt_torchrl.trajectories.engines.parallel import linearise_by_rows, over_all
@@ -77,13 +78,7 @@ class Sensitivities:
 
     @torch.no_grad()
     def __call__(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        actions: Float[Tensor, "batch n n_a"],
-        *,
-        start: float | Float[Tensor, " batch"] = 0.0,
-        initial: bool = False,
+        self, initial_state: Starts, exogenous: Inputs, actions: Actions, *, start: Start = 0.0, initial: bool = False
     ) -> tuple[Float[Tensor, "batch n n_s"], Float[Tensor, "batch n n_s n_w"]]:
         """States s_1 ... s_n and their sensitivities S_1 ... S_n.
 

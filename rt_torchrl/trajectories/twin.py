@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant, require_end_cost
+from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
 from rt_torchrl.trajectories.rollout import Engine, Rollout, able
 from rt_torchrl.trajectories.sensitivity import Sensitivities
@@ -49,14 +50,7 @@ class DigitalTwin:
     def _rollout(self, closure: nn.Module, policy: nn.Module | None) -> Rollout:
         return Rollout(self.plant, closure, policy, engine=self._engine, compiled=self._compiled)
 
-    def replay(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        actions: Float[Tensor, "batch n n_a"],
-        *,
-        start: float | Float[Tensor, " batch"] = 0.0,
-    ) -> Trajectory:
+    def replay(self, initial_state: Starts, exogenous: Inputs, actions: Actions, *, start: Start = 0.0) -> Trajectory:
         """Virtual episodes, or parts of them, under recorded actions; see :meth:`Rollout.__call__`."""
         return self._replay(initial_state, exogenous, actions, start=start)
 
@@ -68,14 +62,7 @@ class DigitalTwin:
         flown = believed.replay(begins, record.exogenous[None], record.actions[None], start=record.start)
         return flown.states[0, :, : record.states.shape[-1]]
 
-    def control(
-        self,
-        policy: nn.Module,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        *,
-        start: float | Float[Tensor, " batch"] = 0.0,
-    ) -> Trajectory:
+    def control(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs, *, start: Start = 0.0) -> Trajectory:
         """Virtual episodes, or parts of them, under a policy; see :meth:`Rollout.__call__`.
 
         The trajectory is differentiable by the policy's weights and the initial state; the closure is held constant.
@@ -92,15 +79,11 @@ class DigitalTwin:
             return policy.fly(initial_state, exogenous, self.closure, plant=self.plant)
         return self._planning(policy)(initial_state, exogenous, start=start)
 
-    def cost(
-        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
-    ) -> Float[Tensor, ""]:
+    def cost(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Float[Tensor, ""]:
         """Mean J_a of virtual episodes under a policy."""
         return self.episode_costs(policy, initial_state, exogenous).mean()
 
-    def episode_costs(
-        self, policy: nn.Module, initial_state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n n_z"]
-    ) -> Float[Tensor, " batch"]:
+    def episode_costs(self, policy: nn.Module, initial_state: Starts, exogenous: Inputs) -> Costs:
         """J_a of each virtual episode under a policy, differentiable by its weights unless it is state feedback."""
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.control(policy, initial_state, exogenous))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rt_torchrl.programs.contract import Executed, Guard, Holdings, ImpureError, guards_of, inputs_of, require_pure
+from rt_torchrl.programs.contract import Executed, Holdings, ImpureError, Outside, inputs_of, outside_of, require_pure
 from rt_torchrl.programs.machine_code import Lanes, ObjectCode, lanes_of_this_machine, march_text, sweep_text
 from rt_torchrl.programs.program import UntraceableError
 from rt_torchrl.programs.rules import new_tracer
@@ -213,7 +213,7 @@ class IntervalCode:
         self.point, self.lanes = point, lanes
         self.sweeps: dict[bool, ObjectCode] = {}
         """The reverse sweeps that have been prepared, without and with the gradients by the drive."""
-        self.guards: tuple[Guard, ...] = ()
+        self.outside = Outside()
         """Constants outside of the interval that its code has read."""
         self._executed, holdings = Executed(), holdings or Holdings(interval)
         tracer = new_tracer(getattr(interval, "straight", STRAIGHT))
@@ -231,7 +231,7 @@ class IntervalCode:
         self.march(*x, states, Inputs(interval).row(), 1)
         with torch.no_grad(), self._executed.noted():
             exact = interval(*point).numpy()
-        self.guards = guards_of(interval, holdings, self._executed)
+        self.outside = outside_of(interval, holdings, self._executed)
         require_equal("the end state", states[1].T, exact, point.state.numpy())
 
     def prepare_sweep(self, interval: nn.Module, driven: bool, holdings: Holdings | None = None) -> None:
@@ -261,7 +261,7 @@ class IntervalCode:
         code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
         self.read |= _read_by(tracer, interval, chain.from_iterable(outputs))
         self._compare_sweep(code, interval, driven)
-        self.guards = guards_of(interval, holdings or Holdings(interval), self._executed)
+        self.outside = outside_of(interval, holdings or Holdings(interval), self._executed)
         self.sweeps[driven] = code
 
     def _compare_sweep(self, sweep: ObjectCode, interval: nn.Module, driven: bool) -> None:
@@ -388,12 +388,12 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (holdings.digest, lanes_of_this_machine(), *widths)
         found, alive = _kept.get(key, (None, tuple(holdings.alive)))
-        if isinstance(found, IntervalCode) and not _as_noted(found, holdings):
+        if isinstance(found, IntervalCode) and not found.outside.unchanged():
             found, alive = None, tuple(holdings.alive)
         driven = any(x.requires_grad for x in drive)
         wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
         if found is None or (isinstance(found, IntervalCode) and wanted and driven not in found.sweeps):
-            if not (np.isfinite(inputs.row()).all() and initial_state.isfinite().all()):
+            if not all(bool(x.isfinite().all()) for x in (initial_state, *interval.parameters())):
                 return None  # nothing to compare with; the next call may have numbers
             point = point_of(initial_state, drive, lanes_of_this_machine().number, sums)
             found = _made(found, key, interval, point, holdings, driven if wanted else None)
@@ -403,11 +403,7 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
-        if isinstance(found, UntraceableError):
-            return None
-        if not holdings.guarded(found.guards):
-            holdings.guard(interval, found.guards)
-        return found, inputs
+        return None if isinstance(found, UntraceableError) else (found, inputs)
 
 
 def _made(
@@ -435,11 +431,6 @@ def _made(
         warnings.warn(f"engine 'autograd' takes the place of 'native': {found}.", stacklevel=2)
         return found
     return code
-
-
-def _as_noted(code: IntervalCode, holdings: Holdings) -> bool:
-    """Whether constants outside of the interval are what they were; those that are compared are."""
-    return holdings.guarded(code.guards) or all(guard.holds() for guard in code.guards)
 
 
 def _reason(error: Exception) -> UntraceableError:

@@ -241,19 +241,16 @@ def pieces(count: int) -> list[slice]:
     return [slice(*pair) for pair in pairwise(ends)]
 
 
-def over_all(
-    function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive, *, at_once: int | None = None
-) -> Tensor:
+def over_all(function: Callable[[Tensor, Drive], Tensor], starts: Tensor, drive: Drive) -> Tensor:
     """``function`` of every interval, ``n batch ...``, in pieces of which the last one may overlap another.
 
     Args:
         function: a function of states and drive of many intervals.
         starts: states at the starts of the intervals.
         drive: times and inputs of the intervals.
-        at_once: number of intervals of a piece; None for :data:`PIECE`.
     """
     rows, driven = as_one_batch(starts, drive)
-    length = min(at_once or PIECE, len(rows))
+    length = min(PIECE, len(rows))
     firsts = [*range(0, len(rows) - length, length), len(rows) - length]
     found = [function(*piece(rows, driven, first, first + length)) for first in firsts]
     found[-1] = found[-1][len(found) * length - len(rows) :]

@@ -1,0 +1,321 @@
+"""The contract of traced code: right, or refused with the line and the remedy; nothing is silently wrong."""
+
+import re
+import warnings
+from collections import OrderedDict
+
+import changes
+import pytest
+import snippets
+import torch
+from impure import Recurrent, Rows
+from linear_quadratic import LinearQuadratic
+from torch import nn
+from traced_function import Snippet, compared, gap, signals, traced
+
+from rt_torchrl.programs.contract import ImpureError
+from rt_torchrl.programs.program import UntraceableError
+from rt_torchrl.systems.collectors import EpisodeCollector, collector_of
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.trajectories.engines import code
+from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.engines.native import Native
+from rt_torchrl.trajectories.engines.parallel import Parallel
+from rt_torchrl.trajectories.rollout import ENGINES, Rollout
+from rt_torchrl.trajectories.twin import DigitalTwin
+
+
+@pytest.mark.parametrize(
+    "case", [case for case in snippets.CASES if case not in snippets.REFUSED and case not in snippets.MIXED]
+)
+def test_equals_eager(case):
+    # Rounding, summed in another order: a Newton iteration amplifies it most.
+    for found, exact in compared(snippets.CASES[case], *signals(11, 3)):
+        assert gap(found, exact) < 1e-10
+
+
+@pytest.mark.parametrize("case", snippets.REFUSED)
+def test_refused_with_the_line_of_the_code(case):
+    with pytest.raises(UntraceableError, match=re.escape(snippets.REFUSED[case])) as refusal:
+        traced(snippets.CASES[case], *signals(11, 3))
+    assert re.search(r"snippets\.py:\d+: .", str(refusal.value)), refusal.value
+
+
+@pytest.mark.parametrize("case", snippets.MIXED)
+@pytest.mark.parametrize("batch", [1, 11])
+def test_realisations_that_depend_on_each_other_are_refused(case, batch):
+    with pytest.raises(UntraceableError, match="differs from what torch computes"):
+        traced(snippets.CASES[case], *signals(batch, 1))
+
+
+@pytest.mark.slow
+def test_wide_perceptrons_need_no_wide_stack():
+    """Each of the arrays of hidden units and of gradients by weights, 4 MiB, lies beyond the stack of a thread."""
+    network = nn.Sequential(nn.Linear(3, 256), nn.Tanh(), nn.Linear(256, 256), nn.Tanh(), nn.Linear(256, 3))
+    snippet = Snippet(lambda m, s, d: sum(m.modules_[0](s * k) for k in (1.0, 2.0, 3.0)), network)
+    for found, exact in compared(snippet, *signals(3, 2)):
+        assert gap(found, exact) < 1e-12
+
+
+def test_refusals_hold_no_tensors():
+    """The traceback of a refusal would keep everything that was traced."""
+    case, (state, drive) = snippets.CASES["sort"], signals(2, 2)
+    with pytest.warns(UserWarning, match="sort"):
+        assert code.code_of(case, state, drive) is None
+    assert code.code_of(case, state, drive) is None  # without another warning
+    kept = (found for found, _ in code._kept.values())
+    (refusal,) = (found for found in kept if isinstance(found, UntraceableError) and "sort" in str(found))
+    assert refusal.__traceback__ is None
+
+
+@pytest.mark.parametrize("where", ["state", "weight"])
+@pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.filterwarnings("error")
+def test_what_is_no_number_refuses_no_code(where, wanted):
+    """A twin that explodes once does not leave its engine for the rest of a training."""
+    network, (state, drive) = nn.Linear(3, 3).double(), signals(4, 2)
+    interval = Snippet(lambda m, s, d: m.w0 * torch.tanh(m.modules_[0](s) * d.t.unsqueeze(-1) * d.exogenous), network)
+    spoiled = state.detach() if where == "state" else network.bias.data
+    before = spoiled.clone()
+    spoiled.fill_(torch.nan)
+    for number in (torch.nan, 0.0):
+        with torch.set_grad_enabled(wanted):
+            begin = torch.full_like(state, number) if where == "state" else state
+            found = Native(compiled=False).end_states(interval, begin, drive)
+            exact = Autograd(compiled=False).end_states(interval, begin, drive)
+        torch.testing.assert_close(found, exact, equal_nan=True)
+        spoiled.copy_(before)
+    assert code.code_of(interval, state, drive) is not None
+
+
+def test_code_may_compute_with_known_numbers_as_it_likes():
+    def counted(m, s, d):
+        sizes = torch.tensor([3.0, 1.0, 2.0]).sort().values
+        return s * sizes.double() * m.w0 if sizes.tolist()[0] < 2 and sizes.numpy()[1] == 2 else -s
+
+    for found, exact in compared(Snippet(counted), *signals(11, 3)):
+        assert gap(found, exact) < 1e-12
+
+
+def counted(monkeypatch):
+    """The texts of recurrences that are made, of which none is known yet."""
+    made, text = [], code.march_text
+    monkeypatch.setattr(code, "march_text", lambda *given: made.append(given) or text(*given))
+    monkeypatch.setattr(code, "_kept", OrderedDict())
+    return made
+
+
+BUFFERS = {
+    "in place": lambda x: x.mul_(2.0),
+    "behind torch's back": lambda x: x.data.mul_(2.0),
+    "in its memory": lambda x: x.numpy().__setitem__(0, 3.0),
+    "other memory": lambda x: setattr(x, "data", x.data * 2.0),
+}
+
+
+@pytest.mark.parametrize("change", BUFFERS)
+def test_a_buffer_is_an_input(change, monkeypatch):
+    """Its new numbers are read, and need no other program."""
+    made = counted(monkeypatch)
+    snippet = Snippet(lambda m, s, d: (s * m.gain).clamp(max=m.limit))
+    snippet.register_buffer("gain", torch.ones(3, dtype=torch.float64))
+    snippet.register_buffer("limit", torch.tensor(torch.inf, dtype=torch.float64))
+    state, drive = signals(4, 5)
+    for _ in range(3):
+        found = Native(compiled=False).end_states(snippet, state, drive)
+        torch.testing.assert_close(found, Autograd(compiled=False).end_states(snippet, state, drive))
+        BUFFERS[change](snippet.gain)
+    assert len(made) == 1
+
+
+def roots(m, s, d):
+    return torch.where(s > m.level, (s - m.level).sqrt(), 0.0) * m.w0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_gradient_that_is_no_number_is_not_traced_again_and_again(share, monkeypatch):
+    """The gradient of a branch that is not taken is NaN. Where torch has one, it is compared."""
+    made, snippet = counted(monkeypatch), Snippet(roots)
+    snippet.level = 0.0
+    state, drive = signals(16, 4)
+    state = state.abs() * torch.where(torch.arange(16) % 2 < 2 * share, 1.0, -1.0).unsqueeze(-1)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(6):
+            ends = Native(compiled=False).end_states(snippet, state.requires_grad_(), drive)
+            exact = Autograd(compiled=False).end_states(snippet, state, drive)
+            torch.testing.assert_close(ends, exact)
+    assert len(made) == (1 if share else code.TRIES)
+    assert [str(each.message) for each in said if "no finite gradient" in str(each.message)] == [] or not share
+    assert sum("no finite gradient" in str(each.message) for each in said) == (0 if share else 1)
+
+
+def test_the_engine_parallel_refuses_attention_in_words():
+    snippet, (state, drive) = snippets.CASES["scaled dot product"], signals(4, 3)
+    found = Native(compiled=False).end_states(snippet, state, drive)
+    torch.testing.assert_close(found, Autograd(compiled=False).end_states(snippet, state, drive))
+    with pytest.raises(ValueError, match=r"engine='parallel' needs .* Use engine='native' or 'autograd'"):
+        Parallel(compiled=False).end_states(snippet, state, drive)
+
+
+# What is read and changes
+
+
+def cost(plant, engine, rollouts):
+    """The cost of a flight, by a rollout that lasts."""
+    generator = torch.Generator().manual_seed(0)
+    scenario = plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator)
+    policy = plant.make_policy(generator)
+    flown = rollouts.setdefault(engine, Rollout(plant, plant.closure, policy, engine=engine))
+    return flown.costs(*scenario).mean().item()
+
+
+@pytest.mark.parametrize("kind", changes.KINDS)
+def test_a_change_is_followed_or_the_thing_is_refused_by_name(kind, monkeypatch):
+    make, change = changes.KINDS[kind]
+    plant, lasting = make(), {}
+    with changes.as_before(monkeypatch), warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for scale in (0.1, 10.0):
+            change(scale, plant)
+            exact = cost(plant, "autograd", {})
+            for rollouts in (lasting, {}):
+                assert cost(plant, "native", rollouts) == pytest.approx(exact, rel=1e-9)
+    refusals = [str(each.message) for each in said if "takes the place of 'native'" in str(each.message)]
+    assert exact > 1.0  # the factor is in the cost
+    if kind in changes.REFUSED:
+        remedies = ("make it an attribute or a buffer", "import it at the top")
+        assert any(changes.REFUSED[kind] in text and any(map(text.count, remedies)) for text in refusals), refusals
+    else:
+        assert not refusals
+
+
+# What is no function of its arguments is refused in words, by every engine and on every path that flies it
+
+
+class Summing(nn.Module):
+    """A PI controller whose integral is a buffer."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(2, dtype=torch.float64))
+        self.register_buffer("integral", torch.zeros(1, dtype=torch.float64))
+
+    def forward(self, observation):
+        self.integral += 0.1 * observation.detach().mean()
+        return (observation * self.gain).sum(-1, keepdim=True) + self.integral
+
+
+class Derivative(nn.Module):
+    """Takes the difference to the last observation."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain, self.last = nn.Parameter(torch.ones(1, dtype=torch.float64)), 0.0
+
+    def forward(self, observation):
+        change, self.last = observation[..., :1] - self.last, observation[..., :1].detach().mean()
+        return self.gain * change
+
+
+class Counter(Derivative):
+    def forward(self, observation):
+        self.last += 1.0
+        return self.gain * observation[..., :1] + 1e-3 * self.last
+
+
+class Random(Derivative):
+    def forward(self, observation):
+        return self.gain * observation[..., :1] + 0.1 * torch.rand(1, dtype=torch.float64)
+
+
+class Centred(Derivative):
+    def forward(self, observation):
+        return self.gain * (observation[..., :1] - observation[..., :1].mean())
+
+
+AGAIN = "gives something else when it is called again with the same arguments"
+POLICIES = {
+    "recurrent": (Recurrent, rf"policy \(Recurrent\) {AGAIN}.*a state of the plant"),
+    "integral": (Summing, r"policy \(Summing\) changes its buffer 'integral'"),
+    "derivative": (Derivative, rf"policy \(Derivative\) {AGAIN}"),
+    "counter": (Counter, rf"policy \(Counter\) {AGAIN}"),
+    "random": (Random, rf"policy \(Random\) {AGAIN}.*random numbers belong in draw_exogenous"),
+    "dropout": (
+        lambda: Rows(nn.Linear(2, 8), nn.Dropout(), nn.Linear(8, 1)),
+        rf"policy.layers.1 \(Dropout\) {AGAIN}.*\.eval\(\)",
+    ),
+    "batch normalisation": (
+        lambda: Rows(nn.BatchNorm1d(2), nn.Linear(2, 1)),
+        r"policy.layers.0 \(BatchNorm1d\) changes its buffer 'running_mean'.*\.eval\(\)",
+    ),
+    "mean over the batch": (Centred, "depends on the other realisations"),
+}
+PLANT = LinearQuadratic(horizon=1.0)
+
+
+def scenario(batch=3):
+    generator = torch.Generator().manual_seed(0)
+    return PLANT.draw_initial_state(batch, generator), PLANT.draw_exogenous(batch, generator)
+
+
+@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_policy_that_is_no_function_is_refused(engine, kind):
+    make, message = POLICIES[kind]
+    twin = DigitalTwin(PLANT, PLANT.make_closure(torch.Generator()), engine=engine)
+    for batch in (1, 3) if kind != "mean over the batch" else (3,):
+        policy = make()
+        for ask in (twin.cost, twin.control):
+            with pytest.raises(ImpureError, match=message):
+                ask(policy, *scenario(batch))
+
+
+@pytest.mark.parametrize("by_steps", [False, True])
+@pytest.mark.parametrize("kind", ["recurrent", "dropout"])
+def test_it_does_not_fly_the_simulated_plant_either(kind, by_steps):
+    make, message = POLICIES[kind]
+    env = PlantEnv(PLANT, seed=0)
+    actor = LivePolicy(PLANT, make(), ExplorationConfig(), generator=torch.Generator().manual_seed(0))
+    collector = EpisodeCollector(env, actor, PLANT) if by_steps else collector_of(env, actor, PLANT)
+    with pytest.raises(ImpureError, match=message):
+        collector.rollout()
+
+
+@pytest.mark.parametrize("kind", ["dropout", "batch normalisation"])
+@pytest.mark.parametrize("engine", ["native", "autograd"])
+def test_a_policy_in_evaluation_flies_until_it_trains_again(engine, kind):
+    make, message = POLICIES[kind]
+    policy = make().eval()
+    fly = Rollout(PLANT, PLANT.closure, policy, engine=engine)
+    exact = Rollout(PLANT, PLANT.closure, policy, engine="autograd")
+    torch.testing.assert_close(fly(*scenario()).states, exact(*scenario()).states)
+    policy.train()
+    with pytest.raises(ImpureError, match=message):
+        fly(*scenario())
+
+
+class Noisy(LinearQuadratic):
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(t, state, applied, exogenous) * (1.0 + torch.rand(()))
+
+
+class Shaken(LinearQuadratic):
+    def vector_field(self, t, state, action, exogenous, closure):
+        return super().vector_field(t, state, action, exogenous, closure) + 0.1 * torch.randn_like(state)
+
+
+@pytest.mark.parametrize("engine", ["native", "autograd"])
+def test_a_plant_that_is_no_function_is_refused(engine):
+    plant = Shaken(horizon=1.0)
+    with pytest.raises(ImpureError, match=f"a method of plant 'linear_quadratic' {AGAIN}"):
+        Rollout(plant, plant.closure, engine=engine)(*scenario(), torch.zeros(3, 10, 1).double())
+
+
+@pytest.mark.parametrize("engine", ["native", "autograd"])
+def test_a_cost_that_is_no_function_is_refused(engine):
+    plant = Noisy(horizon=1.0)
+    policy = plant.make_policy(torch.Generator())
+    with pytest.raises(ImpureError, match=f"a method of plant 'linear_quadratic' {AGAIN}"):
+        Rollout(plant, plant.closure, policy, engine=engine).costs(*scenario())
