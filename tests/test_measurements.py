@@ -76,7 +76,7 @@ def test_names_and_sets_are_chosen_together_and_once():
 @pytest.mark.parametrize("observe", [("lidar",), ("paper", "lidar"), "paper"])
 def test_what_is_not_measured_is_refused(observe):
     with pytest.raises(ValueError, match="observe="):
-        WindTurbine.chosen(observe)
+        WindTurbine(observe=observe)
 
 
 def test_a_measurement_without_a_scale_is_refused():

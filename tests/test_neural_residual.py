@@ -89,7 +89,7 @@ def test_the_residual_is_the_bounded_network_in_the_units_of_the_plant():
 
     plant = NeuralResidual(Sized(), {"velocity": 3.0}, inputs=("force", "position"), ranges={"position": (0.0, 4.0)})
     closure = stirred(plant.make_closure(torch.Generator().manual_seed(1)))
-    first, last = (closure.own.network.network[k] for k in (0, 2))
+    first, last = (closure.own.network[k] for k in (0, 2))
     state = torch.tensor([[1.0, 0.2], [9.0, -3.0]], dtype=torch.float64)
     action = torch.tensor([[0.7], [-2.0]], dtype=torch.float64)
     hat = torch.cat([action / 2.0, (state[:, :1] - 2.0) / 2.0], -1)  # the force goes from −2 to 2 N

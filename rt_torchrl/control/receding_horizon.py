@@ -26,8 +26,6 @@ DIVERGED = 1e6
 """Cost of a trial that diverges, in costs of the start: greater than any that a line search accepts."""
 Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Function from end times ``batch``, states ``batch n_s`` and inputs ``batch n_z`` there to a cost V ``batch``."""
-Guess = Callable[[Tensor, Tensor], Tensor]
-"""Function from states ``batch n_s`` and forecast inputs ``batch n n_z`` to commands ``batch n n_a``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,8 +280,6 @@ class RecedingHorizon:
             that ends with the episode has the plant's ``terminal_cost`` instead.
         tail: the cost V where it also depends on the time and on the inputs after the window, of several futures on
             their mean; None for none.
-        guess: commands that a solve starts from where they cost less than the rest of the last plan, such as those of a
-            classical controller on the model; None for none.
 
     Raises:
         ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
@@ -298,9 +294,8 @@ class RecedingHorizon:
         forecast: Forecast | None = None,
         terminal: TerminalCost | None = None,
         tail: Tail | None = None,
-        guess: Guess | None = None,
     ):
-        self.plant, self.config, self.guess = plant, config, guess
+        self.plant, self.config = plant, config
         self.forecast: Forecast = forecast or Held()
         hold = self._whole("hold", plant.dt if config.hold is None else config.hold, 1)
         self.horizon = self._whole("horizon", config.horizon, hold)
@@ -373,8 +368,6 @@ class RecedingHorizon:
             self.cost.begin(begins, coming, start=t)
             last = self._prepared if first else self._shifted(self._plans[episode])
             starts = ([] if last is None else [last]) + (self._constants() if first else [])
-            if self.guess is not None:
-                starts.append(self.cost.units(self.guess(begins, coming)))
             start = starts[0] if len(starts) == 1 else self._cheapest(starts)
             found.append(self._solved(start, last, began))
         self._plans = found

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.options import quoted
@@ -17,24 +16,8 @@ from rt_torchrl.plants.signal import Signal
 Range = tuple[float, float]
 
 
-class ResidualRates(nn.Module):
-    """The network of a :class:`NeuralResidual`; its weights have no names and no units.
-
-    Args:
-        ranges: range of each feature, which is scaled to [−1, 1].
-        bounds: greatest absolute value of each rate.
-        hidden: width of each hidden layer.
-        seed: seed of the first weights; those of the last layer are zero, so that all rates are.
-    """
-
-    def __init__(self, ranges: Sequence[Range], bounds: Sequence[float], hidden: Sequence[int], seed: int):
-        super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.network = BoundedPerceptron(ranges, bounds, hidden=hidden, generator=generator)
-
-    def forward(self, features: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch m"]:
-        """The rates."""
-        return self.network(features)
+class ResidualRates(BoundedPerceptron):
+    """The network of a :class:`NeuralResidual`, whose rates are zero at first; its weights have no names."""
 
 
 class NeuralResidual(Extension):
@@ -82,7 +65,7 @@ class NeuralResidual(Extension):
         scaled: list[Range] = []
         for name, (_, signal) in zip(inputs, signals, strict=True):
             scaled += _scaled(signal, given.get(name))
-        own = ResidualRates(scaled, bounds, tuple(hidden), seed)
+        own = ResidualRates(scaled, bounds, hidden=hidden, generator=torch.Generator().manual_seed(seed))
         super().__init__(base, [], own)
         self._whole = not base.own_scheme
         self._seen = signals

@@ -137,7 +137,7 @@ class Plant(nn.Module, ABC):
         """Length of an episode T_o [s]."""
         return self.n_steps * self.dt
 
-    # The system
+    # Dynamics
 
     @abstractmethod
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
@@ -170,7 +170,7 @@ class Plant(nn.Module, ABC):
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
         return read
 
-    # The control problem
+    # Task
 
     def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         """The observation of the policies, scaled to order one, such as tracking errors.
@@ -277,7 +277,7 @@ class Plant(nn.Module, ABC):
         ahead = [preview.shifted(exogenous, self.dt) for preview in self.previews]
         return torch.cat([exogenous, torch.stack(ahead, -1)], -1) if ahead else exogenous
 
-    # Randomness, always from the generator that is passed in
+    # Draws, always from the generator that is passed in
 
     @abstractmethod
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
