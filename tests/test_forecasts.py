@@ -1,11 +1,17 @@
-"""Forecasts of the exogenous inputs: against first-order processes of known decay."""
+"""Forecasts, and control under several futures: known processes, quadratic programs, certainty equivalence."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from linear_quadratic import LinearQuadratic
+from scipy.optimize import lsq_linear
+from test_optimal_control import matrices
 
-from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held
+from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Futures, Held, Scattered
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
 
 NOW = torch.tensor([[3.0, -1.0], [5.0, 2.0]], dtype=torch.float64)
 
@@ -72,3 +78,132 @@ def test_impossible_forecasts_are_refused():
         Decaying(torch.zeros(1).double(), torch.zeros(1).double(), dt=0.5)
     with pytest.raises(ValueError, match="horizon=10"):
         Decaying.fitted(record, dt=0.5, horizon=10.0)
+
+
+PLANT = LinearQuadratic(horizon=2.0, noise=0.5)
+N = 10
+
+
+def scattered(size, pairs=2):
+    """Futures about a held input whose deviations grow with time."""
+    steps = torch.arange(N, dtype=torch.float64)
+    rows = [size * steps / N, size * torch.sin(steps)]
+    deviations = torch.stack(rows[:pairs]).unsqueeze(-1)
+    ends = torch.full((1,), 100.0, dtype=torch.float64)
+    return Scattered(Held(), deviations, -ends, ends)
+
+
+def controller(forecast, **options):
+    config = RecedingHorizonConfig(horizon=N * PLANT.dt, tolerance=0.0, iterations=500, **options)
+    return RecedingHorizon(PLANT, PLANT.closure, config, forecast=forecast)
+
+
+def program(s_0, futures, shared):
+    """The optimal variables of all futures, which share their first commands, as a bounded least-squares problem."""
+    A, B, D, Q, R = matrices(PLANT)
+    root, count = np.linalg.cholesky(Q).T, len(futures)
+    variables = shared + count * (N - shared)
+    rows, rest = [], []
+    for i, z in enumerate(futures):
+        gain, free = np.zeros((2, variables)), s_0.copy()
+        for k in range(N):
+            column = k if k < shared else shared + i * (N - shared) + k - shared
+            rows += [root @ gain, np.sqrt(R[0, 0]) * np.eye(variables)[column : column + 1]]
+            rest += [root @ free, np.zeros(1)]
+            gain, free = A @ gain, A @ free + D[:, 0] * z[k]
+            gain[:, column] += B[:, 0]
+    return lsq_linear(np.concatenate(rows), -np.concatenate(rest), bounds=(-2.0, 2.0), tol=1e-14).x
+
+
+@pytest.mark.parametrize("shared", [1, 3])
+def test_plans_are_those_of_a_quadratic_program(shared):
+    state, now = torch.tensor([[3.0, -1.0], [0.2, 0.1]]).double(), torch.tensor([[0.3], [-0.4]]).double()
+    forecast = scattered(4.0)
+    found = controller(forecast, period=shared * PLANT.dt).plan(0.0, state, now)
+    bounded = 0
+    for episode in range(2):
+        futures = forecast.futures(0.0, now, N)[episode, :, :, 0].numpy()
+        wanted = program(state[episode].numpy(), futures, shared)
+        np.testing.assert_allclose(found[episode, :shared, 0].numpy(), wanted[:shared], atol=2e-4)
+        later = wanted[shared:].reshape(len(futures), -1)
+        np.testing.assert_allclose(found[episode, shared:, 0].numpy(), later.mean(0), atol=2e-4)
+        bounded += (np.abs(wanted) > 2.0 - 1e-9).sum()
+    assert bounded > 0
+
+
+def test_without_bounds_the_first_command_is_that_of_the_forecast_alone():
+    """Certainty equivalence; where commands reach their bounds, it no longer holds."""
+    now = torch.tensor([[0.3]]).double()
+    for position, equal in ((0.1, True), (0.5, False)):
+        state = torch.tensor([[position, 0.0]]).double()
+        alone = controller(Held()).plan(0.0, state, now)[0, 0, 0].item()
+        futures = controller(scattered(1.0 if equal else 20.0)).plan(0.0, state, now)[0, 0, 0].item()
+        assert (abs(alone - futures) < 1e-4) == equal
+
+
+def test_the_rest_of_the_last_plans_goes_on_when_a_solve_is_late():
+    state, exogenous = torch.tensor([[1.0, 0.0]]).double(), torch.zeros(1, 1).double()
+    config = RecedingHorizonConfig(horizon=N * PLANT.dt, period=2 * PLANT.dt, deadline=1e-9)
+    late = RecedingHorizon(PLANT, PLANT.closure, config, forecast=scattered(1.0))
+    first, second = (late.plan(t, state, exogenous) for t in (0.0, 2 * PLANT.dt))
+    assert [solve.late for solve in late.solves] == [False, True]
+    torch.testing.assert_close(second[:, :-2], first[:, 2:])
+
+
+def test_futures_have_the_moments_of_the_errors():
+    """With as many pairs as intervals are forecast, all second moments of the errors on the records."""
+    records = PLANT.draw_exogenous(4, torch.Generator().manual_seed(0)).cumsum(1)
+    decaying = Decaying.fitted(records, dt=PLANT.dt, horizon=0.5)
+    found = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=5)
+    assert isinstance(found, Futures) and not isinstance(decaying, Futures)
+    middle = decaying(0.0, records[:, 3], 6)
+    errors = torch.cat([records[:, k : k + 6] - decaying(0.0, records[:, k], 6) for k in range(records.shape[1] - 5)])
+    moments = (errors[..., 0].T @ errors[..., 0] / len(errors)).numpy()
+    spread = torch.cat([found.deviations, -found.deviations])[..., 0]
+    np.testing.assert_allclose((spread.T @ spread / len(spread)).numpy(), moments, atol=1e-12)
+    found.low, found.high = (torch.full((1,), end).double() for end in (-1e3, 1e3))
+    futures = found.futures(0.0, records[:, 3], 6)
+    assert futures.shape == (4, 10, 6, 1)
+    torch.testing.assert_close(futures.mean(1), middle)
+    torch.testing.assert_close(found(0.0, records[:, 3], 6), middle)
+    torch.testing.assert_close(futures[:, :5] - middle.unsqueeze(1), spread[:5, :, None].expand(4, -1, -1, -1))
+    one = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=1).deviations[0, :, 0].numpy()
+    assert one @ moments @ one / (one @ one) == pytest.approx(np.linalg.eigvalsh(moments)[-1])
+
+
+def test_futures_stay_in_the_range_of_the_records_and_begin_with_what_is_measured():
+    records = PLANT.draw_exogenous(3, torch.Generator().manual_seed(0)).cumsum(1)
+    found = Scattered.fitted(Held(), records, dt=PLANT.dt, horizon=1.0, pairs=2)
+    futures = found.futures(0.0, records.amax().reshape(1, 1), 30)
+    assert futures.amax() == records.amax() and futures.amin() >= records.amin()
+    assert (futures[:, :, 0] == records.amax()).all() and (futures[:, :, 11:] == futures[:, :, 10:11]).all()
+
+
+def test_it_acts_as_a_policy_whose_scatter_is_learned_and_kept():
+    generator = torch.Generator().manual_seed(2)
+    state, exogenous = PLANT.draw_initial_state(2, generator), PLANT.draw_exogenous(2, generator)
+    config = PredictiveConfig(horizon=1.0, forecast="scattered", pairs=2)
+    certain = PredictiveControl(PLANT, PLANT.closure, PredictiveConfig(horizon=1.0, forecast="held"))
+    policy, again = (PredictiveControl(PLANT, PLANT.closure, config) for _ in range(2))
+    held = certain.fly(state, exogenous).actions
+    torch.testing.assert_close(policy.fly(state, exogenous).actions, held, rtol=1e-2, atol=1e-2)  # nothing is met yet
+    records = PLANT.draw_exogenous(9, generator).cumsum(1)
+    policy.learn(records[:, :6])  # shorter than the window
+    assert policy.deviations.shape == (2, 10, 1) and (policy.deviations[:, 5:] == policy.deviations[:, 5:6]).all()
+    policy.learn(records)
+    fitted = Decaying.fitted(records, dt=PLANT.dt, horizon=1.0)
+    scatter = Scattered.fitted(fitted, records, dt=PLANT.dt, horizon=1.0, pairs=2)
+    assert torch.equal(policy.deviations, scatter.deviations[:, :10])
+    assert torch.equal(policy.low, records.amin((0, 1))) and torch.equal(policy.high, records.amax((0, 1)))
+    again.load_state_dict(policy.state_dict())
+    assert torch.equal(again.fly(state, exogenous).actions, policy.fly(state, exogenous).actions)
+
+
+@pytest.mark.parametrize("pairs", [0, 11])
+def test_impossible_numbers_of_futures_are_refused(pairs):
+    records = PLANT.draw_exogenous(3, torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=f"pairs={pairs}"):
+        Scattered.fitted(Held(), records, dt=PLANT.dt, horizon=1.0, pairs=pairs)
+    if not pairs:
+        with pytest.raises(ValueError, match="pairs=0"):
+            PredictiveConfig(pairs=pairs)
