@@ -51,7 +51,7 @@ class Config:
         jax: jax_scan for one scan that JAX differentiates, jax_sweep for a reverse sweep by hand; both need the extra
             bench.
         casadi: casadi_scalar for C code of one realisation after another, casadi_lanes for the same code with vectors
-            over realisations; both are written for the drone with its law, and need the extra mpc and g++.
+            over realisations; both are written for the drone with its law, and need the extra bench and g++.
         compiled: compile the engines.
         eager: engines that are not compiled all the same, such as odeint_adjoint as torchdiffeq ships it.
         repeats: greatest number of turns behind a median, each of calls for a tenth of a second, at least one.

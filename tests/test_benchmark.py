@@ -83,7 +83,7 @@ def test_jax_takes_part(tmp_path):
 )
 def test_casadi_and_torch_agree(policy, method):
     """The equations by hand in CasADi, and its derivative, with a number of realisations that fills no vector."""
-    pytest.importorskip("casadi", reason="the drone in CasADi needs the extra mpc")
+    pytest.importorskip("casadi", reason="the drone in CasADi needs the extra bench")
     if shutil.which("g++") is None:
         pytest.skip("CasADi's code needs g++")
     from benchmarking.casadi_code import CasadiCode
@@ -99,7 +99,7 @@ def test_casadi_and_torch_agree(policy, method):
 
 
 def test_casadi_knows_the_drone_with_its_law_alone():
-    pytest.importorskip("casadi", reason="the drone in CasADi needs the extra mpc")
+    pytest.importorskip("casadi", reason="the drone in CasADi needs the extra bench")
     for case in (Case("wind_turbine"), Case("flapping_wing", closure="mlp")):
         assert "only the drone with its law" in NOTHING.refusal("casadi_scalar", system_of(case))
 
@@ -108,7 +108,7 @@ def test_jax_that_is_not_installed_is_left_out(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     system = system_of(Case("wind_turbine"))
     assert "install the extra bench" in NOTHING.refusal("jax_scan", system)
-    assert "install the extra mpc" in NOTHING.refusal("casadi_lanes", system)
+    assert "install the extra bench" in NOTHING.refusal("casadi_lanes", system)
     assert NOTHING.refusal("parallel", system) is None
 
 

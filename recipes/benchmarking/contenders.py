@@ -143,7 +143,7 @@ class _Casadi:
 def _refusal_of_casadi(system: System) -> str | None:
     """The reason why CasADi cannot compute a system; None if it can."""
     if importlib.util.find_spec("casadi") is None:
-        return "casadi is not installed; install the extra mpc."
+        return "casadi is not installed; install the extra bench."
     if shutil.which("g++") is None:
         return "there is no g++ to compile CasADi's code."
     if (system.case.plant, system.case.closure) != ("flapping_wing", "law"):
