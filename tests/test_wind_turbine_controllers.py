@@ -59,8 +59,8 @@ def tensor(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def nominal(plant, **options):
-    return GainScheduled(plant, detuning=0.0, generator=generator(), **options)
+def nominal(plant):
+    return GainScheduled(plant, detuning=0.0, generator=generator())
 
 
 def observed(plant, omega, beta, rate=0.0):
@@ -122,7 +122,9 @@ def test_instruments_change_nothing_of_the_turbine():
 def test_with_jonkmans_constants_it_flies_as_his_controller():
     plant = WindTurbine(observe=("scheduled",))
     state, wind = plant.draw_initial_state(4, generator(5)), plant.draw_exogenous(4, generator(5))
-    flown = Rollout(plant, plant.closure, nominal(plant, reference_speed=122.9096, switch_speed=120.0))(state, wind)
+    policy = nominal(plant)
+    policy.reference_speed, policy.switch_speed = JonkmanController.reference_speed, 120.0
+    flown = Rollout(plant, plant.closure, policy)(state, wind)
     power, expected = (
         plant.merit(f.states, f.actions, wind)["mean power [MW]"]
         for f in (flown, JonkmanController(plant).fly(state, wind))

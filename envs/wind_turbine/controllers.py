@@ -114,15 +114,10 @@ class GainScheduled(nn.Module):
         plant: a turbine whose policies observe speed above rated, speed rate and pitch, as by
             ``observe=("scheduled",)``; other observations are ignored. It gives scales, ranges and control interval.
         detuning: width of the draw of the first gains, exp(U(−detuning, detuning)) times the nominal gains.
-        reference_speed: reference speed ω_ref of the pitch law [rad/s].
-        switch_speed: speed ω_s at which the torque leaves region 2 [rad/s].
-        switch_width: width w_s of that transition [rad/s].
-        switch_pitch: factor c, which keeps region 3 while the blades are pitched [rad/s per deg].
         generator: source of the detuning.
 
     Raises:
-        ValueError: if the detuning is negative, the width of the transition is not positive, or the plant does not
-            observe the signals.
+        ValueError: if the detuning is negative, or the plant does not observe the signals.
 
     Source: the regions and constants of Jonkman et al., NREL/TP-500-38060, section 7.
     """
@@ -135,26 +130,19 @@ class GainScheduled(nn.Module):
         "schedule": math.degrees(JonkmanController.schedule_pitch),  # β_K [deg]
     }
 
+    reference_speed = 124.5  # ω_ref of the pitch law [rad/s]
+    switch_speed = 118.5  # ω_s, at which the torque leaves region 2 [rad/s]
+    switch_width = 1.0  # w_s of that transition [rad/s], about that of Jonkman's table
+    switch_pitch = 1.0  # c, which keeps region 3 while the blades are pitched [rad/s per deg]
+
     nominal: Tensor
     low: Tensor
     high: Tensor
 
-    def __init__(
-        self,
-        plant: WindTurbine,
-        *,
-        detuning: float = math.log(2.0),
-        reference_speed: float = 124.5,
-        switch_speed: float = 118.5,
-        switch_width: float = 1.0,
-        switch_pitch: float = 1.0,
-        generator: torch.Generator,
-    ):
+    def __init__(self, plant: WindTurbine, *, detuning: float = math.log(2.0), generator: torch.Generator):
         super().__init__()
         if not detuning >= 0.0:
             raise ValueError(f"detuning={detuning} of the gains must not be negative.")
-        if not switch_width > 0.0:
-            raise ValueError(f"switch_width={switch_width} rad/s must be positive; Jonkman's table takes about 1.")
         names = [signal.name for signal in plant.observations]
         if not set(self.SEES) <= set(names):
             raise ValueError(
@@ -169,8 +157,6 @@ class GainScheduled(nn.Module):
         low, high = bounds(plant.actions)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
-        self.reference_speed, self.switch_speed = reference_speed, switch_speed
-        self.switch_width, self.switch_pitch = switch_width, switch_pitch
         self.dt = plant.dt
         self.rated_speed, self.speed_scale = plant.rated_generator_speed, plant.speed_error_scale
         self.power = plant.actions[0].high * plant.rated_generator_speed
