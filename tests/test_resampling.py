@@ -9,9 +9,10 @@ import torch
 from test_sensor_log import PLANT, jittered, signals
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit import resampling
 from rt_torchrl.fit.log import SensorLog, checked
-from rt_torchrl.fit.resampling import hold_means, hold_out, resample
+from rt_torchrl.fit.resampling import hidden_states, hold_means, hold_out, resample
 
 
 def test_instantaneous_signals_are_interpolated():
@@ -125,3 +126,14 @@ def test_a_slow_log_is_still_taken():
     """Twenty control intervals between rows are what a slow sensor gives."""
     (segment,) = resample(signals(2.0 * np.arange(20)), PLANT).segments
     assert len(segment.actions) == 380
+
+
+def test_previews_follow_from_the_input_and_need_no_column():
+    plant = WindTurbine(horizon=20.0, observe=("preview",))
+    wind, rows = 8.0 + 0.1 * np.arange(41), {"generator_torque": 2e4, "blade_pitch": 0.0, "rotor_speed": 1.0}
+    columns = {name: np.full(41, value) for name, value in rows.items()} | {"wind_speed": wind}
+    log = checked(SensorLog(times=plant.dt * np.arange(41), columns=columns), plant)
+    (segment,) = resample(log, plant).segments
+    ahead = round(2.0 / plant.dt)
+    np.testing.assert_allclose(segment.exogenous[:-ahead, 1], segment.exogenous[ahead:, 0])
+    assert hidden_states(plant, log) == []
