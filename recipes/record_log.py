@@ -200,7 +200,7 @@ def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, 
     errors = torch.randn(len(rows), n_s, generator=generator, dtype=torch.float64, device=generator.device)
     values = torch.cat([rows[:, :n_s] * (1.0 + noise * errors), rows[:, n_s:]], -1).cpu().numpy()
     own = {signal.name for signal in logged_states(plant)}
-    signals = (*plant.states, *plant.actions, *plant.inputs)
+    signals = (*plant.states, *plant.actions, *plant.acting_inputs)
     chosen = {s.name: k for k, s in enumerate(signals) if k >= n_s or s.name in own}
     columns = {name: np.ascontiguousarray(signals[k].wrapped(values[:, k])) for name, k in chosen.items()}
     return SensorLog(times=times.cpu().numpy(), columns=columns)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
-from test_segments import assimilation, flight
+from test_assimilation import flight, of_segments
 
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
@@ -66,5 +66,5 @@ def test_drag_at_zero_angle_is_not_lost_on_the_way():
     (record,) = TrimmedPD(plant).fly(state, exogenous).each()
     for first in ((1.159, 0.0530, 2.100), (1.461, 0.0232, 1.610), (2.188, 0.0296, 0.816)):
         closure = QuasiSteadyPolar(torch.tensor(first, dtype=torch.float64))
-        assimilation(plant, closure, method="levenberg_marquardt", iterations=40).update([record], [], 1, generator)
+        of_segments(plant, closure, method="levenberg_marquardt", iterations=40).update([record], [], 1, generator)
         torch.testing.assert_close(closure.coefficients, plant.closure.coefficients, rtol=0.01, atol=0.0)

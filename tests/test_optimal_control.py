@@ -16,7 +16,7 @@ from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
-from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import constant
 

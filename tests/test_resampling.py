@@ -1,17 +1,42 @@
-"""Resampling of a log to control intervals, against closed-form signals."""
+"""Logs at control intervals: resampling against closed forms, states without a sensor, samples that are missing."""
 
+import importlib.util
+import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from test_sensor_log import PLANT, jittered, signals
+from hidden_wall import Room, room_records
+from linear_quadratic import LinearClosure, LinearQuadratic
+from test_log import PLANT, jittered, signals
 
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.pendulum.plant import Pendulum
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.fit import resampling
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, autocorrelation
 from rt_torchrl.fit.log import SensorLog, checked
-from rt_torchrl.fit.resampling import hold_means, hold_out, resample
+from rt_torchrl.fit.resampling import (
+    filled,
+    hidden_states,
+    hold_means,
+    hold_out,
+    initial_spread,
+    logged_readings,
+    resample,
+    sensors_in,
+)
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.hypotheses.reread import reread
+
+pd = pytest.importorskip("pandas")
 
 
 def test_instantaneous_signals_are_interpolated():
@@ -125,3 +150,210 @@ def test_a_slow_log_is_still_taken():
     """Twenty control intervals between rows are what a slow sensor gives."""
     (segment,) = resample(signals(2.0 * np.arange(20)), PLANT).segments
     assert len(segment.actions) == 380
+
+
+def test_previews_follow_from_the_input_and_need_no_column():
+    plant = WindTurbine(horizon=20.0, observe=("preview",))
+    wind, rows = 8.0 + 0.1 * np.arange(41), {"generator_torque": 2e4, "blade_pitch": 0.0, "rotor_speed": 1.0}
+    columns = {name: np.full(41, value) for name, value in rows.items()} | {"wind_speed": wind}
+    log = checked(SensorLog(times=plant.dt * np.arange(41), columns=columns), plant)
+    (segment,) = resample(log, plant).segments
+    ahead = round(2.0 / plant.dt)
+    np.testing.assert_allclose(segment.exogenous[:-ahead, 1], segment.exogenous[ahead:, 0])
+    assert hidden_states(plant, log) == []
+
+
+TESTS = Path(__file__).parent
+
+
+def log_of(plant, states, rows=40):
+    """A log with constants for the drive and a ramp for each of these states."""
+    driven = {signal.name: np.full(rows, max(signal.low, 1.0)) for signal in (*plant.actions, *plant.inputs)}
+    ramps = {name: np.linspace(1.0, 1.2, rows) for name in states}
+    return SensorLog(times=plant.dt * np.arange(rows), columns=driven | ramps)
+
+
+@pytest.mark.parametrize(
+    "kind, states, hidden, unknown",
+    [
+        (WindTurbine, ["rotor_speed"], [], ["rotor_speed"]),
+        (FlappingWing, ["forward_position", "height"], ["forward_speed", "climb_speed"], None),
+        (CryogenicTank, ["pressure"], ["wall_temperature", "liquid_volume"], None),
+    ],
+)
+def test_hidden_states_are_those_that_the_plant_cannot_complete(kind, states, hidden, unknown):
+    plant = kind()
+    log = log_of(plant, states)
+    assert hidden_states(plant, log) == hidden
+    free = [state.name for state, s in zip(plant.states, initial_spread(plant, log), strict=True) if s > 0.0]
+    assert sorted(free) == sorted(unknown or [*states, *hidden])
+
+
+def test_the_drones_last_angle_is_that_of_the_record():
+    plant = FlappingWing(stroke_plane_rate=3000.0)
+    log = log_of(plant, ["forward_position", "height"])
+    assert hidden_states(plant, log) == ["forward_speed", "climb_speed"] and initial_spread(plant, log)[4] == 0.0
+
+
+def test_samples_between_rows_that_are_too_far_apart_are_missing():
+    plant = Room()
+    log = log_of(plant, ["air"], rows=30)
+    times = log.times + np.where(np.arange(30) % 2 == 1, 60.0, 0.0)
+    air = 20.0 + 1e-3 * times
+    air[10:14] = np.nan  # rows 9 and 14: 1 440 s and more
+    log = checked(SensorLog(times=times, columns=log.columns | {"air": air}), plant, missing=True)
+    whole = filled(log, plant, {"wall": 11.0})
+    parts = resample(whole, plant)
+    record = logged_readings(log, plant, sensors_in(plant, log), parts.segments[0], parts.gap)
+    expected = 20.0 + 1e-3 * plant.dt * np.arange(len(record.readings))
+    seen = record.seen[:, 0].numpy()
+    assert np.flatnonzero(~seen).tolist() == [10, 11, 12, 13]
+    np.testing.assert_allclose(record.readings[:, 0].numpy()[seen], expected[seen], rtol=1e-12)
+    assert record.guess.tolist() == [20.0, 11.0] and len(record.actions) == 29
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda log, plant: filled(log, plant, {"air": 3.0}), "guess air=3.0: .* wall"),
+        (lambda log, plant: filled(log, plant, {"wall": math.inf}), "guess wall=inf"),
+        (lambda log, plant: sensors_in(plant, log, ["wall"]), r"sensors=\('wall',\): the log has no column wall"),
+        (lambda log, plant: sensors_in(plant, log.without(["air"])), "nothing cannot be measured"),
+    ],
+)
+def test_what_does_not_fit_a_log_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        change(log_of(Room(), ["air"]), Room())
+
+
+def test_missing_values_of_the_drive_are_refused():
+    log = log_of(Room(), ["air"])
+    log.columns["heater"][3] = np.nan
+    with pytest.raises(ValueError, match="heater is nan W in row 3"):
+        checked(log, Room(), missing=True)
+
+
+@pytest.fixture
+def room_log(tmp_path):
+    """The first record of the room as a file, and the class of the room beside it."""
+    _, _, (record, _) = room_records()
+    rows = {"time": 300.0 * np.arange(200), "air": record.readings[:200, 0]}
+    rows |= {"heater": record.actions[:, 0], "outside": record.exogenous[:, 0]}
+    pd.DataFrame(rows).to_csv(tmp_path / "log.csv", index=False)
+    text = (TESTS / "hidden_wall.py").read_text()
+    made = "    def make_closure(self, generator):\n        return Envelope(torch.tensor([30.0, 150.0, 8.0]))\n\n"
+    text = text.replace(
+        "    observe = running_cost = draw_exogenous = make_closure = None", made + "    observe = None"
+    )
+    held = "    def running_cost(self): ...\n    def draw_exogenous(self): ...\n    def observe(self): ...\n"
+    (tmp_path / "own_room.py").write_text(text.replace("    observe = None", held))
+    return tmp_path
+
+
+def identify_recipe():
+    spec = importlib.util.spec_from_file_location("recipe_identify", TESTS.parent / "recipes" / "identify.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_room_is_identified_from_a_file(room_log, capsys):
+    identify = identify_recipe()
+    given = {"log": room_log / "log.csv", "plant": f"{room_log}/own_room.py:Room", "log_dir": room_log / "results"}
+    with pytest.raises(ValueError, match="--missing keeps the row"):
+        identify.main(identify.Config(**given))
+    identify.main(identify.Config(**given, missing=True, guess=("wall=20",)))
+    metrics = json.loads((room_log / "results" / "metrics.json").read_text())
+    weights = metrics["weights"]
+    for name, true in (("to_wall", 60.0), ("outdoors", 90.0), ("capacity", 4.0)):
+        entry = weights[name]
+        assert abs(entry["after"] - true) < 4.0 * entry["standard_error"] < 0.2 * true
+        assert entry["interval"][0] < entry["after"] < entry["interval"][1]
+    assert metrics["held_out"]["rms"]["air"]["after"] == pytest.approx(0.05, rel=0.4)  # 50 samples
+    assert 0.0 < metrics["initial_states"][0]["wall"][1] < 1.0
+    assert {path.name for path in (room_log / "results/figures").iterdir()} == {
+        f"{name}.png" for name in ("twin_and_log", "weights", "correlations")
+    }
+    shown = capsys.readouterr().out
+    assert "noise of the sensors: air 0.0" in shown and "to_wall" in shown
+    torch.load(room_log / "results" / "weights.pt", weights_only=True)
+    with pytest.raises(ValueError, match="guess='wall' is not understood"):
+        identify.main(identify.Config(**given, missing=True, guess=("wall",)))
+
+
+def slow_log(seed=1, rows=240, noise=0.01):
+    """The oscillator of the oracle at every tenth control instant, with a force held from row to row, and noise."""
+    plant, generator = LinearQuadratic(horizon=1.0 * rows), torch.Generator().manual_seed(seed)
+    force = torch.rand(1, rows, 1, generator=generator, dtype=torch.float64).round().repeat_interleave(10, 1) - 0.5
+    start = plant.draw_initial_state(1, generator)
+    with torch.no_grad():
+        states = Rollout(plant, plant.closure)(start, torch.zeros_like(force), force).states[0, :-1:10]
+    states = (states + noise * torch.randn(states.shape, generator=generator, dtype=torch.float64)).numpy()
+    columns = {"position": states[:, 0], "velocity": states[:, 1], "force": force[0, ::10, 0].numpy()}
+    log = SensorLog(times=1.0 * np.arange(rows), columns=columns | {"disturbance": np.zeros(rows)})
+    return plant, log
+
+
+def test_what_lies_between_the_rows_of_a_slow_log_is_no_measurement():
+    plant, log = slow_log()
+    parts, sensors = resample(log, plant), sensors_in(plant, log)
+    record = logged_readings(log, plant, sensors, parts.segments[0], parts.gap)
+    assert np.flatnonzero(record.seen.all(-1)).tolist() == list(range(0, 2391, 10))
+    assert int(record.seen.sum()) == 2 * 240
+    closure = LinearClosure(torch.zeros(2, 2))
+    config = EstimationConfig(errors="robust")
+    found = Estimation(DigitalTwin(plant, closure), sensors, config=config).run([record])
+    errors = found.uncertainty.standard_errors()
+    for (name, value), true in zip(found.after.items(), np.ravel(plant.true_closure), strict=True):
+        assert abs(value - true) < 4.0 * errors[name] < 0.05
+    assert list(found.noise.values()) == pytest.approx([0.01, 0.01], rel=0.2)
+    # White noise correlates by 1/√240 = 0.065 from row to row.
+    assert autocorrelation(found.likelihood).abs().max() < 0.25
+
+
+@pytest.mark.parametrize("options", [{"method": "levenberg_marquardt"}, {"descent": DescentConfig(optimiser="lbfgs")}])
+def test_a_training_that_begins_with_a_slow_log_compares_its_rows_alone(options):
+    """Without noise the true weights are found; an interpolated sample of the oscillator is off by up to 1/8 of it."""
+    plant, log = slow_log(rows=60, noise=0.0)
+    (record,) = resample(log, plant).segments
+    assert record.seen.nonzero().flatten().tolist() == list(range(0, 591, 10))
+    closure = LinearClosure(torch.zeros(2, 2))
+    config = AssimilationConfig(iterations=200, inputs="record", **options)
+    found = Assimilation(DigitalTwin(plant, closure), config).update([record], [], 1, torch.Generator())
+    assert found.best < 1e-8 * found.start
+    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-3)
+    short = reread(record, plant, 12).exogenous[:, -1]
+    assert short.nonzero().flatten().tolist() == [0, *(10 * math.ceil(k * 1.2) for k in range(1, 49))]
+
+
+def test_errors_of_a_slow_log_are_those_of_its_rows():
+    """Neighbours of which each is the mean of two noises: as many rows in between without a sample change nothing."""
+    plant, log = slow_log()
+    smooth = 0.01 * np.convolve(np.random.default_rng(0).normal(size=241), [1.0, 1.0], "valid")
+    log.columns["position"] += smooth - smooth[0]
+    found = []
+    for every in (10, 5):  # control intervals between rows
+        own = LinearQuadratic(dt=1.0 / every, horizon=240.0)
+        parts, sensors = resample(log, own), sensors_in(own, log, ["position"])
+        record = logged_readings(log, own, sensors, parts.segments[0], parts.gap)
+        closure = LinearClosure(torch.tensor(own.true_closure))
+        closure.matrix.requires_grad_(True)
+        config = EstimationConfig(errors="robust")
+        estimate = Estimation(DigitalTwin(own, closure), sensors, config=config).run([record])
+        found.append([estimate.uncertainty.covariance.diagonal()[-2:].sqrt(), autocorrelation(estimate.likelihood)])
+    # The two grids integrate the same system, to fourth order.
+    torch.testing.assert_close(found[0], found[1], rtol=0.02, atol=0)
+    assert 0.25 < found[0][1].item() < 0.6  # half, of the part of the noise that is smooth
+
+
+def test_samples_are_not_interpolated_across_rows_that_were_left_out():
+    """The air lacks its sample before the cut, so that only rows on both sides of the cut are around it."""
+    plant = Room()
+    log = log_of(plant, ["air"], rows=40)
+    log.columns["air"][19] = np.nan
+    log = log.chosen(np.arange(40) != 20)
+    parts = resample(filled(log, plant), plant)
+    records = [logged_readings(log, plant, sensors_in(plant, log), part, 1e9) for part in parts.segments]
+    assert [len(record.readings) for record in records] == [20, 19]
+    assert "gap from 5700 to 6300 s of rows left out" in identify_recipe().report_of_parts(parts, plant, rows=39)
+    assert records[0].readings[:, 0].isnan().nonzero().flatten().tolist() == [19] and records[1].seen.all()

@@ -109,6 +109,47 @@ def multi_start(
     return found
 
 
+R = TypeVar("R")
+
+
+def over_segments(closure: nn.Module, intervals: int, fit: Callable[[int], tuple[R, Tensor]], enough: Tensor) -> R:
+    """Fit whole records, or the longest segments that the twin follows as well as shorter ones; its weights stay.
+
+    Where the errors over whole records are not small enough, segments of a third of them are fitted from the same
+    weights, then of a ninth, and so on.
+
+    Args:
+        closure: closure with the weights.
+        intervals: number of control intervals of the longest record.
+        fit: function of the number of control intervals of a segment, or 0 for whole records, that moves the weights
+            and returns the result and its RMS errors.
+        enough: RMS errors that are small enough.
+
+    Raises:
+        FloatingPointError: if every fit diverges.
+    """
+    start = copy.deepcopy(closure.state_dict())
+    results, errors, weights, length = list[R](), list[Tensor](), list[dict[str, Tensor]](), 0
+    diverged: FloatingPointError | None = None
+    while length != 1 and not (errors and (errors[-1] <= enough).all()):
+        closure.load_state_dict(start)
+        try:
+            result, error = fit(length)
+        except FloatingPointError as failed:
+            diverged = diverged or failed
+        else:
+            results.append(result)
+            errors.append(error)
+            weights.append(copy.deepcopy(closure.state_dict()))
+        length = max((length or intervals) // SHORTENED, 1)
+    if diverged is not None and not results:
+        raise diverged
+    least = torch.stack(errors).amin(0)
+    best = next(k for k, error in enumerate(errors) if (error <= APART * least).all())
+    closure.load_state_dict(weights[best])
+    return results[best]
+
+
 @torch.no_grad()
 def move(closure: nn.Module, generator: torch.Generator) -> None:
     """Move the weights at random, each by a normal number of some units; a unit is a factor of e for a logarithm."""
@@ -202,12 +243,11 @@ class Estimate(NamedTuple):
 
 
 class _Minimum(NamedTuple):
-    """A likelihood at its minimum, its cost, the number of trial steps, and the weights there."""
+    """A likelihood at its minimum, its cost, the number of trial steps, and the length of its segments."""
 
     likelihood: Likelihood
     best: float
     iterations: int
-    weights: dict[str, Tensor] = {}
     segment: int = 0
 
 
@@ -300,34 +340,25 @@ class Estimation:
             iterations += self._descended(found.likelihood).iterations
             if rest:
                 break
-        weights = copy.deepcopy(closure.state_dict())
-        return found._replace(iterations=iterations, weights=weights, segment=length)
+        return found._replace(iterations=iterations, segment=length)
 
     def _longest(self, records: Sequence[SensorRecord], belief: BeliefPrior | None) -> _Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
-        closure, scatter = self.twin.closure, scatter_of(self.sensors, records)
-        start, tried, errors = copy.deepcopy(closure.state_dict()), list[_Minimum](), list[Tensor]()
+        scatter = scatter_of(self.sensors, records)
         given = scatter.new_tensor([APART * (sensor.noise or 0.0) for sensor in self.sensors])
+        lengths, done = [len(record.actions) for record in records], 0
+        free, samples = int((self.spread > 0.0).sum()), sum(int(record.seen.sum()) for record in records)
+
+        def fit(length: int) -> tuple[_Minimum, Tensor]:
+            nonlocal done
+            if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
+                raise FloatingPointError(f"segments of {length} control intervals have too many first states")
+            found = self._minimum(records, belief, length)
+            done += found.iterations
+            return found, judged(found.likelihood).rms
+
         enough = torch.maximum(EXPLAINED * scatter, given)
-        free, length = int((self.spread > 0.0).sum()), 0
-        diverged: FloatingPointError | None = None
-        most = min(MOST_UNKNOWNS, sum(int(record.seen.sum()) for record in records) // 2)
-        while not errors or not (errors[-1] <= enough).all():
-            closure.load_state_dict(start)
-            try:
-                tried.append(self._minimum(records, belief, length))
-                errors.append(judged(tried[-1].likelihood).rms)
-            except FloatingPointError as error:
-                diverged = diverged or error
-            length = (length or max(len(record.actions) for record in records)) // SHORTENED
-            if length < 2 or free * sum(-(-len(record.actions) // length) for record in records) > most:
-                break
-        if diverged is not None and not tried:
-            raise diverged
-        least = torch.stack(errors).amin(0)
-        found = next(fit for fit, error in zip(tried, errors, strict=True) if (error <= APART * least).all())
-        closure.load_state_dict(found.weights)
-        return found._replace(iterations=sum(fit.iterations for fit in tried))
+        return over_segments(self.twin.closure, max(lengths), fit, enough)._replace(iterations=done)
 
     def likelihood(
         self,

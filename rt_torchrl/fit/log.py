@@ -183,11 +183,14 @@ def logged_states(plant: Plant | type[Plant]) -> tuple[Signal, ...]:
 
 
 def logged_signals(plant: Plant) -> tuple[Signal, ...]:
-    """Signals that a log of this plant can hold: its states and measurements, actions and exogenous inputs."""
+    """Signals that a log of this plant can hold: its states and measurements, actions and exogenous inputs.
+
+    Previews of an input are computed from it, and need no column.
+    """
     states = logged_states(plant)
     names = {state.name for state in states}
     others = tuple(one.measurement.signal for name, one in known_sensors(plant).items() if name not in names)
-    return (*states, *plant.actions, *plant.inputs, *others)
+    return (*states, *plant.actions, *plant.acting_inputs, *others)
 
 
 def read_log(path: Path, plant: Plant, columns: Sequence[Column] = ()) -> SensorLog:
@@ -250,14 +253,14 @@ def checked(log: SensorLog, plant: Plant, *, drop: bool = False, missing: bool =
     Raises:
         ValueError: if an action or input has no column; without ``drop`` also if a value is missing or out of range.
     """
-    absent = [signal.name for signal in (*plant.actions, *plant.inputs) if signal.name not in log.columns]
+    driven = {signal.name for signal in (*plant.actions, *plant.acting_inputs)}
+    absent = [signal.name for signal in (*plant.actions, *plant.acting_inputs) if signal.name not in log.columns]
     if absent:
         raise ValueError(
             f"log of plant {plant.name!r} has no column {', '.join(absent)}; it has {', '.join(log.columns)}. Actions "
             "and inputs drive the twin, so each is needed: log it, or name its column, such as --columns "
             f"HEADER={absent[0]}."
         )
-    driven = {signal.name for signal in (*plant.actions, *plant.inputs)}
     good = np.ones(len(log.times), dtype=bool)
     for signal in logged_signals(plant):
         if signal.name not in log.columns:

@@ -156,7 +156,7 @@ def _segment(log: SensorLog, rows: slice, steps: int, plant: Plant) -> Trajector
             values[:, k] = hold_means(times, log.columns[signal.name][rows], grid)
         return torch.from_numpy(values)
 
-    actions, exogenous = held(plant.actions), held(plant.inputs)
+    actions, exogenous = held(plant.actions), plant.with_previews(held(plant.acting_inputs)[None])[0]
     measured = {
         state.name: torch.from_numpy(_interpolated(state, times, log.columns[state.name][rows], grid))
         for state in logged_states(plant)
@@ -191,12 +191,12 @@ def _completes(plant: Plant, log: SensorLog, given: list[str]) -> bool:
     names = [state.name for state in logged_states(plant) if state.name in log.columns]
     like = torch.zeros(2, dtype=torch.float64)
     values = {name: like + float(np.nanmean(log.columns[name])) for name in names} | dict.fromkeys(given, like)
-    drive = [
+    inputs, actions = (
         torch.tensor([[float(np.nanmean(log.columns[signal.name])) for signal in signals]], dtype=torch.float64)
-        for signals in (plant.inputs, plant.actions)
-    ]
+        for signals in (plant.acting_inputs, plant.actions)
+    )
     try:
-        plant.complete_states(values, *(x.reshape(1, -1) for x in drive))
+        plant.complete_states(values, plant.with_previews(inputs[None])[0], actions)
     except ValueError:
         return False
     return True

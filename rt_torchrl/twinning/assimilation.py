@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rt_torchrl.fit.least_squares import APART, EXPLAINED, NOISE_TOLERANCE, SHORTENED, Estimation, multi_start
+from rt_torchrl.fit.least_squares import EXPLAINED, NOISE_TOLERANCE, Estimation, multi_start, over_segments
 from rt_torchrl.fit.likelihood import Likelihood
 from rt_torchrl.fit.prior import WeightPrior
 from rt_torchrl.fit.record import SensorRecord, sensor_records
@@ -189,33 +189,24 @@ class Assimilation:
             sampled = torch.cat([process.sample(count, generator) for process in processes])
             rows = torch.arange(len(whole.states), device=sampled.device).repeat_interleave(count)
             whole = whole.rows(rows)._replace(exogenous=self.twin.plant.with_previews(sampled))
-        if self.config.segment is None:
-            return self._descend_as_far_as_it_follows(whole)
+        if self.config.segment is None and self.config.iterations:
+            return self._over_segments(whole)
         if not self.config.segment:
             return self._descend_anew(whole)
         before = self.cost_of(whole)
         found = self._descend_anew(whole.segments(min(self.config.segment, whole.actions.shape[1]), self.twin.plant.dt))
         return found._replace(start=before, best=self.cost_of(whole))
 
-    def _descend_as_far_as_it_follows(self, whole: Trajectory) -> Descended:
+    def _over_segments(self, whole: Trajectory) -> Descended:
         """Descend over whole records, or over the longest segments that the twin follows as well as shorter ones."""
-        closure, plant, length = self.twin.closure, self.twin.plant, whole.actions.shape[1]
-        start, centred = copy.deepcopy(closure.state_dict()), whole.states.mean(1, keepdim=True)
-        scatter = plant.discrepancy(whole.states, centred).mean().item()
-        replayed, tried = whole, list[tuple[Descended, float, dict[str, Tensor]]]()
-        while True:
-            found = self._descend_anew(replayed)
-            error = found.best / (replayed.actions.shape[1] * plant.dt)
-            tried.append((found, error, copy.deepcopy(closure.state_dict())))
-            length //= SHORTENED
-            if math.isnan(error) or error <= EXPLAINED**2 * scatter or length < 2:
-                break
-            closure.load_state_dict(start)
-            replayed = whole.segments(length, plant.dt)
-        least = min(error for _, error, _ in tried)
-        found, _, weights = next((one for one in tried if one[1] <= APART**2 * least), tried[0])
-        closure.load_state_dict(weights)
-        return found
+        plant, intervals = self.twin.plant, whole.actions.shape[1]
+        scatter = plant.discrepancy(whole.states, whole.states.mean(1, keepdim=True)).mean()
+
+        def fit(length: int) -> tuple[Descended, Tensor]:
+            found = self._descend_anew(whole.segments(length, plant.dt) if length else whole)
+            return found, torch.tensor(found.best / (plant.dt * (length or intervals)), dtype=torch.float64).sqrt()
+
+        return over_segments(self.twin.closure, intervals, fit, EXPLAINED * scatter.sqrt().cpu())
 
     def _descend_anew(self, replayed: Trajectory) -> Descended:
         """Descend from the present closure, or from the first one if the twin diverges under the present one.

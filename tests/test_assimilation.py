@@ -1,0 +1,450 @@
+"""Step 4: first states as unknowns, records replayed in segments, and fits to some sensors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearQuadratic
+from straight_line import Line, Slope, flown, line_segment, noise_of
+from torch import nn
+
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.fit.least_squares import Estimation, EstimationConfig, usual_sizes
+from rt_torchrl.fit.prior import BeliefPrior
+from rt_torchrl.fit.record import chained, sensor_record
+from rt_torchrl.fit.sensors import sensors_of, state_sensors
+from rt_torchrl.plants.closures import BoundedPerceptron
+from rt_torchrl.runs.command_line import from_command_line, load_recipe
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.trajectories.sensitivity import Sensitivities
+from rt_torchrl.trajectories.trajectory import Trajectory, identification_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
+from rt_torchrl.twinning.config import TwinningConfig
+from rt_torchrl.twinning.exogenous import ExogenousProcess
+from rt_torchrl.twinning.hypotheses.choice import make_assimilation, make_twin
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+from rt_torchrl.twinning.sensor_assimilation import FirstStates, SensorAssimilation
+
+WINDS = (1.0, -2.0)
+
+
+def assimilation(plant, closure, **options):
+    options = {"inputs": "record", "method": "levenberg_marquardt", "initial": "estimated", "iterations": 30, **options}
+    return Assimilation(DigitalTwin(plant, closure), AssimilationConfig(**options))
+
+
+def lines():
+    """Two noisy records of a line, each with its own start and wind."""
+    times = 0.1 * np.arange(101)
+    return [line_segment(3.0 + (0.4 + 0.2 * z) * times + noise_of(101, k), wind=z) for k, z in enumerate(WINDS)]
+
+
+def test_weights_are_those_of_a_regression_with_a_start_for_each_record():
+    records, closure = lines(), Slope()
+    found = assimilation(Line(), closure).update(records, [], 1, torch.Generator())
+    times, X, y = 0.1 * np.arange(101), np.zeros((202, 4)), np.concatenate([r.states[:, 0].numpy() for r in records])
+    for k, z in enumerate(WINDS):
+        rows = slice(101 * k, 101 * (k + 1))
+        X[rows, k], X[rows, 2], X[rows, 3] = 1.0, times, z * times
+    solution, residual, *_ = np.linalg.lstsq(X, y, rcond=None)
+    # The loop ends where J_p can fall by 1e-8 of it: 1e-4 of a step that would change it by itself.
+    np.testing.assert_allclose(closure.w.detach().numpy(), solution[2:], atol=1e-6)
+    assert found.best == pytest.approx(0.1 * 0.5 * residual[0] / 2, rel=1e-7)  # mean over the records
+    fixed = Slope()
+    assimilation(Line(), fixed, initial="measured").update(records, [], 1, torch.Generator())
+    # A standard error is 0.03 or so: the pinned start moves the slope by about as much.
+    assert (fixed.w - closure.w).abs().max() > 0.02
+
+
+def test_nothing_is_drawn_from_a_record_without_noise():
+    plant = LinearQuadratic()
+    (segment,) = flown(plant, torch.Generator().manual_seed(0), (50,))
+    closure = plant.make_closure(torch.Generator().manual_seed(1))
+    found = assimilation(plant, closure).update([segment], [], 1, torch.Generator())
+    assert found.best < 1e-20 * found.start
+    # The loop ends at steps of 1e-9, or where little is left to gain.
+    torch.testing.assert_close(closure.matrix, torch.tensor(plant.true_closure).double(), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("initial", ["measured", "estimated"])
+def test_what_is_reported_of_segments_is_the_cost_of_whole_records(initial):
+    """J_p has the start that suits the whole record best, which is here a regression on the residuals of the slope."""
+    record, closure = lines()[0], Slope()
+    found = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
+    found = found.update([record], [], 1, torch.Generator())
+    times, x = 0.1 * np.arange(101), record.states[:, 0].numpy()
+    for weights, J_p in ((Slope().w, found.start), (closure.w, found.best)):
+        left = x - (weights[0] + WINDS[0] * weights[1]).item() * times
+        start = left.mean() if initial == "estimated" else left[0]
+        assert J_p == pytest.approx(0.1 * 0.5 * ((left - start) ** 2).sum(), rel=1e-7)
+
+
+class Bent(nn.Module):
+    """ẋ = w + g(z), with a perceptron g in reach of the prior."""
+
+    def __init__(self):
+        super().__init__()
+        self.slope = nn.Parameter(torch.tensor([0.5], dtype=torch.float64))
+        self.bend = BoundedPerceptron([(-3.0, 3.0)], [1.0], hidden=(2,), generator=torch.Generator().manual_seed(0))
+
+    def forward(self, features):
+        return self.slope + self.bend(features)
+
+
+def test_the_prior_holds_the_perceptron_and_leaves_the_first_states():
+    records, change = lines(), []
+    for prior in (0.0, 1e8):
+        closure = Bent()
+        before = [w.detach().clone() for w in closure.bend.parameters()]
+        assimilation(Line(), closure, prior=prior).update(records, [], 1, torch.Generator())
+        change.append(max((w - b).abs().max().item() for w, b in zip(closure.bend.parameters(), before, strict=True)))
+    assert change[1] < 1e-4 < 1e-2 < change[0]
+
+
+@pytest.mark.parametrize("options", [{"method": "gradient"}, {"inputs": "realisations"}])
+def test_what_first_states_need_is_demanded(options):
+    (value,) = options.values()
+    with pytest.raises(ValueError, match=f"initial='estimated' .* needs .* {value!r}"):
+        assimilation(Line(), Slope(), **options)
+
+
+class Capped(Slope):
+    """ẋ = min(w_0, 1): above one the weight has no effect."""
+
+    def forward(self, features):
+        return self.w[:1].clamp(max=1.0).expand_as(features)
+
+
+def test_the_error_of_a_first_sample_does_not_leave_a_weight_where_it_shows_nowhere():
+    """With the first sample, two metres too low, the best slope is above the cap, from where no gradient leads back."""
+    values = 0.9 * 0.1 * np.arange(101) + 0.01 * noise_of(101, 0)
+    values[0] -= 2.0
+    plant, fixed, closure = Line(), Capped(), Capped()
+    sensors = state_sensors(plant)
+    records = [sensor_record(plant, sensors, line_segment(values))]
+    Estimation(DigitalTwin(plant, fixed), sensors, spread=torch.zeros(1).double()).run(records)
+    assert fixed.w[0] > 1.0
+    Estimation(DigitalTwin(plant, closure), sensors).run(records)
+    # The regression holds the wrong sample too: two metres at the end of ten seconds weigh 0.01 m/s or so.
+    times = 0.1 * np.arange(101)
+    assert closure.w[0].item() == pytest.approx(np.polyfit(times, values, 1)[0], abs=1e-4)
+    assert abs(closure.w[0].item() - 0.9) < 0.02
+
+
+def test_noise_of_the_first_sample_is_no_error_of_the_weights():
+    """On the oracle plant, over ten draws of the noise: the error is smaller than with the first sample believed."""
+    plant = LinearQuadratic()
+    (segment,) = flown(plant, torch.Generator().manual_seed(0), (50,))
+    errors = {"measured": 0.0, "estimated": 0.0}
+    for seed in range(10):
+        noise = 0.05 * torch.randn(51, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        record = segment._replace(states=segment.states + noise)
+        for initial in errors:
+            closure = LinearClosure(plant.true_closure)
+            assimilation(plant, closure, initial=initial).update([record], [], 1, torch.Generator())
+            errors[initial] += (closure.matrix - plant.closure.matrix).square().sum().item()
+    assert errors["estimated"] < 0.6 * errors["measured"]
+
+
+@pytest.mark.parametrize("closure", ["paper", "mlp"])
+def test_a_tank_with_noisy_sensors_estimates_them_unless_told_otherwise(closure):
+    config = load_recipe(Path(__file__).parent.parent / "recipes" / "cryogenic_tank.py").Config
+    exact, noisy, told = (
+        from_command_line(config, ["--closure", closure, *options]).twinning.assimilation
+        for options in ((), ("--noise", "0.01"), ("--noise", "0.01", "--twinning.assimilation.initial", "measured"))
+    )
+    assert [found.initial for found in (exact, noisy, told)] == ["measured", "estimated", "measured"]
+    assert told == exact and noisy.segment == exact.segment
+
+
+class Seasonal(LinearQuadratic):
+    """A plant whose force comes and goes with the time."""
+
+    def vector_field(self, t, state, action, exogenous, closure):
+        return super().vector_field(t, state, action * torch.cos(3.0 * t).unsqueeze(-1), exogenous, closure)
+
+
+def flight(plant, seed=0):
+    """A record of the true plant under random commands."""
+    generator = torch.Generator().manual_seed(seed)
+    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    command = 2.0 * torch.rand(1, plant.n_steps, 1, generator=generator, dtype=torch.float64) - 1.0
+    flown = Rollout(plant, plant.closure)(state, exogenous, command)
+    return Trajectory(flown.states[0].detach(), command[0], exogenous[0])
+
+
+def of_segments(plant, closure, **options):
+    options = {"inputs": "record", "iterations": 30, **options}
+    return Assimilation(DigitalTwin(plant, closure), AssimilationConfig(**options))
+
+
+def replayed(*records):
+    return Trajectory(*(torch.stack(x) for x in zip(*(r[:3] for r in records), strict=True)))
+
+
+def test_segments_start_at_their_own_time_and_state():
+    """Two records of 50 intervals are cut into segments of 12; J_p is the mean of what a loop over them finds."""
+    plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
+    records, expected = [flight(plant, seed) for seed in (0, 1)], []
+    for record in records:
+        for first in range(0, 48, 12):
+            part = slice(first, first + 12)
+            rollout = Rollout(plant, closure)
+            piece = record.states[None, first : first + 13]
+            flown = rollout(
+                piece[:, 0], record.exogenous[None, part], record.actions[None, part], start=first * plant.dt
+            )
+            expected.append(identification_cost(plant, flown, piece).item())
+    segments = replayed(*records).segments(12, plant.dt)
+    found = of_segments(plant, closure).normal_equations(segments).cost.item()
+    assert len(segments.states) == 8 and found == pytest.approx(sum(expected) / 8, rel=1e-12)  # sums in another order
+
+
+def test_the_truth_has_no_cost_in_segments():
+    plant = Seasonal()
+    segments = replayed(flight(plant)).segments(7, plant.dt)
+    assert of_segments(plant, plant.closure).normal_equations(segments).cost < 1e-28
+
+
+@pytest.mark.parametrize("method", ["gradient", "levenberg_marquardt"])
+def test_what_is_reported_is_the_cost_of_whole_records(method):
+    plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
+    record = flight(plant)
+    before = of_segments(plant, closure).normal_equations(replayed(record)).cost.item()
+    found = of_segments(plant, closure, segment=12, method=method, iterations=3)
+    found = found.update([record], [], 1, torch.Generator())
+    assert found.start == pytest.approx(before, rel=1e-12)  # two ways to sum
+    assert found.best == pytest.approx(of_segments(plant, closure).normal_equations(replayed(record)).cost.item())
+
+
+def test_sensitivities_start_at_their_own_time():
+    """Two pieces together have the sensitivities of each alone."""
+    plant, record = Seasonal(), flight(Seasonal())
+    pieces = torch.tensor([0.0, 2.5], dtype=torch.float64)
+    rows = [(record.states[k], record.exogenous[k : k + 25], record.actions[k : k + 25]) for k in (0, 25)]
+    sensitivities = Sensitivities(plant, LinearClosure(torch.zeros(2, 2)))
+    together = sensitivities(*(torch.stack(x) for x in zip(*rows, strict=True)), start=pieces)
+    for b, row in enumerate(rows):
+        alone = sensitivities(*(x[None] for x in row), start=pieces[b].item())
+        for one, other in zip(together, alone, strict=True):
+            torch.testing.assert_close(one[b], other[0], rtol=1e-12, atol=1e-14)
+
+
+def test_a_start_for_each_is_refused_by_the_engine_that_has_one_span():
+    plant = LinearQuadratic(horizon=1.0)
+    rollout = Rollout(plant, plant.closure, engine="odeint_adjoint")
+    state, inputs = torch.zeros(2, 2).double(), torch.zeros(2, 10, 1).double()
+    with pytest.raises(ValueError, match="takes no start for each"):
+        rollout(state, inputs, inputs, start=torch.tensor([0.0, 1.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("segment", "message"), [(-1, "segment=-1"), (51, "segment=51 of the assimilation exceeds the 50")]
+)
+def test_a_bad_segment_is_refused(segment, message):
+    with pytest.raises(ValueError, match=message):
+        of_segments(LinearQuadratic(), LinearClosure(torch.zeros(2, 2)), segment=segment)
+
+
+def test_a_plant_without_inputs_has_an_empty_process():
+    process = ExogenousProcess(torch.zeros(20, 0).double(), dt=0.1, signals=())
+    assert process.sample(3, torch.Generator()).shape == (3, 20, 0)
+
+
+NONE = HypothesesConfig()
+
+
+def config(*sensors, **options):
+    given = {"method": "levenberg_marquardt", "inputs": "record", "initial": "estimated", "iterations": 30}
+    return AssimilationConfig(sensors=sensors, **given | options)
+
+
+def episodes(plant, count, seed=0):
+    """Real episodes under random commands, each held for some intervals."""
+    generator, found = torch.Generator().manual_seed(seed), []
+    for _ in range(count):
+        start, inputs = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+        n, low = plant.n_steps, torch.tensor([a.low for a in plant.actions]).double()
+        high = torch.tensor([a.high for a in plant.actions]).double()
+        held = torch.rand(1, n // 20 + 1, len(low), generator=generator, dtype=torch.float64)
+        share = 0.3 + 0.4 * held.repeat_interleave(20, 1)[:, :n]
+        with torch.no_grad():
+            found.append(Rollout(plant, plant.closure)(start, inputs, low + share * (high - low)).each()[0])
+    return found
+
+
+def blinded(plant, record, names):
+    """The record with NaN in every state that no sensor reads."""
+    hidden = [k for k, state in enumerate(plant.states) if state.name not in names]
+    states = record.states.clone()
+    states[:, hidden] = torch.nan
+    return record._replace(states=states)
+
+
+@pytest.mark.slow
+def test_the_tank_is_identified_from_its_pressure_alone():
+    plant = CryogenicTank(horizon=21600.0)
+    records = [blinded(plant, record, ["pressure"]) for record in episodes(plant, 2)]
+    closure = plant.make_closure(torch.Generator())
+    step = make_assimilation(DigitalTwin(plant, closure), config("pressure"), NONE)
+    found = step.update(records, [], 1, torch.Generator())
+    # From [1, 1, 10]: without noise only the wall's start, which follows p to 1e-5 K or so, is uncertain.
+    true = plant.closure.coefficients
+    assert ((closure.coefficients / true - 1.0).abs() < 1e-4).all()
+    assert found.best < 1e-3 * found.start
+    report = step.report()
+    assert report["noise/pressure"] < 100.0 and set(report) > {"standard_error/U_s", "standard_error/K_JT"}
+
+
+def test_first_states_follow_from_what_is_read():
+    """The tank's wall is as cold as the fluid, whose temperature follows from the pressure; its fill is always 70 %."""
+    plant = CryogenicTank(horizon=3600.0)
+    (record,) = episodes(plant, 1, seed=3)
+    sensors = sensors_of(plant, ["pressure"])
+    first = FirstStates(plant, sensors)
+    guess = first.guess(sensor_record(plant, sensors, blinded(plant, record, ["pressure"])))
+    # The saturation curve is straight to some mK over ±50 kPa.
+    assert guess[0].item() == pytest.approx(record.states[0, 0].item(), abs=0.02)
+    assert guess[1:].tolist() == pytest.approx(record.states[0, 1:].tolist())
+    assert first.spread[1] == 0.0 and 0.0 < first.spread[0] < 0.02 and first.spread[2] == torch.inf
+
+
+def test_a_turbine_needs_its_rotor_speed_alone():
+    plant = WindTurbine(horizon=60.0)
+    spread = FirstStates(plant, sensors_of(plant, ["rotor_speed"])).spread
+    # The wind's filter and the integral begin with the same value; the torque is a kinked function of the speed.
+    assert spread[[1, 2, 3, 5]].tolist() == [0.0] * 4
+
+
+def test_nothing_is_fitted_in_no_iteration_and_a_start_from_nonsense_begins_anew():
+    plant = LinearQuadratic()
+    records = episodes(plant, 1)
+    closure = plant.make_closure(torch.Generator().manual_seed(0))
+    before = closure.matrix.detach().clone()
+    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity", iterations=0))
+    step.update(records, [], 1, torch.Generator())
+    assert torch.equal(closure.matrix, before) and step.report() == {}
+    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity"))
+    with torch.no_grad():
+        closure.matrix.fill_(1e9)
+    found = step.update(records, [], 1, torch.Generator())
+    assert found.start == float("inf")
+    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-6)
+
+
+def test_what_does_not_go_with_sensors_is_refused():
+    for options in ({"initial": "measured"}, {"segment": 5}):
+        with pytest.raises(ValueError, match=r"sensors=\('position',\) .* need initial='estimated' and segment=0"):
+            config("position", **options)
+    plant = WindTurbine(horizon=60.0)
+    closure = plant.make_closure(torch.Generator())
+    twin = make_twin(plant, closure, HypothesesConfig(which="automatic"))
+    with pytest.raises(ValueError, match="do not go with hypotheses"):
+        make_assimilation(twin, config("rotor_speed"), NONE)
+    with pytest.raises(ValueError, match="roof cannot be measured"):
+        make_assimilation(DigitalTwin(plant, closure), config("roof"), NONE)
+
+
+def test_a_recipe_that_fits_sensors_leaves_the_hypotheses_out():
+    recipe = load_recipe(Path(__file__).parent.parent / "recipes" / "cryogenic_tank.py").Config
+    asked = ["--twinning.assimilation.sensors", "pressure", "--twinning.assimilation.initial", "estimated"]
+    asked += ["--twinning.assimilation.method", "levenberg_marquardt", "--twinning.assimilation.inputs", "record"]
+    assert from_command_line(recipe, asked).twinning.hypotheses.which == "none"
+    assert from_command_line(recipe, []).twinning.hypotheses.which == "automatic"
+
+
+class DriftingLine(Line):
+    """The line with the methods that step 4 asks for."""
+
+    def draw_initial_state(self, batch, generator):
+        return 0.1 * torch.randn(batch, 1, generator=generator, dtype=torch.float64)
+
+
+def line_step(**options):
+    closure = Slope()
+    return SensorAssimilation(DigitalTwin(DriftingLine(), closure), config("position", **options)), closure
+
+
+TIMES = 0.1 * np.arange(61)
+
+
+def line_records(slopes, *, pushes=0.0):
+    """A record in each of two winds; something pushes the states in the middle by ``pushes``."""
+    jump = pushes * (np.arange(61) > 30)
+    return [
+        line_segment(0.05 + (slopes[0] + slopes[1] * z) * TIMES + jump + 0.02 * noise_of(61, k), wind=z)
+        for k, z in enumerate((1.0, -2.0))
+    ]
+
+
+def test_pushes_in_step_4_are_those_of_an_estimation():
+    """And they keep the weights from bending: a push of 1 in 6 s would be taken for a slope."""
+    bent, plain = line_step()
+    bent.update(line_records((0.8, 0.1), pushes=1.0), [], 1, torch.Generator())
+    step, closure = line_step(pushes=2, push=2.0)
+    step.update(line_records((0.8, 0.1), pushes=1.0), [], 1, torch.Generator())
+    assert abs(plain.w[0].item() - 0.8) > 0.1 and closure.w.tolist() == pytest.approx([0.8, 0.1], abs=0.02)
+    plant, own = DriftingLine(), Slope()
+    sensors = sensors_of(plant, ["position"])
+    records = [sensor_record(plant, sensors, one) for one in line_records((0.8, 0.1), pushes=1.0)]
+    first = FirstStates(plant, sensors)
+    records = [one._replace(guess=first.guess(one)) for one in records]
+    size = usual_sizes(plant, torch.stack([one.guess for one in records]), sensors, records)
+    parts = [part for one in records for part in chained(one, 30, plant.dt)]
+    found = Estimation(DigitalTwin(plant, own), sensors, spread=first.spread, process=2.0 * size).run(parts)
+    assert closure.w.tolist() == pytest.approx(own.w.tolist(), abs=1e-6)
+    assert step.report()["noise/position"] == pytest.approx(found.noise["position"], rel=1e-3)
+
+
+def test_weights_that_drift_are_followed_from_episode_to_episode():
+    """As an estimation with the belief of the one before; without the belief, each episode stands alone."""
+    step, closure = line_step(drift=0.05)
+    plant, own = DriftingLine(), Slope()
+    sensors, belief = sensors_of(plant, ["position"]), None
+    for k in range(3):
+        (storm, other), first = line_records((0.5 + 0.1 * k, 0.3)), FirstStates(plant, sensors)
+        records = [(storm, other)[k % 2]]  # each episode has one wind, which alone cannot tell the slopes apart
+        step.update(records, [], 1, torch.Generator())
+        read = [sensor_record(plant, sensors, one) for one in records]
+        read = [one._replace(guess=first.guess(one)) for one in read]
+        prior = None if belief is None else BeliefPrior(own, belief, 0.05)
+        options = EstimationConfig(rounds=4, starts=10 if prior is None else 1)
+        task = Estimation(DigitalTwin(plant, own), sensors, spread=first.spread, config=options)
+        belief = task.run(read, prior).uncertainty.belief()
+        assert closure.w.tolist() == pytest.approx(own.w.tolist(), abs=1e-6)
+    again, _ = line_step(drift=0.05)
+    again.load_state_dict(step.state_dict())
+    assert torch.equal(again.belief.covariance, step.belief.covariance)
+    assert closure.w.tolist() == pytest.approx([0.7, 0.3], abs=0.1)
+
+
+def test_a_biased_sensor_is_found_in_step_4():
+    plant = LinearQuadratic()
+    records = episodes(plant, 1)
+    states = records[0].states.clone()
+    states[:, 0] += 0.4
+    closure = plant.make_closure(torch.Generator().manual_seed(0))
+    step = SensorAssimilation(DigitalTwin(plant, closure), config("position", "velocity", biased=("position",)))
+    step.begun = True  # one start is enough
+    step.update([records[0]._replace(states=states)], [], 1, torch.Generator())
+    assert step.report()["bias/position"] == pytest.approx(0.4, abs=1e-6)
+    torch.testing.assert_close(closure.matrix, plant.closure.matrix, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match=r"biased=\('roof',\): roof is none of the sensors"):
+        SensorAssimilation(DigitalTwin(plant, closure), config("position", biased=("roof",)))
+
+
+def test_what_only_a_fit_to_sensors_takes_is_refused_without_sensors():
+    for options, message in (
+        ({"biased": ("pressure",)}, "give sensors, too"),
+        ({"pushes": 3}, "give sensors, too"),
+        ({"drift": 0.1}, "give sensors, too"),
+        ({"pushes": 0}, "pushes=0 must be at least 1"),
+        ({"drift": -1.0}, "drift=-1.0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            config(**options)
+    with pytest.raises(ValueError, match="would count them twice"):
+        TwinningConfig(records=2, assimilation=config("position", drift=0.1))
