@@ -49,7 +49,6 @@ TAGS = {
     "scouted": "switch/plan from a random policy accepted",
     "astray": "twin/plans that failed from extreme starts",
     "alarm": "twin/alarm: the twin is wrong where it matters",
-    "whiteness": "twin/apart from the alarm: probability that white noise leaves as much over (Ljung-Box)",
     "predicted_violations": "violations/predicted share of intervals (twin, the policy that acts)",
     "weight_change": "switch/relative weight change of the idle policy",
     "distillation_error": "switch/RMS action error of a distilled clone, share of range",

@@ -10,7 +10,6 @@ from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.results import Entry, arm_entry
 from rt_torchrl.study.training import Training
 from rt_torchrl.twinning.evidence import alarm
-from rt_torchrl.twinning.evidence.whiteness import SIGNIFICANT
 
 MATTERS = 0.1
 """Gap over the oracle from which an alarm is missed if it does not rise."""
@@ -28,14 +27,12 @@ class Arm:
         entry: costs of the live policy on the unseen episodes, and after each real episode.
         paid: J_a of every real episode, with that of the start, for each seed; empty for a yardstick.
         alarms: whether the alarm was up after each real episode, for each seed; empty for an arm without a twin.
-        correlated: whether the replay of each real episode left more over than white noise; empty without a twin.
         wrong: whether each real episode cost over a tenth other than the twin says of it; empty without a twin.
     """
 
     entry: Entry
     paid: list[list[float]] = field(default_factory=list)
     alarms: list[list[bool]] = field(default_factory=list)
-    correlated: list[list[bool]] = field(default_factory=list)
     wrong: list[list[bool]] = field(default_factory=list)
 
     @property
@@ -99,7 +96,7 @@ def missed_alarms(arm: Arm, oracle: float) -> AlarmCount:
         arm: arm on a system that its twin does not know.
         oracle: mean J_a of the oracle on the same unseen episodes.
     """
-    return _unsaid(arm, arm.alarms, oracle)
+    return _unsaid(arm, oracle)
 
 
 def missed_errors(arm: Arm, oracle: float) -> AlarmCount:
@@ -107,26 +104,15 @@ def missed_errors(arm: Arm, oracle: float) -> AlarmCount:
 
     A plan may end in a poor minimum, about which the twin is right.
     """
-    return _unsaid(arm, arm.alarms, oracle, among=arm.wrong)
+    return _unsaid(arm, oracle, among=arm.wrong)
 
 
-def falsely_correlated(arm: Arm) -> AlarmCount:
-    """Episodes of a system as its twin knows it whose replay left more over than white noise."""
-    found = [correlated for seed in arm.correlated for correlated in seed]
-    return AlarmCount(len(found), sum(found))
-
-
-def not_correlated(arm: Arm, oracle: float) -> AlarmCount:
-    """As :func:`missed_alarms`, of the replay that left more over than white noise in the place of the alarm."""
-    return _unsaid(arm, arm.correlated, oracle)
-
-
-def _unsaid(arm: Arm, said: list[list[bool]], oracle: float, *, among: list[list[bool]] | None = None) -> AlarmCount:
-    """Episodes after the first ones whose policy costs at least a tenth more than the oracle, where nothing is said."""
-    counted = [[True] * len(seed) for seed in said] if among is None else among
+def _unsaid(arm: Arm, oracle: float, *, among: list[list[bool]] | None = None) -> AlarmCount:
+    """Episodes after the first ones whose policy costs at least a tenth more than the oracle, without an alarm."""
+    counted = [[True] * len(seed) for seed in arm.alarms] if among is None else among
     silent = [
         not up
-        for each in zip(arm.entry.curves, said, counted, strict=True)
+        for each in zip(arm.entry.curves, arm.alarms, counted, strict=True)
         for cost, up, counts in list(zip(*each, strict=False))[SETTLED:]
         if counts and cost >= (1.0 + MATTERS) * oracle
     ]
@@ -139,12 +125,10 @@ def trained_arm(name: str, trainings: Sequence[Training]) -> Arm:
     paid = [[one[key] for one in seed for key in ("start_cost", "real_cost") if key in one] for seed in found]
     watched = all("alarm" in one for seed in found for one in seed)
     alarms = [[bool(one["alarm"]) for one in seed] for seed in found] if watched else []
-    # An episode too short for the test has no whiteness.
-    correlated = [[one.get("whiteness", 1.0) < SIGNIFICANT for one in seed] for seed in found] if watched else []
     differences = [[one.get("paired_difference", 0.0) for one in seed] for seed in found] if watched else []
     wrong = [[abs(d) > alarm.MATTERS for d in seed] for seed in differences]
     entry = arm_entry(name, list(trainings))
-    return Arm(entry=entry, paid=paid, alarms=alarms, correlated=correlated, wrong=wrong)
+    return Arm(entry=entry, paid=paid, alarms=alarms, wrong=wrong)
 
 
 def classical_arms(training: Training) -> list[Arm]:

@@ -10,10 +10,8 @@ from rt_torchrl.study.arms import (
     Arm,
     SystemResult,
     false_alarms,
-    falsely_correlated,
     missed_alarms,
     missed_errors,
-    not_correlated,
 )
 from rt_torchrl.study.results import difference
 
@@ -25,8 +23,6 @@ COUNTED = {
     "false": "false, of the episodes as the twin",
     "missed": "missed, of the episodes with a gap of 10 %",
     "missed, twin wrong": "missed where the twin is a tenth off about the policy, too",
-    "not white, false": "residuals not white, of the episodes as the twin",
-    "not white, missed": "residuals white, of the episodes with a gap of 10 %",
 }
 """Headings of what is counted."""
 TARGET = 0.05
@@ -125,14 +121,10 @@ def verdict(shares: Sequence[tuple[float, float]]) -> str:
 
 
 def counted(arm: Arm, found: SystemResult) -> dict[str, AlarmCount]:
-    """What is wrong with the alarms of an arm on a system, and apart from these with the test of whiteness."""
+    """What is wrong with the alarms of an arm on a system."""
     if not found.system:
-        return {"false": false_alarms(arm), "not white, false": falsely_correlated(arm)}
-    return {
-        "missed": missed_alarms(arm, found.least),
-        "missed, twin wrong": missed_errors(arm, found.least),
-        "not white, missed": not_correlated(arm, found.least),
-    }
+        return {"false": false_alarms(arm)}
+    return {"missed": missed_alarms(arm, found.least), "missed, twin wrong": missed_errors(arm, found.least)}
 
 
 def alarm_section(results: Sequence[SystemResult]) -> str:

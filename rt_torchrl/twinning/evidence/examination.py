@@ -4,26 +4,23 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict
-from torch import nn
 
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, control_cost
 from rt_torchrl.twinning.assimilation import Assimilation
-from rt_torchrl.twinning.evidence.alarm import EPISODES, MATTERS, QUIET, alarm, contradiction
+from rt_torchrl.twinning.evidence.alarm import MATTERS, QUIET, alarm, contradiction
 from rt_torchrl.twinning.evidence.paired_differences import LARGEST, difference, unexplained
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
-from rt_torchrl.twinning.evidence.repeated_exploration import RepeatedExploration, repeatable
-from rt_torchrl.twinning.evidence.whiteness import LEAST, whiteness
 from rt_torchrl.twinning.findings import findings, merged
-from rt_torchrl.twinning.track_record import Flown, TrackRecord
+from rt_torchrl.twinning.track_record import TrackRecord
 from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class Examination:
     """Compares what real episodes cost with what the twin says of them.
 
-    The attribute ``unexplained`` is the size of the paired difference of the latest episode with its exploration
-    repeated or, where the plant does not allow that, beyond two standard deviations of what exploration explains.
+    The attribute ``unexplained`` is the size of the paired difference of the latest episode or, where it explored by
+    more than ``QUIET``, beyond two standard deviations of what exploration explains.
 
     Args:
         track_record: the real episodes.
@@ -32,63 +29,29 @@ class Examination:
 
     def __init__(self, track_record: TrackRecord, virtual: VirtualEpisodes):
         self.track_record, self.virtual = track_record, virtual
-        self.unexplained, self._repeated, self._said = 0.0, RepeatedExploration(), False
+        self.unexplained, self._said = 0.0, False
 
     @torch.no_grad()
     def examine(self) -> TensorDict:
         """Fly the latest real episodes on the present twin.
 
         Returns:
-            ``paired_difference`` of the last episode; ``alarm``, with a ``warning`` in words if it is 1; and apart from
-            these ``whiteness`` of what the replay of the episode leaves over, see :func:`whiteness`, if it is long
-            enough. Nothing if state feedback flew them.
+            ``paired_difference`` of the last episode, and ``alarm``, with a ``warning`` in words if it is 1. Nothing if
+            state feedback flew them.
         """
         found = self.track_record.differences(self.virtual)
         self.track_record.weigh(found)
         if len(found.values) == found.earlier:
             self.unexplained, self._said = 0.0, False
             return findings()
-        flown = list(zip(found.policies, found.values, found.flown, strict=True))
-        *earlier, latest = flown[found.earlier :]
-        now = self._without_luck(*latest)
-        self.unexplained = unexplained(found.values[-1], found.exploration[-1]) if now is None else abs(now)
-        said = alarm([*self._comparable(earlier), *([] if now is None else [now])])
+        now, explored = found.values[-1], found.exploration[-1]
+        self.unexplained = abs(now) if explored <= QUIET else unexplained(now, explored)
+        latest = list(zip(found.values, found.exploration, strict=True))[found.earlier :]
+        said = alarm([d for d, explored in latest if explored <= QUIET])
         self._said = said is not None
         explained = self.virtual.twin.explanation()
-        report = findings(paired_difference=found.values[-1], alarm=float(said is not None))
-        if len(self.track_record.latest_record.actions) >= LEAST:
-            report = merged(report, findings(whiteness=self._white()))
+        report = findings(paired_difference=now, alarm=float(said is not None))
         return report if said is None else report.set_non_tensor("warning", f"{said}; {explained}".rstrip("; "))
-
-    def _comparable(self, earlier: Sequence[tuple[nn.Module, float, Flown]]) -> list[float]:
-        """Paired differences of the latest earlier episodes in which luck cancels, oldest first."""
-        values: list[float] = []
-        for flown in reversed(earlier):
-            value = self._without_luck(*flown) if len(values) < EPISODES else None
-            values += [] if value is None else [value]
-        return values[::-1]
-
-    def _without_luck(self, policy: nn.Module, value: float, one: Flown) -> float | None:
-        """The paired difference of an episode in which luck cancels; None if it does not.
-
-        That of an episode that explored is that with its exploration repeated, where the plant allows it.
-        """
-        if one.exploration <= QUIET:
-            return value
-        if not repeatable(self.virtual.twin.plant):
-            return None
-        episode = self.virtual.repeated(one.trajectory)
-        return difference(one.cost, self._repeated.cost(self.virtual.twin.believed, policy, one.trajectory, episode))
-
-    def _white(self) -> float:
-        """Whiteness of what the replay of the latest real episode leaves over, by the likeliest twin."""
-        record = self.track_record.latest_record
-        try:
-            replay = self.virtual.twin.replayed(record)
-        except DivergenceError:
-            return 0.0
-        read = record.states[1:]
-        return whiteness(replay[1:] - read, read)
 
     def explained(self, assimilation: Assimilation, generator: torch.Generator) -> TensorDict:
         """As :meth:`examine`, once step 4 has sought what explains the difference."""
