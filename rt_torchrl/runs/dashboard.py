@@ -44,7 +44,6 @@ TAGS = {
     "diverged_solves": "predictive control/solves whose model diverged",
     "paired_difference": "twin/log of the real cost over the twin's, same policy and inputs",
     "withheld": "twin/log of the cost that stays over that of the plan which real episodes contradict (twin)",
-    "corrected": "twin/plans that real episodes have corrected",
     "led_back": "switch/plan from earlier weights accepted",
     "scouted": "switch/plan from a random policy accepted",
     "astray": "twin/plans that failed from extreme starts",

@@ -98,7 +98,7 @@ class ReinforcementTwinning:
         self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
         self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual)
-        self.planning = Planning(self.planner, self.virtual, config.planner, corrected=config.corrected_descents)
+        self.planning = Planning(self.planner, self.virtual, config.planner)
         self.planning.scouts = Scouts(self.virtual, model_based, config.scouts, make_policy)
         self.cloning = Cloning(self.virtual, config.distillation, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)

@@ -42,8 +42,6 @@ class TwinningConfig:
             on the real system, as the paired differences of real episodes say, and step 5 goes back to weights that
             have flown and are expected to cost less, where one of these episodes contradicts the twin; without it the
             twin alone judges.
-        corrected_descents: whether step 5 then also descends this expected cost. It leads on where no hypothesis
-            explains the real system, by trials that cost real episodes. Needs corrected_plans.
         exploration: parameters of step 1.
         learner: parameters of step 2.
         exogenous: parameters of step 3.
@@ -63,7 +61,6 @@ class TwinningConfig:
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
     judged_updates: bool = False
     corrected_plans: bool = False
-    corrected_descents: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)
@@ -99,12 +96,4 @@ class TwinningConfig:
             raise ValueError(
                 f"assimilation.drift={self.assimilation.drift} keeps what earlier episodes told, and would count them "
                 f"twice with records={self.records} and informative={self.informative}; use 1 and 0."
-            )
-        self._check_combinations()
-
-    def _check_combinations(self) -> None:
-        if self.corrected_descents and not (self.corrected_plans and self.planner.whole):
-            raise ValueError(
-                "corrected_descents=True needs corrected_plans=True, and plans over whole episodes: leave "
-                "planner.method and short_horizon.window as they are, or leave it out."
             )

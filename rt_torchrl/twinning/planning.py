@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from rt_torchrl.optimisers.descent import Descended, by_small_steps
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.twinning.corrected_plans import CorrectedPlans
 from rt_torchrl.twinning.extreme_starts import astray
 from rt_torchrl.twinning.findings import findings, merged
 from rt_torchrl.twinning.judgement import Judgement
@@ -37,13 +36,11 @@ class Planning:
         planner: planner of step 5.
         virtual: virtual episodes.
         config: parameters of step 5.
-        corrected: whether to make :class:`CorrectedPlans`, too, where there is evidence.
     """
 
-    def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig, *, corrected: bool = False):
+    def __init__(self, planner: Planner, virtual: VirtualEpisodes, config: PlannerConfig):
         self.planner, self.virtual, self.config = planner, virtual, config
         self.scouts: Scouts | None = None
-        self.corrected = CorrectedPlans(planner, virtual) if corrected else None
         # A copy of the policy descends over a short horizon, and goes on whether or not a plan gains anything.
         limit = math.inf if config.short_horizon.window else config.episode_gradient_limit
         self.way_back = WayBack(limit, config.anew)
@@ -77,8 +74,6 @@ class Planning:
             planned_on, judged_on = (self.virtual.draw(len(each.initial_state)) for each in (planned_on, judged_on))
             further = self._from_the_present(planned_on, judged_on, judgement)
             found = merged(found, further) if further["plan_accepted"] else found
-        if self.corrected is not None and judgement.evidence is not None:
-            found = merged(found, self.corrected.plan(planned_on, judged_on, judgement.evidence))
         refuted = self._refuted(judgement)
         if refuted:
             found.update(findings(withheld=max(refuted, float(found.get("withheld", 0.0)))))

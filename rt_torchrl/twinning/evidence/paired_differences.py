@@ -52,7 +52,6 @@ class PairedDifferences:
         differences: d of these episodes.
         exploration: exploration of these episodes, as a share of half the ranges, which the twin does not repeat.
         least: least d that counts; a smaller one is taken for it.
-        noise: standard deviation of d for one episode that does not explore.
 
     Raises:
         ValueError: if the numbers of policies, differences and explorations differ.
@@ -64,7 +63,6 @@ class PairedDifferences:
         differences: Float[Tensor, " n_d"],
         exploration: Float[Tensor, " n_e"] | None = None,
         least: float = -LARGEST,
-        noise: float = NOISE,
     ):
         exploration = torch.zeros_like(differences) if exploration is None else exploration
         if not len(actions) == len(differences) == len(exploration):
@@ -74,19 +72,19 @@ class PairedDifferences:
             )
         self.actions = actions.detach()
         self.differences = differences.detach().clamp(least, LARGEST)
-        self.exploration, self.noise = exploration, noise
-        covariance = self._kernel(self.actions) + torch.diag(noise**2 + (EXPLORED * exploration) ** 2)
+        self.exploration = exploration
+        covariance = self._kernel(self.actions) + torch.diag(NOISE**2 + (EXPLORED * exploration) ** 2)
         self._root = torch.linalg.cholesky(covariance)
         self._weights = torch.cholesky_solve(self.differences.unsqueeze(-1), self._root)
 
-    def at_least(self, least: float, noise: float = NOISE) -> "PairedDifferences":
-        """What follows from the same episodes, where a smaller d is taken for ``least``, with this noise."""
-        return PairedDifferences(self.actions, self.differences, self.exploration, least, noise)
+    def at_least(self, least: float) -> "PairedDifferences":
+        """What follows from the same episodes, where a smaller d is taken for ``least``."""
+        return PairedDifferences(self.actions, self.differences, self.exploration, least)
 
     def of(self, differences: Sequence[float]) -> "PairedDifferences":
         """What follows if these are the differences of the same episodes."""
         values = self.differences.new_tensor(differences)
-        return PairedDifferences(self.actions, values, self.exploration, noise=self.noise)
+        return PairedDifferences(self.actions, values, self.exploration)
 
     def _kernel(self, others: Float[Tensor, "k m"]) -> Float[Tensor, "k n"]:
         squared = (others.unsqueeze(1) - self.actions).square().mean(-1)
@@ -99,7 +97,7 @@ class PairedDifferences:
             return actions.new_zeros(()), prior.sqrt()
         k = self._kernel(actions.unsqueeze(0))
         half = torch.linalg.solve_triangular(self._root, k.mT, upper=False)
-        variance = (prior - half.square().sum()).clamp_min(self.noise**2 / len(self.differences))
+        variance = (prior - half.square().sum()).clamp_min(NOISE**2 / len(self.differences))
         return (k @ self._weights).squeeze(), variance.sqrt()
 
     def deviation_between(self, one: Float[Tensor, " m"], other: Float[Tensor, " m"]) -> float:
@@ -113,11 +111,6 @@ class PairedDifferences:
             seen = self._kernel(one.unsqueeze(0)) - self._kernel(other.unsqueeze(0))
             variance = variance - torch.linalg.solve_triangular(self._root, seen.mT, upper=False).square().sum()
         return variance.clamp_min(0.0).sqrt().item()  # rounding alone makes it negative
-
-    def log_likelihood(self) -> float:
-        """Log of the marginal likelihood of the differences, without its constant."""
-        misfit = (self.differences * self._weights.squeeze(-1)).sum()
-        return (-0.5 * misfit - self._root.diagonal().log().sum()).item()
 
     def belief(self, actions: Float[Tensor, " m"]) -> Belief:
         """The same as numbers."""

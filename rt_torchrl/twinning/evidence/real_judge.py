@@ -12,8 +12,6 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
 from rt_torchrl.twinning.evidence.paired_differences import (
-    LEAST,
-    NOISE,
     Belief,
     PairedDifferences,
     difference,
@@ -25,9 +23,6 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 RECALLED_BELOW = 0.98
 """Share of the present policy's expected cost below which earlier weights take its place."""
-NOISES = tuple(NOISE * 2.0**k for k in range(4))
-"""Standard deviations of d for one episode among which the likeliest is taken: luck does not cancel where the real
-system has inputs that no sensor reads. Beforehand log₂ of their ratio to the first one is normal, with deviation 1."""
 
 
 class RealJudge:
@@ -65,34 +60,6 @@ class RealJudge:
         """The joint belief about d of one policy less d of another; each comes with its cost on the twin."""
         mean = self.belief(*one).mean - self.belief(*other).mean
         return Belief(mean, self.learned.deviation_between(self.shares(one[0]), self.shares(other[0])))
-
-    @cached_property
-    def limited(self) -> PairedDifferences:
-        """The belief that follows from paired differences of at least ``LEAST``, with the likeliest noise."""
-        found = [self.learned.at_least(LEAST, noise) for noise in NOISES]
-        return max(found, key=lambda one: one.log_likelihood() - 0.5 * math.log2(one.noise / NOISE) ** 2)
-
-    def factor(self, policy: nn.Module) -> Tensor:
-        """What multiplies the cost of a policy on the twin in a descent, by the limited belief; differentiable.
-
-        The mean stays between the least and the largest paired difference, and zero: a Gaussian process goes beyond
-        them where neighbours differ.
-        """
-        mean, deviation = self.limited.posterior(self.shares(policy))
-        seen = self.limited.differences
-        mean = mean.clamp(seen.min().clamp_max(0.0), seen.max().clamp_min(0.0))
-        return (mean + 0.5 * deviation.square()).exp()
-
-    @torch.no_grad()
-    def deviation(self, policy: nn.Module) -> float:
-        """Standard deviation of the limited belief about a policy."""
-        return self.limited.belief(self.shares(policy)).deviation
-
-    @torch.no_grad()
-    def dearest(self, policy: nn.Module, cost: float) -> float:
-        """The cost that is expected on the real system by the dearer of both beliefs; ``cost`` is that on the twin."""
-        expected = self.expected(policy, cost)
-        return max(expected, cost * self.factor(policy).item()) if cost > 0.0 else expected
 
     def expected(self, policy: nn.Module, cost: float) -> float:
         """The cost that is expected of a policy on the real system, where it has this cost on the twin."""

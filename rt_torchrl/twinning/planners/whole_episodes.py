@@ -1,7 +1,6 @@
 """Planning over whole virtual episodes, as in the paper."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor, nn
@@ -26,9 +25,6 @@ class WholeEpisodes:
     algorithm compares policies on the twin. A plan leaves its multipliers as they are.
     """
 
-    correction: Callable[[nn.Module], Tensor] | None = None
-    """Function of a policy that multiplies its cost in the plans; None for the cost on the twin."""
-
     def __init__(self, twin: DigitalTwin, policy: nn.Module, config: PlannerConfig):
         self.twin, self.policy, self.config = twin, policy, config
         self.descent = Descent(policy, config.descent)
@@ -50,8 +46,6 @@ class WholeEpisodes:
 
     def _cost(self, episodes: Scenario, limit: float) -> Tensor:
         costs = self.constraints.costs(self.twin, self.policy, episodes)
-        if self.correction is not None:
-            costs = costs * self.correction(self.policy)
         return limited_mean(costs, self.policy.parameters(), limit)
 
     def refuse(self) -> None:
