@@ -1,4 +1,4 @@
-"""Which real episodes a twin should remember: the last ones, or those that tell most."""
+"""How many real episodes a twin should remember."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,8 +23,8 @@ from rt_torchrl.runs.results_file import make_folder, write_results
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MEMORIES = {"last": (1, 0), "last four": (4, 0), "last, and three that tell most": (1, 3)}
-"""Numbers of latest episodes and of informative ones, by name."""
+MEMORIES = {"last": 1, "last four": 4}
+"""Numbers of latest episodes, by name."""
 TITLE = "Twins that remember other real episodes, on unseen winds (mean of the seeds; band: their range)"
 OPTIONS = ("--twinning.arm", "model_based", "--untrained", "0", "--unseen", "2", "--threads", "1", "--no-figures")
 RECORDED = ("--twinning.assimilation.inputs", "record", "--twinning.hypotheses.which", "none")
@@ -32,7 +32,7 @@ RECORDED = ("--twinning.assimilation.inputs", "record", "--twinning.hypotheses.w
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Compare memories of the turbine's twin: the last real episodes, and those with the greatest gain in information.
+    """Compare memories of the turbine's twin: the last real episode, and the last four.
 
     After every real episode the twin is judged by J_p on unseen winds, as the classical controller flies them and as
     the present policy flies them, and the policy by J_a on the true turbine.
@@ -62,9 +62,8 @@ def trained(config: Config, memory: str, seed: int) -> list[dict[str, float]]:
     """Costs after every real episode of a training."""
     from rt_torchrl import Run  # here, because --help need not wait for TorchRL
 
-    latest, informative = MEMORIES[memory]
-    kept = ("--twinning.records", str(latest), "--twinning.informative", str(informative))
-    folder = config.log_dir / memory.replace(",", "").replace(" ", "-") / f"seed-{seed}"
+    kept = ("--twinning.records", str(MEMORIES[memory]))
+    folder = config.log_dir / memory.replace(" ", "-") / f"seed-{seed}"
     named = ("--seed", str(seed), "--episodes", str(config.episodes), "--log-dir", str(folder), "--overwrite")
     recipe = load_recipe(Path(__file__).with_name("wind_turbine.py"))
     options = from_command_line(recipe.Config, [*OPTIONS, *RECORDED, *kept, *named, "--closure", config.closure])

@@ -1,4 +1,4 @@
-"""Regions, profiles, design of manoeuvres and bands of curves, against closed forms of regression."""
+"""Regions and bands of curves, against closed forms of regression."""
 
 import math
 
@@ -12,7 +12,6 @@ from torch import nn
 from rt_torchrl.figures import uncertainty as charts
 from rt_torchrl.fit.covariance import standard_errors
 from rt_torchrl.fit.curve import band
-from rt_torchrl.fit.design import next_manoeuvres, weight_information
 from rt_torchrl.fit.estimation import Estimation, EstimationConfig
 from rt_torchrl.fit.output_error import InitialStates, OutputError
 from rt_torchrl.fit.prediction import predict
@@ -132,37 +131,6 @@ def test_a_prediction_in_a_wind_of_which_no_record_tells_has_no_bound():
     estimate = task.run([sensor_record(Line(), sensors, line_segment(values))])
     calm, wind = (predict(task, estimate, sensor_record(Line(), sensors, line_segment(values, wind=z))) for z in (0, 1))
     assert calm.deviation.isfinite().all() and wind.deviation[1:].isinf().all()
-
-
-def test_a_manoeuvre_that_shows_nothing_leaves_an_infinite_error():
-    task = Estimation(DigitalTwin(Line(), InUnits((1.0, 1e9), (1.0, 1.0))), position())
-    noise = torch.tensor([NOISE]).double()
-    (calm,) = next_manoeuvres(task, {"calm": line_segment(0.0 * TIMES)}, noise)
-    assert calm.errors.isinf().tolist() == [False, True]
-    known = [sensor_record(Line(), position(), line_segment(0.0 * TIMES, wind=3.0))]
-    (both,) = next_manoeuvres(task, {"calm": line_segment(0.0 * TIMES)}, noise, known=known)
-    expected = np.sqrt(np.diag(exact_covariance((0.0, 3.0)))) / [1.0, 1e9]
-    np.testing.assert_allclose(both.errors.numpy(), expected, rtol=1e-4)
-
-
-def test_the_next_manoeuvre_is_the_one_that_tells_most():
-    """Of a slope that shows only in wind, a strong wind tells most; then calm air tells the other slope apart."""
-    task = Estimation(DigitalTwin(Line(), Slope()), position())
-    manoeuvres = {f"wind {z}": line_segment(0.0 * TIMES, wind=z) for z in (0.0, 0.5, 3.0)}
-    known = [sensor_record(Line(), position(), line_segment(0.0 * TIMES, wind=0.1))]
-    noise = torch.tensor([NOISE]).double()
-    chosen = next_manoeuvres(task, manoeuvres, noise, count=2, known=known)
-    gains = {}
-    for name, z in (("wind 0.0", 0.0), ("wind 0.5", 0.5), ("wind 3.0", 3.0)):
-        one = Estimation(DigitalTwin(Line(), Slope()), position())
-        records = [*known, sensor_record(Line(), position(), manoeuvres[name])]
-        gains[name] = torch.linalg.det(weight_information(one.likelihood(records, noise))).item()
-        assert gains[name] == pytest.approx(1.0 / np.linalg.det(exact_covariance((0.1, z))), rel=1e-6)
-    assert chosen[0].name == max(gains, key=gains.get) == "wind 3.0" and chosen[0].gain > chosen[1].gain > 0.0
-    expected = np.sqrt(np.diag(exact_covariance((0.1, 3.0))))
-    np.testing.assert_allclose(chosen[0].errors.numpy(), expected, rtol=1e-4)
-    with pytest.raises(ValueError, match=r"manoeuvres=\[\], count=1"):
-        next_manoeuvres(task, {}, noise)
 
 
 def test_the_band_of_a_line_is_that_of_regression():

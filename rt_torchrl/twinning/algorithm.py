@@ -30,7 +30,6 @@ from rt_torchrl.twinning.evidence.examination import Examination
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
-from rt_torchrl.twinning.informative_memory import InformativeMemory
 from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
@@ -92,7 +91,6 @@ class ReinforcementTwinning:
         self.fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=self.fed_back)
         self.short_term, self.track_record = ShortTermMemory(config.records), TrackRecord(self.policies)
-        self.informative = InformativeMemory(self.assimilation, config.informative)
         self.virtual = VirtualEpisodes(twin, config.exogenous, config.experience, generator=generator)
         self.virtual.judge_by(getattr(self.planner, "constraints", None), config.planner.extremes)
         self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
@@ -182,7 +180,6 @@ class ReinforcementTwinning:
     def keep(self, flight: Flight) -> None:
         """Both memories hold the sound part of an episode; of those that are refused, none does."""
         self.learning.store(flight.parts(self.twin.plant.dt))
-        self.informative.before(self.short_term, flight.record)
         self.short_term.append(flight.record)
 
     def update_model_free(self) -> TensorDict:
@@ -199,7 +196,6 @@ class ReinforcementTwinning:
         """Step 4: n_G gradient steps on J_p over virtual trajectories with stored actions, of D_S or ``records``."""
         latest, processes = self.virtual.paired(list(records or self.short_term))
         self.earlier.remember()
-        latest = self.informative.with_latest(latest)
         found = self.assimilation.update(latest, processes, self.config.realisations, self.generator)
         fit = findings(J_p_before=found.start, J_p=found.best, closure_gradient=found.gradient, closure_refused=0.0)
         return merged(fit, findings(**self.assimilation.report()))
@@ -293,5 +289,5 @@ class ReinforcementTwinning:
         self.episodes_done = state["episodes_done"]
 
 
-KEPT = ("virtual", "short_term", "informative", "track_record")  # they leave the tensors of their state on their device
+KEPT = ("virtual", "short_term", "track_record")  # they leave the tensors of their state on their device
 COMPONENTS = ("env", "learner", "planner", "planning", "referee", "assimilation", "clearance", *KEPT)

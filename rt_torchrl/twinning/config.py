@@ -27,9 +27,6 @@ class TwinningConfig:
         realisations: number N_z of samples of the exogenous process, for each record in step 4 and in all in step 5.
         records: number n_S of latest real episodes that step 4 trains the twin on; steps 5 and 6 draw exogenous inputs
             from at least as many.
-        informative: number of earlier real episodes that step 4 also trains the twin on, chosen by what they tell about
-            its weights; it needs the inputs of the record. A closure of many weights, such as a perceptron, has a
-            matrix of as many rows and columns for each record.
         virtual_episodes: number N of virtual episodes on which step 5 judges a plan and step 6 compares the policies.
         least_sound: least share of a real episode without a fault, in a row, that is learned from; with a lower share
             the episode is flown again.
@@ -55,7 +52,6 @@ class TwinningConfig:
     arm: Arm = "twinning"
     realisations: int = 5
     records: int = 1
-    informative: int = 0
     virtual_episodes: int = 20
     least_sound: float = 0.5
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
@@ -92,8 +88,8 @@ class TwinningConfig:
                 raise ValueError(f"{argument}={getattr(self, argument)} must be at least 1.")
         if not 0.0 < self.least_sound <= 1.0:
             raise ValueError(f"least_sound={self.least_sound} must lie in (0, 1], a share of an episode.")
-        if self.assimilation.drift and (self.records > 1 or self.informative):
+        if self.assimilation.drift and self.records > 1:
             raise ValueError(
                 f"assimilation.drift={self.assimilation.drift} keeps what earlier episodes told, and would count them "
-                f"twice with records={self.records} and informative={self.informative}; use 1 and 0."
+                f"twice with records={self.records}; use 1."
             )
