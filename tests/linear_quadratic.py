@@ -6,7 +6,9 @@ with the closure C the unknown part of the dynamics. With A and B in real-Jordan
 library's solvers: the tests compute matrix exponentials and Riccati solutions with scipy.
 """
 
+import numpy as np
 import torch
+from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 from torch import nn
 
 from rt_torchrl.plants.plant import Plant
@@ -92,3 +94,27 @@ class LinearQuadratic(Plant):
     def make_policy(self, generator):
         shape = len(self.actions), len(self.observations)
         return LinearGain(0.1 * torch.randn(shape, generator=generator, dtype=torch.float64))
+
+
+def discretised():
+    """Exact A_d, B_d over one interval, and the weights."""
+    A, B, Q, R = (np.array(getattr(LinearQuadratic, name)) for name in "ABQR")
+    block = np.zeros((3, 3))
+    block[:2, :2], block[:2, 2:] = A + np.array(LinearQuadratic.true_closure), B
+    transition = expm(0.1 * block)
+    return transition[:2, :2], transition[:2, 2:], Q, R
+
+
+def optimal_gain(gamma):
+    """Infinite-horizon gain of Σ γ^k (sᵀQs + aᵀRa): the Riccati equation of √γA_d, √γB_d."""
+    A, B, Q, R = discretised()
+    A, B = np.sqrt(gamma) * A, np.sqrt(gamma) * B
+    P = solve_discrete_are(A, B, Q, R)
+    return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+
+
+def discounted_cost(gain, gamma):
+    """Mean of Σ γ^k L_a over starts of unit covariance, by a Lyapunov equation."""
+    A, B, Q, R = discretised()
+    closed = np.sqrt(gamma) * (A - B @ gain)
+    return np.trace(solve_discrete_lyapunov(closed.T, Q + gain.T @ R @ gain))

@@ -5,8 +5,7 @@ import functools
 import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearQuadratic
-from test_optimal_gain import optimal_gain
+from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig

@@ -3,8 +3,7 @@
 import fresh_process
 import pytest
 import torch
-from linear_quadratic import LinearClosure, LinearQuadratic
-from test_optimal_gain import optimal_gain
+from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.control.tuning import tune

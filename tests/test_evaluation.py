@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 from test_classical import PD
-from test_optimal_gain import optimal_gain
 from test_real_system import connected
 
 from rt_torchrl.evaluation.baseline import RealController

@@ -5,15 +5,22 @@ import itertools
 import time
 import warnings
 
+import numpy as np
 import pytest
 import torch
+from hidden_force import Answer, HiddenForce
 from linear_quadratic import LinearGain, LinearQuadratic
-from test_ddpg import explored, seeded
+from scipy.stats import ks_2samp
+from test_learners import explored, seeded
 from torch import nn
 from torch.utils._pytree import tree_flatten_with_path
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, mlp
 from rt_torchrl.programs.vector_functions import Lanes, lanes_of_this_machine
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import DDPG, LearnerConfig, ddpg, make_learner
 from rt_torchrl.twinning.learners.explicit import formulas
 from rt_torchrl.twinning.learners.explicit.formulas import Ascent, CriticShape, RowFunction, TemporalDifferences
@@ -245,3 +252,40 @@ def test_the_formulas_take_less_than_half_the_time():
     times = [[cpu_seconds(each) for each in both] for _ in range(4)][1:]
     print("CPU seconds of an update, TorchRL and formulas:", times)
     assert sum(one for one, _ in times) > 2.0 * sum(other for _, other in times)
+
+
+def learning_curves(seeds, update):
+    """J/J* of trainings of the model-free half from half the optimal gain, after each episode."""
+    config = LearnerConfig(return_steps=10, critic_iterations=300, actor_iterations=300, update=update)
+    answer, curves = Answer(HiddenForce()), []
+    for seed in seeds:
+        plant = HiddenForce()
+        training = ReinforcementTwinning(
+            PlantEnv(plant, seed=1000 + seed),
+            DigitalTwin(plant, plant.closure),
+            model_free=LinearGain(0.5 * answer.gain),
+            model_based=LinearGain(0.5 * answer.gain),
+            config=TwinningConfig(arm="model_free", learner=config),
+            generator=torch.Generator().manual_seed(seed),
+        )
+        gains = []
+        for _ in range(3):
+            training.episode()
+            gains.append(training.policies["model_free"].gain.detach().numpy().copy())
+        curves.append([1.0 + answer.excess(gain) for gain in gains])
+    return np.array(curves)
+
+
+@pytest.mark.nightly
+def test_learning_curves_of_ten_seeds_are_those_of_torchrl(unchecked):
+    expected, same, others = (
+        learning_curves(seeds, update)
+        for seeds, update in ((range(10), "torchrl"), (range(10), "explicit"), (range(10, 20), "explicit"))
+    )
+    for name, curves in {"torchrl": expected, "explicit": same, "explicit, other seeds": others}.items():
+        print(f"{name}: J/J* of ten seeds: medians {np.median(curves, 0)}, last {np.sort(curves[:, -1])}")
+    # The same seeds give the same curves: what differs by rounding stays close over a thousand iterations.
+    np.testing.assert_allclose(same, expected, rtol=1e-3)
+    p = ks_2samp(expected[:, -1], others[:, -1]).pvalue
+    print(f"two-sample Kolmogorov-Smirnov test of the last costs with other seeds: p = {p:.3f}")
+    assert p > 0.05

@@ -1,4 +1,4 @@
-"""Whatever gives a policy new weights is judged alike: plans from other weights, updates, clones."""
+"""Whatever gives a policy new weights is judged alike: plans from other weights, updates of step 2, clones."""
 
 import copy
 import math
@@ -8,6 +8,7 @@ import torch
 from linear_quadratic import LinearGain
 from tensordict import TensorDict
 from test_evidence import Content, judge_of
+from test_first_controller import twinning
 
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -127,3 +128,41 @@ def test_a_clone_replaces_weights_that_flights_refute(evidence, kept):
         judgement=judgement(evidence),
     )
     assert said(idle) == kept and ("reason" in report) == (evidence is None)
+
+
+GAINS = {"ruined": -0.6, "better": 0.9}
+
+
+def updated(wanted, **options):
+    """An algorithm after an episode in which step 2 sets the gains of the model-free policy; the imitation has 0.4."""
+    found = twinning(**options)
+    critic = found.learner.update
+
+    def update():
+        report = critic()
+        found.policies["model_free"].gain.data.fill_(GAINS[wanted])
+        return report
+
+    found.learner.update = update
+    return found, found.episode()
+
+
+def test_a_worse_update_is_taken_back_and_its_moments_are_forgotten():
+    found, report = updated("ruined", judged_updates=True)
+    gain = found.policies["model_free"].gain.detach()
+    torch.testing.assert_close(gain, torch.tensor([[0.4, 0.3]], dtype=torch.float64), rtol=1e-2, atol=1e-2)
+    assert report["update_accepted"] == 0.0 and "update refused: J_a of model_free would be" in report["reason"]
+    assert not found.learner.actor_optimiser.state and report["weight_change"] < 1e-2
+
+
+def test_a_better_update_stays():
+    found, report = updated("better", judged_updates=True)
+    assert report["update_accepted"] == 1.0 and "reason" not in report
+    assert found.policies["model_free"].gain.detach().unique().tolist() == [GAINS["better"]]
+
+
+@pytest.mark.parametrize("options", [{}, {"judged_updates": True, "arm": "model_free"}])
+def test_every_update_stays_where_none_is_judged(options):
+    found, report = updated("ruined", **options)
+    assert "update_accepted" not in report
+    assert found.policies["model_free"].gain.detach().unique().tolist() == [GAINS["ruined"]]

@@ -1,18 +1,19 @@
-"""Step 2 by DDPG: isolated gradients, hand-computed TD errors, bootstrapping, targets."""
+"""Step 2 by DDPG and TD3: gradients, TD errors, bootstrapping, targets, and the optimal gain of a Riccati equation."""
 
 import contextlib
 import copy
 import re
 
+import numpy as np
 import pytest
 import torch
-from linear_quadratic import LinearGain, LinearQuadratic
+from linear_quadratic import LinearGain, LinearQuadratic, discounted_cost, optimal_gain
 from tensordict import TensorDict
 from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.twinning.learners import DDPG, TD3, LearnerConfig
-from rt_torchrl.twinning.learners.config import LongTermMemoryConfig
+from rt_torchrl.twinning.learners.config import LongTermMemoryConfig, TD3Config
 from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory
 
 GAMMA = 0.9
@@ -93,8 +94,7 @@ def test_a_transition_that_is_not_finite_is_refused_by_name(kind, key, value):
     assert_equal(found.state_dict()["loss"], before["loss"])
 
 
-@pytest.mark.parametrize("update", ["explicit", "torchrl"])
-@pytest.mark.parametrize("kind", [DDPG, TD3])
+@pytest.mark.parametrize(("kind", "update"), [(DDPG, "explicit"), (DDPG, "torchrl"), (TD3, "torchrl")])
 @pytest.mark.parametrize("rate", ["critic_rate", "actor_rate"])
 def test_an_update_that_leaves_numbers_that_are_not_finite_is_taken_back_and_said(kind, rate, update):
     """A second step of 1e308 overflows."""
@@ -219,3 +219,118 @@ def test_restart_forgets_the_moments_of_the_policys_optimiser():
     found.update()
     # Adam's first step has the length of the rate in each direction, up to ε = 1e-8 over the gradient.
     torch.testing.assert_close((found.policy.gain - before).abs(), torch.full((1, 2), 0.01).double(), rtol=1e-4, atol=0)
+
+
+def td3_learner(seed=0, td3=None, **options):
+    return learner(seed, TD3, td3=td3 or TD3Config(smoothing=0.0), **options)
+
+
+def critics(found, *, target):
+    """The two critics, or their targets, as plain modules."""
+    weights = found.loss.target_qvalue_network_params if target else found.loss.qvalue_network_params
+    modules = []
+    for k in range(2):
+        module = copy.deepcopy(found.critics[k])
+        named = weights[k].flatten_keys(".")
+        with torch.no_grad():
+            for name, weight in module.named_parameters():
+                weight.copy_(named["module." + name])
+        modules.append(module)
+    return modules
+
+
+def test_the_critics_start_apart_and_from_the_generator():
+    one, other = (critics(td3_learner(), target=False) for _ in range(2))
+    assert torch.equal(one[0].network[0].weight, other[0].network[0].weight)
+    assert not torch.equal(one[0].network[0].weight, one[1].network[0].weight)
+
+
+def test_the_target_is_the_lower_of_two_at_the_delayed_policys_action():
+    """max_i |r + γ min_j q_j′(e′, π′(e′)) − q_i(e, a)| by hand, without noise."""
+    found, data = td3_learner(target_rate=0.3, critic_iterations=20), explored(10)
+    filled(data, found)
+    found.update()
+    first = data[:6].clone()
+    following, reward = first["next", "observation"], first["next", "reward"]
+    delayed = LinearGain(found.loss.target_actor_network_params.flatten_keys(".")["module.gain"].detach())
+    assert not torch.equal(delayed.gain, found.policy.gain)
+    with torch.no_grad():
+        values = [q(following, delayed(following)) for q in critics(found, target=True)]
+        y = reward + GAMMA_IN_TORCHRL * torch.minimum(*values)
+        deltas = [(y - q(first["observation"], first["action"])).abs() for q in critics(found, target=False)]
+    expected = torch.maximum(*deltas)[:, 0]
+    torch.testing.assert_close(found.td_errors(first), expected, rtol=1e-10, atol=1e-12)
+
+
+def test_smoothing_moves_targets_by_no_more_than_its_limit():
+    """Noise of at most 10 % of half the range moves |δ| less than noise of up to twice that half."""
+    data = explored(40)
+    quiet = td3_learner().td_errors(data)
+    limits = 0.1, 2.0
+    gaps = [
+        (td3_learner(td3=TD3Config(smoothing=1.0, smoothing_limit=limit)).td_errors(data) - quiet).abs().max()
+        for limit in limits
+    ]
+    # The perceptrons are nearly linear over so short a way: the ratio of the limits, within a factor of two.
+    assert gaps[0] > 0.0 and 0.5 * limits[1] / limits[0] / 2.0 < gaps[1] / gaps[0] < 2.0 * limits[1] / limits[0]
+
+
+def test_smoothing_is_drawn_from_the_learners_generator():
+    errors = []
+    for _ in range(2):
+        torch.manual_seed(np.random.default_rng().integers(2**31))
+        found = td3_learner(td3=TD3Config())
+        state = torch.get_rng_state()
+        errors.append(found.td_errors(explored(10)))
+        assert torch.equal(state, torch.get_rng_state())
+    assert torch.equal(*errors)
+
+
+@pytest.mark.parametrize("delay, policy_steps", [(1, 7), (2, 3), (3, 2)])
+def test_the_policy_and_the_targets_follow_with_their_delay(monkeypatch, delay, policy_steps):
+    options = {"critic_iterations": 7, "actor_iterations": 50}
+    found, calls = td3_learner(td3=TD3Config(delay=delay), **options), []
+    filled(explored(10), found)
+    for part, label in ((found.critic_optimiser, "q"), (found.actor_optimiser, "a"), (found.target, "t")):
+        step = part.step
+        monkeypatch.setattr(part, "step", lambda label=label, step=step: calls.append(label) or step())
+    found.update()
+    assert calls.count("q") == 7 and calls.count("a") == calls.count("t") == policy_steps
+    assert calls[:delay] == ["q"] * delay and calls[delay : delay + 2] == ["a", "t"]
+
+
+@pytest.mark.parametrize("change", [{"delay": 0}, {"smoothing": -0.1}, {"smoothing_limit": float("nan")}])
+def test_wrong_parameters_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        TD3Config(**change)
+
+
+@pytest.mark.parametrize(
+    ("make", "updates", "options"),
+    [
+        # Measured at the end: 0.07 to 0.09 of ‖K*‖.
+        pytest.param(learner, 45, {"actor_iterations": 20, "actor_rate": 0.02}, id="ddpg"),
+        # The lower of two critics leans towards small actions.
+        pytest.param(
+            td3_learner,
+            30,
+            {"td3": TD3Config(smoothing=0.05, smoothing_limit=0.1), "actor_rate": 0.01},
+            id="td3",
+        ),
+    ],
+)
+def test_policy_finds_the_optimal_gain(make, updates, options, unchecked):
+    """On 5000 transitions of a noise-free plant."""
+    best = optimal_gain(GAMMA)
+    critic = {"critic_hidden": (64, 64), "critic_iterations": 100, "critic_rate": 3e-3, "target_rate": 0.05}
+    found = make(batch_size=256, **critic, **options)
+    start, data = found.policy.gain.detach().numpy().copy(), explored(1000, spread=1.0)
+    filled(data, found, prioritisation=0.0)
+    for _ in range(updates):
+        found.update()
+    gain = found.policy.gain.detach().numpy()
+    # ‖K − K*‖/‖K*‖ from 0.87. The critics are perceptrons, no quadratic forms, and wander with Adam's steps. The cost
+    # is flat at its minimum.
+    assert np.linalg.norm(start - best) > 0.8 * np.linalg.norm(best)
+    assert np.linalg.norm(gain - best) < 0.15 * np.linalg.norm(best)
+    assert 1.0 <= discounted_cost(gain, GAMMA) / discounted_cost(best, GAMMA) < 1.01
