@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.results import Entry, arm_entry
 from rt_torchrl.study.training import Training
 from rt_torchrl.twinning.evidence import alarm
@@ -55,10 +54,6 @@ class Arm:
     def sums(self) -> list[float]:
         """Sum of the real costs of each seed."""
         return [sum(costs) for costs in self.paid]
-
-    def sum_interval(self) -> tuple[float, float]:
-        """95 % bootstrap interval over the seeds of the mean sum of real costs."""
-        return mean_interval(np.array(self.sums())[:, None])
 
 
 @dataclass(frozen=True)

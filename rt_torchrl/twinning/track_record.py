@@ -142,11 +142,6 @@ class TrackRecord:
     def _predicted(self, flown: Flown, virtual: VirtualEpisodes) -> float:
         return virtual.cost(self._policy(flown), virtual.repeated(flown.trajectory)).item()
 
-    @property
-    def latest_record(self) -> Trajectory:
-        """The latest real episode."""
-        return self._flown[-1].trajectory
-
     def policy_flown(self) -> nn.Module:
         """The policy that has flown the latest episode, with the weights that it had in it."""
         return self._policy(self._flown[-1])
