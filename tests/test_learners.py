@@ -316,6 +316,7 @@ def test_wrong_parameters_are_refused(change):
             30,
             {"td3": TD3Config(smoothing=0.05, smoothing_limit=0.1), "actor_rate": 0.01},
             id="td3",
+            marks=pytest.mark.nightly,  # TorchRL's loss takes a minute
         ),
     ],
 )
