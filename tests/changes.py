@@ -310,6 +310,10 @@ HELD = {
         holding(lambda: np.array([0.1]), lambda plant: torch.as_tensor(plant.thing)),
         lambda value, plant: plant.thing.fill(value),
     ),
+    "context variable": (
+        holding(lambda: CONTEXT, lambda plant: plant.thing.get()),
+        lambda value, plant: CONTEXT.set(value) and None,
+    ),
     "number": (
         holding(lambda: 0.1, lambda plant: plant.thing),
         lambda value, plant: setattr(plant if "thing" in vars(plant) else type(plant), "thing", value),
@@ -346,6 +350,7 @@ REFUSED = {
     "global object of another module": "settings.OPTIONS",
     "global import": "imports 'settings_of_a_user' inside",
     "global import from": "imports 'settings_of_a_user' inside",
+    "attribute context variable": "the attribute thing, a ContextVar",
     "dict around a class": "variable table of the function around it, a dict",
 } | {
     f"class {kind}": "class attribute Attributed.thing" for kind in (*(name for name in HELD if "number" not in name),)

@@ -102,6 +102,7 @@ class Other(Plain):
 FURTHER = {
     "a plain tensor, behind torch's back": lambda m: m.plain.data.add_(1e-12),
     "the memory of a plain tensor": lambda m: m.plain.numpy().__setitem__(0, 2.0),
+    "the type of a weight": lambda m: m.linear.float(),
     "other memory for a buffer": lambda m: setattr(m.offset, "data", torch.zeros(2, dtype=torch.float64)),
     "a transposed tensor": lambda m: m.transposed.numpy().__setitem__((1, 1), 2.0),
     "the strides of a tensor": lambda m: m.transposed.t_(),

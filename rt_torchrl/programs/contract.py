@@ -133,12 +133,10 @@ class Holdings:
             return self._read_tensor(x)
         if isinstance(x, np.ndarray) and not x.dtype.hasobject:
             self._constants.append(x)
-            self._complete &= x.base is None or isinstance(x.base, np.ndarray)
             return [x.shape, str(x.dtype), hashlib.sha256(_bytes(x)).digest()]
         parts = [*self._elements(x), *self._slots(x)]
         if not isinstance(x, types.FunctionType) and hasattr(x, "__dict__"):
-            if id(x) in self._numbers and self._numbers[id(x)]:
-                self._instances.append(x)
+            self._instances += [x] if self._numbers[id(x)] else []  # all but the root
             parts += chain(vars(x), vars(x).values())
         elif not parts and not isinstance(x, (tuple, frozenset, list, dict, set)):
             return self._address(x)
@@ -183,8 +181,8 @@ class Holdings:
 
     def _slots(self, x: Any) -> Iterator[object]:
         """The attributes of an object that are not in its dictionary."""
-        for kind in (kind for kind in type(x).__mro__ if "__slots__" in vars(kind)):
-            for name, slot in vars(kind).items():
+        for kind in type(x).__mro__:
+            for name, slot in () if foreign(kind.__module__) else vars(kind).items():
                 if isinstance(slot, types.MemberDescriptorType):
                     self._complete &= hasattr(x, name)  # which may get a value
                     self._parts += [(x, name)] if hasattr(x, name) else []
@@ -220,7 +218,7 @@ class Holdings:
                 and [x.requires_grad for x in self._tensors] == self._graded
                 and [*map(_bytes, self._constants)] == self._bytes
             )
-        except (AttributeError, ValueError):  # a variable of a function or a slot has lost its value
+        except (AttributeError, ValueError, RuntimeError):  # a value is lost, or a tensor has another type
             return False
 
 
@@ -372,6 +370,9 @@ class _Reads:
         if foreign(kind.__module__):
             return
         own = {} if isinstance(x, type) else getattr(x, "__dict__", {})
+        for name in own.keys() & named.keys():
+            if isinstance(own[name], contextvars.ContextVar):  # of which nothing is known but its address
+                raise _refusal(named[name], f"the attribute {name}", own[name])
         functions = {name: _function_of(f) for owner in kind.__mro__ for name, f in vars(owner).items()}
         methods = {name: f.__code__ for name, f in functions.items() if f is not None and f.__code__ in self._codes}
         for name, code in {name: code for name, code in (methods | named).items() if name not in own}.items():

@@ -1,8 +1,7 @@
 """The digital twin: a plant's vector field and step under a learned closure."""
 
 import copy
-from operator import is_
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,7 +10,7 @@ from torch import Tensor, nn
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Start, Starts
 from rt_torchrl.programs.contract import Holdings
-from rt_torchrl.trajectories.rollout import Engine, Rollout, able
+from rt_torchrl.trajectories.rollout import Engine, Rollout, able, require_double
 from rt_torchrl.trajectories.sensitivity import Sensitivities
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
@@ -118,28 +117,27 @@ class DigitalTwin:
     def _planning(self, policy: nn.Module) -> Rollout:
         """The rollout of a policy under the closure held constant, kept as long as both are the same."""
         for planned in self._planned:
-            if planned.rollout.plant is self.plant and planned.serves(self.closure, policy):
+            if planned.serves(self.plant, self.closure, policy):
+                require_double("policy", policy)
                 return planned.rollout
-        modules = nn.ModuleList([self.closure, policy])
-        new = _Planned(modules, self._rollout(constant(self.closure), policy))
+        rollout = self._rollout(constant(self.closure), policy)
+        new = _Planned(self.closure, policy, rollout, Holdings(self.closure))
         self._planned = [new, *self._planned[: KEPT - 1]]
-        return new.rollout
+        return rollout
 
 
-class _Planned:
-    """A rollout with a constant copy of a closure, which shares its weights and buffers.
+class _Planned(NamedTuple):
+    """A rollout with a constant copy of a closure, which shares its weights and buffers, and what the closure held."""
 
-    Args:
-        modules: the closure and the policy.
-        rollout: the rollout.
-    """
+    closure: nn.Module
+    policy: nn.Module
+    rollout: Rollout
+    holdings: Holdings
 
-    def __init__(self, modules: nn.ModuleList, rollout: Rollout):
-        self.rollout, self._pair, self._holdings = rollout, modules, Holdings(modules)
-
-    def serves(self, *modules: nn.Module) -> bool:
-        """Whether closure and policy are those of the rollout, and nothing but their weights' values has changed."""
-        return all(map(is_, self._pair, modules)) and self._holdings.unchanged(self._pair)
+    def serves(self, plant: Plant, closure: nn.Module, policy: nn.Module) -> bool:
+        """Whether the rollout is of these, and nothing of the closure has changed but the values of its weights."""
+        same = plant is self.rollout.plant and closure is self.closure and policy is self.policy
+        return same and self.holdings.unchanged(closure)
 
 
 def constant(module: nn.Module) -> nn.Module:
