@@ -136,12 +136,13 @@ class Tracer(TorchDispatchMode):
 
     def assign(self, x: Tensor, cells: Tensor) -> None:
         """Let a new tensor hold values of the program; a part of a storage leaves the rest of it as it is."""
-        cell = self._cells.get(_storage_of(x))
+        storage = _storage_of(x)  # now, because code that is traced may not ask for it once its numbers vary
+        cell = self._cells.get(storage)
         if cell is None:
             cell = torch.zeros(x.untyped_storage().nbytes() // max(1, x.element_size()), dtype=torch.int64)
         once = tuple(slice(1) if stride == 0 else slice(None) for stride in x.stride())
         torch.as_strided(cell, x.shape, x.stride(), x.storage_offset())[once].copy_(cells[once])
-        self._cells[_storage_of(x)] = cell
+        self._cells[storage] = cell
         self._alive.append(x)
 
     def input(self, x: Tensor, name: str) -> None:
