@@ -65,18 +65,18 @@ class LaggedInflow(Extension):
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         plant: Any = self.base
         (base, hidden), inner, u = self.split(state), self.of_base(closure), exogenous[..., 0]
+        # The floor is that of the torque, where the rotor hardly turns.
+        speed = torch.maximum(base[..., 0], plant.least_tip_speed_ratio * u / plant.radius)
         torque = plant.aerodynamic_torque(base[..., 0], action[..., 1], u, inner)
+        power = self.of == "power"
+        missing = hidden[..., 0] * MEGA / speed - torque if power else hidden[..., 0] - torque
         field = plant.vector_field(t, base, action, exogenous, inner)
-        if self.of == "torque":
-            missing = hidden[..., 0] - torque
-            rate = -missing / self.time_constant
-        else:
-            # The floor is that of the torque, where the rotor hardly turns.
-            speed = torch.maximum(base[..., 0], plant.least_tip_speed_ratio * u / plant.radius)
-            missing = hidden[..., 0] * MEGA / speed - torque
-            rate = -(missing * speed) / (MEGA * self.coefficients(closure)[0])
         accelerated = field[..., :1] + (missing / plant.inertia).unsqueeze(-1)
-        return torch.cat([accelerated, field[..., 1:], rate.unsqueeze(-1)], -1)
+        if power:
+            rate = -(missing * speed).unsqueeze(-1) / (MEGA * self.coefficients(closure)[0])
+        else:
+            rate = -missing.unsqueeze(-1) / self.time_constant
+        return torch.cat([accelerated, field[..., 1:], rate], -1)
 
     def rest(self, base: State) -> Hidden:
         plant: Any = self.base
