@@ -18,7 +18,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -59,6 +59,7 @@ MOST_UNKNOWNS = 1000
 """Greatest number of first states of segments; the normal equations hold its square."""
 
 
+@runtime_checkable
 class Fitted(Protocol):
     """Result of one descent."""
 

@@ -200,7 +200,7 @@ class Assimilation:
     def _over_segments(self, whole: Trajectory) -> Descended:
         """Descend over whole records, or over the longest segments that the twin follows as well as shorter ones."""
         plant, intervals = self.twin.plant, whole.actions.shape[1]
-        scatter = plant.discrepancy(whole.states, whole.states.mean(1, keepdim=True)).mean()
+        scatter = plant.discrepancy(whole.states, whole.states.mean(1, keepdim=True).expand_as(whole.states)).mean()
 
         def fit(length: int) -> tuple[Descended, Tensor]:
             found = self._descend_anew(whole.segments(length, plant.dt) if length else whole)
