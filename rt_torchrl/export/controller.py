@@ -47,6 +47,7 @@ class Controller:
         self.held = [names.index(name) for name in plant.controller_states]
         self.measured = [k for k in range(len(names)) if k not in self.held]
         self._order = torch.tensor([*self.measured, *self.held]).argsort()
+        self._moving = copy.deepcopy(self.plant)
 
     def start(self, measured: Float[Tensor, "*batch n_y"], inputs: Float[Tensor, "*batch n_z"]) -> Tensor:
         """The controller's states c_0 at the first measurement.
@@ -107,13 +108,18 @@ class Controller:
 
     def _along(self, rate: Tensor) -> Plant:
         """The plant whose measured states change at a given rate."""
-        plant, field = copy.copy(self.plant), self.plant.vector_field
+        inner, field = self._moving.innermost, self.plant.innermost.vector_field
+        # Extensions call the vector field of the plant that they extend, whose states are the first ones.
+        n = len(inner.states)
+        measured, held = ([k for k in places if k < n] for places in (self.measured, self.held))
+        order = torch.tensor([*measured, *held]).argsort()
 
         def given(t: Tensor, state: Tensor, action: Tensor, exogenous: Tensor, closure: nn.Module) -> Tensor:
-            return self._joined(rate, field(t, state, action, exogenous, closure)[..., self.held])
+            own = field(t, state, action, exogenous, closure)[..., held]
+            return torch.cat([rate[..., : len(measured)], own], -1)[..., order]
 
-        vars(plant)["vector_field"] = given
-        return plant
+        vars(inner)["vector_field"] = given
+        return self._moving
 
     def _joined(self, measured: Tensor, memory: Tensor) -> Tensor:
         """States of measured ones and the controller's, in the plant's order."""

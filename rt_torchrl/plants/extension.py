@@ -152,6 +152,10 @@ class Extension(Plant):
         n = len(self.base.states)
         return state[..., :n], state[..., n:]
 
+    def joined(self, base: Float[Tensor, "*batch n_b"], hidden: Hidden) -> State:
+        """All states, of which :meth:`split` gives the two parts."""
+        return torch.cat([base, hidden], -1)
+
     def of_base(self, closure: nn.Module) -> nn.Module:
         """The part of the closure that belongs to the plant."""
         return closure.get_submodule("base") if self._parameterised else closure
@@ -166,27 +170,31 @@ class Extension(Plant):
         base, hidden = self.split(state)
         acting, met = self.acting(hidden, action), self.meeting(hidden, exogenous)
         field = self.base.vector_field(t, base, acting, met, self.of_base(closure))
-        return torch.cat([field, self.rates(hidden, action, closure)], -1)
+        return self.joined(field, self.rates(hidden, action, closure))
 
     def advance(self, t: Time, state: State, applied: Action, exogenous: Input, closure: nn.Module) -> State:
         """The plant's own scheme under the mean of the action that acts on it in this interval."""
         base, hidden = self.split(state)
         acting, end = self.respond(hidden, applied, closure)
         met = self.meeting(hidden, exogenous)
-        return torch.cat([self.base.advance(t, base, acting, met, self.of_base(closure)), end], -1)
+        return self.joined(self.base.advance(t, base, acting, met, self.of_base(closure)), end)
 
     def actuate(self, state: State, command: Action) -> Action:
         return self.base.actuate(self.split(state)[0], command)
 
     def latch(self, state: State, applied: Action) -> State:
         base, hidden = self.split(state)
-        return torch.cat([self.base.latch(base, applied), hidden], -1)
+        return self.joined(self.base.latch(base, applied), hidden)
+
+    def memorise(self, t: Time, state: State, exogenous: Input) -> State:
+        base, hidden = self.split(state)
+        return self.joined(self.base.memorise(t, base, exogenous), hidden)
 
     def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
         return self._with_rest(self.base.at_rest(read))
 
     def _with_rest(self, base: Float[Tensor, "*batch n_b"]) -> State:
-        return torch.cat([base, self.rest(base)], -1)
+        return self.joined(base, self.rest(base))
 
     # The task, which is that of the plant
 

@@ -156,6 +156,13 @@ class Plant(nn.Module, ABC):
         """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
+    def memorise(self, t: Time, state: State, exogenous: Input) -> State:
+        """The state, into which the controller writes what it keeps of this moment's signals; by default nothing.
+
+        Inputs are those that sensors read, also where an extension lets others act on the plant.
+        """
+        return state
+
     def latch(self, state: State, applied: Action) -> State:
         """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
@@ -168,10 +175,11 @@ class Plant(nn.Module, ABC):
         return rk4_step(lambda t, s: self.vector_field(t, s, applied, exogenous, closure), t, state, self.dt)
 
     def step(self, t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module) -> Transition:
-        r"""One control interval from ``t`` on, :math:`\Phi`: actuate, advance under the held action, latch.
+        r"""One control interval from ``t`` on, :math:`\Phi`: memorise, actuate, advance under the held action, latch.
 
         The closure is the true one in the real system, and the learned one in the twin.
         """
+        state = self.memorise(t, state, exogenous)
         applied = self.actuate(state, command)
         return Transition(self.latch(self.advance(t, state, applied, exogenous, closure), applied), applied)
 

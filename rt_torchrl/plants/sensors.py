@@ -68,9 +68,10 @@ class BiasedSensor(Extension):
             )
         if not 0.0 < scale < math.inf or not (math.isfinite(offset) and math.isfinite(drift)):
             raise ValueError(f"scale={scale} must be positive, offset={offset} and drift={drift} finite.")
-        if base.controller_states:
+        inner = base.innermost.controller_states  # past observations are those of the reading
+        if inner:
             raise ValueError(
-                f"plant {base.name!r} computes {', '.join(base.controller_states)} from what is true, not from the "
+                f"plant {base.name!r} computes {', '.join(inner)} from what is true, not from the "
                 f"reading of {state}; a biased sensor needs a plant without controller_states."
             )
         self.place, self.state = names.index(state), state

@@ -1,0 +1,260 @@
+"""Policies that observe past observations: by hand, in both engines, with extensions, in C, in runs and from logs."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from c_build import generator, needs_compiler
+from linear_quadratic import LinearGain, LinearQuadratic
+from small_runs import SMALL
+from test_export_controller import InC
+
+from rt_torchrl import (
+    BiasedSensor,
+    DelayedActuator,
+    LaggedActuator,
+    NeuralResidual,
+    Run,
+    RunConfig,
+    StackedObservations,
+    UnreadInput,
+    check_plant,
+    export_controller,
+    shipped_plants,
+)
+from rt_torchrl.plants.signal import Signal
+from rt_torchrl.trajectories.rollout import Rollout
+from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
+
+DT = 0.1
+
+
+class Timed(LinearQuadratic):
+    """The oracle plant, of which policies observe what depends on time, state and input."""
+
+    def observe(self, t, state, exogenous):
+        x, _ = state.unbind(-1)
+        return torch.stack([x + torch.sin(3.0 * t), exogenous[..., 0] + 0.0 * x], -1)
+
+    def suspects(self):
+        return {"late": DelayedActuator(self, "force", 2 * self.dt), "lag": LaggedActuator(self, "force", 0.3)}
+
+
+def residual(plant):
+    """The plant with a network that is no longer zero."""
+    found = NeuralResidual(plant, {"velocity": 1.0}, inputs=("force",))
+    with torch.no_grad():
+        for weight in found.closure.own.parameters():
+            weight.copy_(torch.randn(weight.shape, generator=generator(), dtype=weight.dtype))
+    return found
+
+
+EXTENSIONS = {
+    "none": lambda plant: plant,
+    "lag": lambda plant: LaggedActuator(plant, "force", 0.3),
+    "delay": lambda plant: DelayedActuator(plant, "force", 0.2),
+    "bias": lambda plant: BiasedSensor(plant, "position", 0.4, 0.1, scale=1.0),
+    "unread": lambda plant: UnreadInput(plant, "disturbance", 0.5, [2.0]),
+    "residual": residual,
+}
+
+
+def flight(plant, n=12, batch=3):
+    """Initial states, inputs, and commands within the range of the actions."""
+    start, exogenous = plant.draw_initial_state(batch, generator(1)), plant.draw_exogenous(batch, generator(2))[:, :n]
+    share = torch.rand(batch, n, len(plant.actions), generator=generator(3), dtype=torch.float64)
+    low, high = (torch.tensor([getattr(a, end) for a in plant.actions], dtype=torch.float64) for end in ("low", "high"))
+    return start, exogenous, low + share * (high - low)
+
+
+def observed(plant, states, exogenous):
+    """The observations in every interval of a flight."""
+    n = exogenous.shape[1]
+    return plant.observe(plant.dt * torch.arange(n, dtype=torch.float64), states[:, :n], exogenous)
+
+
+def by_hand(now, count):
+    """Present and past observations, from the present ones of a flight."""
+    places = torch.arange(now.shape[1])
+    return torch.cat([now[:, (places - k).clamp(min=0)] for k in range(count + 1)], -1)
+
+
+@pytest.mark.parametrize("engine", ["autograd", "native"])
+@pytest.mark.parametrize("kind", EXTENSIONS)
+def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(kind, engine):
+    extend, base = EXTENSIONS[kind], Timed()
+    plain = extend(base)
+    start, exogenous, commands = flight(plain)
+    flown = Rollout(plain, plain.closure, engine=engine)(start, exogenous, commands)
+    expected = by_hand(observed(plain, flown.states, exogenous), 3)
+    for plant in (StackedObservations(plain, 3), extend(StackedObservations(base, 3))):
+        assert plant.unread == plain.unread and len(plant.observations) == 8
+        stacked = plant.draw_initial_state(3, generator(1))
+        found = Rollout(plant, plant.closure, engine=engine)(stacked, exogenous, commands)
+        # The own scheme of a stacked plant has the residual push before and after, to second order.
+        close = 1e-3 if kind == "residual" and plant.base is not plain else 1e-13
+        torch.testing.assert_close(observed(plant, found.states, exogenous), expected, rtol=close, atol=close)
+        now = observed(plant, found.states, exogenous)[..., :2]
+        torch.testing.assert_close(observed(plant, found.states, exogenous), by_hand(now, 3), rtol=1e-14, atol=1e-14)
+        costs = [
+            p.running_cost(torch.zeros(1), x.states[:, :-1], commands, exogenous)
+            for p, x in ((plain, flown), (plant, found))
+        ]
+        torch.testing.assert_close(*costs, rtol=close, atol=close)
+
+
+@pytest.mark.parametrize("name", shipped_plants())
+def test_the_plants_and_all_that_they_suspect(name):
+    plant = StackedObservations(shipped_plants()[name](), 2)
+    suspects = {**plant.suspects(), **plant.further_suspects()}
+    assert suspects.keys() == {**plant.base.suspects(), **plant.base.further_suspects()}.keys()
+    n_o, readings = len(plant.base.observations), len(plant.states)
+    for each in (plant, *suspects.values()):
+        assert each.readings == plant.states and each.observations == plant.observations
+        start, exogenous, commands = flight(each, n=4, batch=2)
+        with torch.no_grad():
+            states = Rollout(each, each.closure, engine="autograd")(start, exogenous, commands).states
+        found = observed(each, states, exogenous)
+        torch.testing.assert_close(found, by_hand(found[..., :n_o], 2), rtol=0.0, atol=0.0)
+        # A twin begins a replay with what was read.
+        again = each.at_rest(states[:, 0, :readings])
+        assert torch.equal(again[:, :readings], states[:, 0, :readings])
+
+
+@pytest.mark.parametrize("extend", [EXTENSIONS["none"], EXTENSIONS["lag"]], ids=["none", "lag"])
+def test_gradients_of_native_are_those_of_autograd_and_of_differences(extend):
+    plant = extend(StackedObservations(Timed(), 2))
+    policy, (start, exogenous, _) = plant.make_policy(generator(4)), flight(plant, n=20)
+    closure = plant.make_closure(generator(5))
+    weights = [*policy.parameters(), *(w for w in closure.parameters() if w.requires_grad)]
+
+    def cost(engine="autograd"):
+        return Rollout(plant, closure, policy, engine=engine).costs(start, exogenous).mean()
+
+    found = {engine: torch.autograd.grad(cost(engine), weights) for engine in ("autograd", "native")}
+    for one, other in zip(*found.values(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-13)
+    weight, slope = weights[0], found["native"][0]
+    assert slope.shape == (1, 6) and (slope != 0.0).all()
+    for k in range(slope.numel()):
+        with torch.no_grad():
+            ends = []
+            for shift in (1e-5, -2e-5):
+                weight.view(-1)[k] += shift
+                ends.append(cost().item())
+            weight.view(-1)[k] += 1e-5
+        assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(slope.view(-1)[k].item(), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("extend", [EXTENSIONS["none"], EXTENSIONS["delay"]], ids=["none", "delay"])
+def test_the_plant_fulfils_the_contract(extend):
+    check_plant(extend(StackedObservations(Timed(), 2)), episodes=2, steps=10)
+
+
+class Mass(LinearQuadratic):
+    """A free mass of which only the position is seen: x_{k+1} = x_k + Δt v_k + ½Δt² a_k, v_{k+1} = v_k + Δt a_k."""
+
+    A, true_closure = ((0.0, 1.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, 0.0))
+    observations = LinearQuadratic.observations[:1]
+
+    def observe(self, t, state, exogenous):
+        return state[..., :1]
+
+
+def test_two_positions_hold_a_mass_that_no_law_of_one_position_holds():
+    r"""A difference of positions is a speed: a_k = −p x_k − d (x_k − x_{k−1})/Δt.
+
+    With c = Δt²/2 and the gains g of the positions, the loop's poles are the zeros of
+    :math:`z^3 - 2z^2 + z + c(z + 1)(g_1z + g_2)`. With g_2 = 0 the product of the two others is 1 + c g_1, which must
+    be below 1, while 2 c g_1, the value at z = 1, must be positive.
+    """
+    p, d, n = 1.0, 1.5, 300
+    gains = np.array([p + d / DT, -d / DT])
+    loop = np.polyadd([1.0, -2.0, 1.0, 0.0], 0.5 * DT**2 * np.polymul([1.0, 1.0], gains))
+    assert np.abs(np.roots(loop)).max() < 0.95
+    for gain in np.linspace(-5.0, 20.0, 101):
+        alone = np.polyadd([1.0, -2.0, 1.0], 0.5 * DT**2 * gain * np.array([1.0, 1.0]))
+        assert np.abs(np.roots(alone)).max() >= 1.0 - 1e-7
+    plant = StackedObservations(Mass(dt=DT, horizon=n * DT, noise=0.0), 1)
+    start, exogenous = plant.draw_initial_state(4, generator()), torch.zeros(4, n, 1, dtype=torch.float64)
+    flown = Rollout(plant, plant.closure, LinearGain(gains[None]))(start, exogenous)
+    x, v = start[:, :2].unbind(-1)
+    before, expected = x, [x]
+    for _ in range(n):
+        a = -gains[0] * x - gains[1] * before
+        before, x, v = x, x + DT * v + 0.5 * DT**2 * a, v + DT * a
+        expected.append(x)
+    torch.testing.assert_close(flown.states[..., 0], torch.stack(expected, -1), rtol=1e-10, atol=1e-12)
+    assert flown.states[:, -1, 0].abs().max() < 1e-5
+
+
+@needs_compiler
+def test_the_controller_in_c_holds_the_past_observations(tmp_path):
+    plant = StackedObservations(Mass(dt=DT, horizon=5.0), 2)
+    agreement = export_controller(LinearGain([[3.0, -2.0, 0.5]]), tmp_path / "mass.c", plant, name="mass")
+    # They are those of the measured states, without the curvature within an interval.
+    assert agreement.difference < 1e-12 and agreement.from_plant < 1e-12
+    in_c, positions = InC(tmp_path / "mass.c", 1, 2, 1), [0.3, 0.5, -0.2, 0.1, 0.4]
+    in_c.start(positions[0])
+    seen = [positions[0]] * 2 + positions
+    for k, x in enumerate(positions):
+        assert in_c.step(x)[0] == pytest.approx(-3.0 * x + 2.0 * seen[k + 1] - 0.5 * seen[k], rel=1e-14)
+
+
+@needs_compiler
+def test_a_controller_with_filters_and_limits_beside_past_observations(tmp_path, monkeypatch):
+    """The turbine's: past errors are those of filters in C, which differ from the plant's within an interval."""
+    monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 50)
+    base = shipped_plants()["wind_turbine"]()
+    plant = StackedObservations(base, 1)
+    agreement = export_controller(plant.make_policy(generator(3)), tmp_path / "turbine.c", plant, name="turbine")
+    assert agreement.difference < 1e-9 and agreement.from_plant < 2e-3
+
+
+def test_past_observations_follow_from_a_log():
+    plant = StackedObservations(Timed(), 3)
+    start, exogenous, commands = flight(plant)
+    states = Rollout(plant, plant.closure)(start, exogenous, commands).states[0].detach()
+    log = {signal.name: states[:, k] for k, signal in enumerate(LinearQuadratic.states)}
+    found = plant.complete_states(log, exogenous[0], commands[0])
+    torch.testing.assert_close(found[1:], states[1:], rtol=1e-14, atol=1e-14)
+    assert torch.equal(found[0, 2:], observed(plant, states[None], exogenous[:1])[0, 0, 2:])
+
+
+def test_a_run_with_hypotheses_resumes_to_the_bit(tmp_path):
+    twinning = dataclasses.replace(SMALL, hypotheses=HypothesesConfig())
+
+    def run(folder, episodes, **options):
+        config = RunConfig(
+            episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures=False, twinning=twinning, **options
+        )
+        return Run(config, StackedObservations(Timed(horizon=2.0), 2)).train()
+
+    whole = run(tmp_path / "whole", 4)
+    run(tmp_path / "parts", 2)
+    parts = run(tmp_path / "parts", 4, resume=True)
+    assert len(whole["episodes"]) == 4
+    for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
+        assert {**one, "seconds": None} == {**other, "seconds": None}
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="count=0 of past observations must be at least 1"):
+        StackedObservations(LinearQuadratic(), 0)
+    with pytest.raises(ValueError, match="already has the states position_error_1_ago, velocity_error_1_ago"):
+        StackedObservations(StackedObservations(LinearQuadratic(), 1), 1)
+
+
+def test_names_and_units_of_the_signals():
+    plant = StackedObservations(LinearQuadratic(), 2)
+    assert [signal.name for signal in plant.states] == [
+        "position",
+        "velocity",
+        "position_error_1_ago",
+        "velocity_error_1_ago",
+        "position_error_2_ago",
+        "velocity_error_2_ago",
+    ]
+    assert plant.controller_states == tuple(signal.name for signal in plant.states[2:])
+    assert plant.observations[2] == Signal(symbol="(e_1)_{-1}", name="position_error_1_ago", unit="-")
