@@ -9,12 +9,14 @@ from c_build import generator, needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_export_controller import InC
+from test_real_system import Rig, connected
 
 from rt_torchrl import (
     BiasedSensor,
     DelayedActuator,
     LaggedActuator,
     NeuralResidual,
+    PlantEnv,
     Run,
     RunConfig,
     StackedObservations,
@@ -24,6 +26,7 @@ from rt_torchrl import (
     shipped_plants,
 )
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 
@@ -231,10 +234,62 @@ def test_a_run_with_hypotheses_resumes_to_the_bit(tmp_path):
         )
         return Run(config, StackedObservations(Timed(horizon=2.0), 2)).train()
 
-    whole = run(tmp_path / "whole", 4)
-    run(tmp_path / "parts", 2)
-    parts = run(tmp_path / "parts", 4, resume=True)
-    assert len(whole["episodes"]) == 4
+    assert_same_episodes(*resumed(run, tmp_path, 3))
+
+
+def test_a_real_system_that_reports_the_states_of_the_plant_alone():
+    """Two episodes are those of the stacked plant itself."""
+    base = Timed(horizon=2.0)
+    plant = StackedObservations(base, 2)
+    policy = LinearGain(0.1 * torch.arange(1.0, 7.0).double()[None])
+    system, own = connected(plant, rig=Rig(base), computes=True), PlantEnv(plant)
+    for number in range(2):
+        found = system.reset()
+        own.set_seed(episode_seed(0, number), static_seed=True)
+        other, seen = own.reset(), []
+        for _ in range(plant.n_steps):
+            stepped = [
+                env.step(now.set("action", policy(now["observation"]).detach()))
+                for env, now in ((system, found), (own, other))
+            ]
+            seen.append(stepped[0]["observation"])
+            for key in ("observation", "state", "action", ("next", "reward"), ("next", "observation")):
+                torch.testing.assert_close(*(entries[key] for entries in stepped), rtol=1e-11, atol=1e-11)
+            found, other = (env.step_mdp(entries) for env, entries in zip((system, own), stepped, strict=True))
+        seen = torch.stack(seen, 1)
+        torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
+        assert found["done"].all()
+
+
+def test_what_the_environment_does_not_report_is_refused_by_its_name():
+    base = Timed(horizon=2.0)
+    with pytest.raises(ValueError, match="the plant needs .*position_error_1_ago"):
+        connected(StackedObservations(base, 1), rig=Rig(base))
+
+
+def test_a_run_on_such_a_real_system_resumes_to_the_bit(tmp_path):
+    base = Timed(horizon=2.0)
+
+    def run(folder, episodes, **options):
+        plant = StackedObservations(base, 2)
+        config = RunConfig(
+            episodes=episodes, log_dir=folder, compiled=False, unseen=3, figures=False, twinning=SMALL, **options
+        )
+        env = connected(plant, rig=Rig(base), computes=True, closure=base.closure)
+        return Run(config, plant, env=env).train()
+
+    assert_same_episodes(*resumed(run, tmp_path, 3))
+
+
+def resumed(run, folder, episodes):
+    """The results of a whole run, and of one that was cut short after an episode."""
+    whole = run(folder / "whole", episodes)
+    run(folder / "parts", 1)
+    return whole, run(folder / "parts", episodes, resume=True)
+
+
+def assert_same_episodes(whole, parts):
+    assert len(whole["episodes"]) > 1
     for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
         assert {**one, "seconds": None} == {**other, "seconds": None}
 

@@ -78,7 +78,7 @@ class Controller:
             measured: measured states y_k.
             inputs: exogenous inputs z_k.
         """
-        state = self._joined(measured, memory)
+        state = self.joined(measured, memory)
         command = self.policy(self.plant.observe(t, state, inputs))
         return command, self.plant.actuate(state, command)
 
@@ -103,7 +103,7 @@ class Controller:
         """
         signals = [self.plant.states[k] for k in self.measured]
         rate = differences(signals, following, measured) / self.plant.dt if signals else measured
-        state = self._joined(measured, memory)
+        state = self.joined(measured, memory)
         return self._along(rate).step(t, state, command, inputs, self.closure).state[..., self.held]
 
     def _along(self, rate: Tensor) -> Plant:
@@ -121,6 +121,6 @@ class Controller:
         vars(inner)["vector_field"] = given
         return self._moving
 
-    def _joined(self, measured: Tensor, memory: Tensor) -> Tensor:
+    def joined(self, measured: Tensor, memory: Tensor) -> Tensor:
         """States of measured ones and the controller's, in the plant's order."""
         return torch.cat([measured, memory], -1)[..., self._order]

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.around_system import AroundSystem, innermost
 from rt_torchrl.systems.environment import declare_specs, ended_early
@@ -47,6 +48,8 @@ class RealSystem(EnvBase):
         applied: place of the applied action in the report at the end of an interval; with None, ``plant.actuate``
             tells what was applied.
         closure: the true closure, on which policies are then judged in simulation; None where it is not known.
+        computes: whether the :attr:`Plant.controller_states`, which the environment does not report, are computed here,
+            as an exported controller computes them; ``state`` then reads the other ones.
         seed: seed of the sequence of episodes. Each episode has a seed of its own, made of this one and the episode's
             number, so that a training can be resumed. None for a system that takes no seed.
         device: device of the entries.
@@ -70,6 +73,7 @@ class RealSystem(EnvBase):
         actuation: Actuation | None = None,
         applied: Reading | None = None,
         closure: nn.Module | None = None,
+        computes: bool = False,
         seed: int | None = 0,
         device: torch.device | str = "cpu",
     ):
@@ -84,6 +88,10 @@ class RealSystem(EnvBase):
         self.env, self.plant, self.closure = env, plant.to(device), closure
         self._state, self._applied, self._actuation = state, applied, actuation or Actuation()
         self._exogenous = () if exogenous is None else exogenous
+        self._controller = Controller(plant, nn.Identity()) if computes else None
+        self._read = plant.states
+        if self._controller is not None:
+            self._read = tuple(plant.states[k] for k in self._controller.measured)
         if not isinstance(self._exogenous, Reading):
             require_numbers("real system", exogenous=self._exogenous)
         self._seed, self._episodes = seed, 0
@@ -103,7 +111,7 @@ class RealSystem(EnvBase):
     def _require_fit(self) -> None:
         """Refuse, before the first step and without moving anything real, an environment that would fail in it."""
         imagined = self.env.fake_tensordict()  # zeros; a reading of them need not be finite
-        self._state.vector(imagined, self.plant.states, "state")
+        self._state.vector(imagined, self._read, "state")
         if isinstance(self._exogenous, Reading):
             self._exogenous.vector(imagined, self.plant.inputs, "exogenous")
         else:
@@ -175,6 +183,9 @@ class RealSystem(EnvBase):
             # The seed counts episodes, not resets: a reset need not be followed by a step.
             self.env.set_seed(episode_seed(self._seed, self._episodes), static_seed=True)
         self._reported, self._step_count = self.env.reset(), 0
+        if self._controller is not None:
+            measured = self._state.read(self._reported, self._read, "state").cpu()
+            self._memory = self._controller.start(measured, self._input(self._reported).cpu())
         applied = torch.zeros(1, len(self.plant.actions), dtype=torch.float64, device=self.device)
         return self._entries(applied, ended=False)
 
@@ -206,16 +217,17 @@ class RealSystem(EnvBase):
         stepped = self.env.step(self._reported.set(self._actuation.key, action))
         self._step_count += 1
         self._require_reported(stepped["next"])
-        over = self.plant.end_cost is not None and self._ended(stepped["next"])
-        last = self._step_count >= self.plant.n_steps and not over
-        if stepped["next", "done"].any() and not (last or over):
-            raise ended_early(stepped["next"], self._step_count, self.plant)
-        self._reported = self.env.step_mdp(stepped)
         if self._applied is None:
             applied = self.plant.actuate(before["state"], command)
         else:
             applied = self._applied.read(stepped["next"], self.plant.actions, "applied").to(self.device)
         t = torch.full((1,), (self._step_count - 1) * self.plant.dt, dtype=torch.float64, device=self.device)
+        self._remember(t, before, applied, stepped["next"])
+        over = self.plant.end_cost is not None and self._ended(stepped["next"])
+        last = self._step_count >= self.plant.n_steps and not over
+        if stepped["next", "done"].any() and not (last or over):
+            raise ended_early(stepped["next"], self._step_count, self.plant)
+        self._reported = self.env.step_mdp(stepped)
         cost = self.plant.running_cost(t, before["state"], applied, before["exogenous"])
         after = self._entries(applied, ended=last)
         if over:
@@ -226,8 +238,22 @@ class RealSystem(EnvBase):
 
     def _ended(self, found: TensorDictBase) -> bool:
         """Whether the episode of the plant has ended in the state that the environment reports."""
-        state = self._state.read(found, self.plant.states, "state").to(self.device)
-        return bool(self.plant.ended(state).any())
+        return bool(self.plant.ended(self._state_of(found)).any())
+
+    def _state_of(self, found: TensorDictBase) -> Float[Tensor, "1 n_s"]:
+        """The plant's state, of what the environment reports and what the controller has computed."""
+        measured = self._state.read(found, self._read, "state")
+        if self._controller is not None:
+            measured = self._controller.joined(measured.cpu(), self._memory)
+        return measured.to(self.device)
+
+    def _remember(self, t: Tensor, before: TensorDictBase, applied: Tensor, following: TensorDictBase) -> None:
+        """Take the states that the controller computes to the end of an interval."""
+        if self._controller is not None:
+            state, inputs = before["state"].cpu(), before["exogenous"].cpu()
+            measured, end = state[:, self._controller.measured], self._state.read(following, self._read, "state").cpu()
+            now = t.cpu(), self._memory, measured, inputs, applied.cpu(), end
+            self._memory = self._controller.advance(*now)
 
     def _require_reported(self, found: TensorDictBase) -> None:
         """Refuse a step that leaves out an entry that is read; its last value would otherwise be used again unseen."""
@@ -238,7 +264,7 @@ class RealSystem(EnvBase):
 
     def _entries(self, applied: Tensor | None, *, ended: bool) -> TensorDict:
         """The environment's present report in the plant's terms."""
-        state = self._state.read(self._reported, self.plant.states, "state").to(self.device)
+        state = self._state_of(self._reported)
         exogenous = self._input(self._reported).to(self.device)
         t = torch.full((1,), self._step_count * self.plant.dt, dtype=torch.float64, device=self.device)
         flag = torch.full((1, 1), ended, dtype=torch.bool, device=self.device)
