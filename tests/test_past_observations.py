@@ -7,6 +7,7 @@ import pytest
 import torch
 from c_build import generator, needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
+from printed_commands import blocks
 from small_runs import SMALL
 from test_export_controller import InC
 from test_real_system import Rig, connected
@@ -292,6 +293,13 @@ def assert_same_episodes(whole, parts):
     assert len(whole["episodes"]) > 1
     for one, other in zip(whole["episodes"], parts["episodes"], strict=True):
         assert {**one, "seconds": None} == {**other, "seconds": None}
+
+
+def test_the_page_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = {}
+    exec("\n".join(blocks("policies_and_closures.md", "python")), found)
+    assert len(found["run"].algorithm.policies["model_based"](torch.zeros(1, 8).double())[0]) == 2
 
 
 def test_refusals():
