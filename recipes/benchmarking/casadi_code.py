@@ -212,7 +212,7 @@ def vector_field(
     z: ca.SX,
 ) -> ca.SX:  # fmt: skip
     """The drone's equations; ``envs/flapping_wing/plant.py`` explains them."""
-    radius, strip_mass = plant.wings.radius.numpy(), plant.wings.strip_mass.numpy()
+    radius, strip_mass = plant.radius.numpy(), plant.strip_mass.numpy()
     mass, weight = float(plant.mass), float(plant.weight[1])
     rate, epsilon = 2.0 * math.pi * plant.frequency, plant.smallest_airspeed**2
     v_x, v_z = state[2] + z[0], state[3]

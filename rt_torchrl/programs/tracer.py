@@ -136,13 +136,12 @@ class Tracer(TorchDispatchMode):
 
     def assign(self, x: Tensor, cells: Tensor) -> None:
         """Let a new tensor hold values of the program; a part of a storage leaves the rest of it as it is."""
-        storage = _storage_of(x)  # now, because code that is traced may not ask for it once its numbers vary
-        cell = self._cells.get(storage)
-        if cell is None:
-            cell = torch.zeros(x.untyped_storage().nbytes() // max(1, x.element_size()), dtype=torch.int64)
+        key = _storage_of(x)
+        if key not in self._cells:
+            size = x.untyped_storage().nbytes() // max(1, x.element_size())
+            self._cells[key] = torch.zeros(size, dtype=torch.int64)
         once = tuple(slice(1) if stride == 0 else slice(None) for stride in x.stride())
-        torch.as_strided(cell, x.shape, x.stride(), x.storage_offset())[once].copy_(cells[once])
-        self._cells[storage] = cell
+        torch.as_strided(self._cells[key], x.shape, x.stride(), x.storage_offset())[once].copy_(cells[once])
         self._alive.append(x)
 
     def input(self, x: Tensor, name: str) -> None:
