@@ -217,8 +217,6 @@ class CryogenicTank(Plant):
     """The paper's error; this with the time of the episode; with the phase of the orbit; all states; and all states
     with both times and the load."""
 
-    error_sizes: Tensor
-
     def __init__(
         self,
         *,
@@ -248,7 +246,7 @@ class CryogenicTank(Plant):
         self.command, self.actions = command, (COMMANDS[command],)
         self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)
-        self.register_buffer("error_sizes", torch.tensor(error_sizes, dtype=torch.float64))
+        self.error_sizes = error_sizes
         if wall == "explicit":
             mode = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K"
             rate = self.wall_rate(self.closure)
@@ -257,7 +255,7 @@ class CryogenicTank(Plant):
     @torch.no_grad()
     def wall_rate(self, closure: nn.Module) -> float:
         """Decay rate U_s A_s/(m_s c_s) [1/s] of a closure's wall at the set point and at the fluid's temperature."""
-        state = self.state_at(self.error_sizes.new_tensor(self.set_point))
+        state = self.state_at(self.saturation.table.new_tensor(self.set_point))
         now = self.conditions(state, torch.zeros_like(state[:1]), closure)
         return now.wall_conductance.item() / self.wall_heat_capacity
 
@@ -388,7 +386,7 @@ class CryogenicTank(Plant):
     @property
     def discrepancy_scales(self) -> tuple[float, ...]:
         r"""Scales in which J_p is the sum of the squared errors over their natural sizes, over T_o (eq. of J_p)."""
-        return tuple((math.sqrt(0.5 * self.horizon) * self.error_sizes).tolist())
+        return tuple(math.sqrt(0.5 * self.horizon) * size for size in self.error_sizes)
 
     def held_load(self, state: State, action: Action, closure: nn.Module) -> Scalar:
         r"""Load [W] at which the pressure stands still: Q_HX plus the heat that evaporates the refilling vapour.
