@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import fresh_process
 import numpy as np
 import pytest
 import torch
@@ -153,7 +154,25 @@ def test_gradients_of_native_are_those_of_autograd_and_of_differences(extend):
 
 @pytest.mark.parametrize("extend", [EXTENSIONS["none"], EXTENSIONS["delay"]], ids=["none", "delay"])
 def test_the_plant_fulfils_the_contract(extend):
-    check_plant(extend(StackedObservations(Timed(), 2)), episodes=2, steps=10)
+    """Annotations may be checked at run time here, and cannot be traced; the next test does that."""
+    check_plant(extend(StackedObservations(Timed(), 2)), episodes=2, steps=10, traced=False)
+
+
+CHECK = """
+import sys
+sys.path.insert(0, "tests")
+from test_past_observations import EXTENSIONS, Timed
+from rt_torchrl import StackedObservations, check_plant
+
+for kind in ("none", "delay"):
+    check_plant(EXTENSIONS[kind](StackedObservations(Timed(), 2)), episodes=2, steps=5)
+print("fulfilled")
+"""
+
+
+def test_it_is_one_graph():
+    found = fresh_process.run(CHECK)
+    assert found.stdout == "fulfilled\n", found.stderr[-3000:]
 
 
 class Mass(LinearQuadratic):
