@@ -227,8 +227,9 @@ class Estimate(NamedTuple):
         warnings, dt = [], self.likelihood.plant.dt
         if self.segment:
             warnings.append(
-                "over whole records the twin leaves what was read, as that of an unstable system does: it was fitted "
-                f"over segments of {self.segment} control intervals ({self.segment * dt:g} s), as all errors here are"
+                f"the twin was fitted over segments of {self.segment} control intervals ({self.segment * dt:g} s) with "
+                "first states of their own, as all errors here are; over whole records it may leave what was read, as "
+                "that of an unstable system does"
             )
         rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
         for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
