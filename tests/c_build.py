@@ -5,7 +5,6 @@ import shutil
 import subprocess
 
 import pytest
-import torch
 
 from rt_torchrl.export.c_compiler import COMPILERS
 
@@ -14,19 +13,11 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def library(path):
     """The library of a C file."""
     found = path.with_suffix(".so")
     subprocess.run([COMPILER, *STRICT, "-shared", "-fPIC", path, "-o", found, "-lm"], check=True)
     return ctypes.CDLL(str(found))
-
-
-def c_array(numbers):
-    return (ctypes.c_double * max(1, len(numbers)))(*numbers)
 
 
 def printed(folder, *sources):

@@ -5,6 +5,7 @@ import math
 import CoolProp.CoolProp as CP
 import numpy as np
 import torch
+from seeds_and_numbers import double
 from torch import nn
 
 from rt_torchrl.plants.sampling import rk4_step
@@ -13,14 +14,6 @@ V_T, A_S, A_HX, M_C = 60.0, 74.1, 200 * math.pi * 0.005 * 2, 500e3
 U_S, U_HX, K_JT = 50.0, 75.0, 500e9
 LIGHT_WALL = 20e3  # [J/K]
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def double(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 class PerRow(nn.Module):

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from c_build import c_array, library, needs_compiler
+from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from small_runs import SMALL
 from test_export_recipe import recipe
@@ -12,6 +12,7 @@ from test_hypotheses import PLANT, Suspecting, ensemble
 
 from rt_torchrl import Run, control_cost, export_twin, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
+from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.results_table import hypothesis_lines, results_table

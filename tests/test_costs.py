@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from seeds_and_numbers import double, seeded
 from tensordict.nn import TensorDictModule
 
 from rt_torchrl import PlantEnv, Rollout, SaturatedAffine, check_plant, control_cost
@@ -16,14 +17,6 @@ from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
 RATED = 122.9096
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def double(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def turbine_cost(speed, torque, pitch, last, **weights):

@@ -14,9 +14,8 @@ from cryogenic_tank_reference import (
     U_HX,
     U_S,
     coolprop_rates,
-    double,
-    seeded,
 )
+from seeds_and_numbers import double, seeded
 from torch import nn
 
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients, CubicVentLaw

@@ -14,10 +14,9 @@ from cryogenic_tank_reference import (
     U_S,
     Ledger,
     PerRow,
-    double,
     flown,
-    seeded,
 )
+from seeds_and_numbers import double, seeded
 
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from seeds_and_numbers import seeded
 from test_algorithm import STEPS, twinning, weights
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
@@ -20,10 +21,6 @@ from rt_torchrl.twinning.distillation import (
 from rt_torchrl.twinning.referees import RefereeConfig
 
 PLANT = LinearQuadratic(horizon=2.0)
-
-
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 def affine(*rows):

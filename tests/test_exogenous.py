@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import Signal
@@ -14,10 +15,6 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def autoregressive(n, rho, seed=0, std=1.0):

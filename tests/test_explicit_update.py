@@ -11,7 +11,8 @@ import torch
 from hidden_force import Answer, HiddenForce
 from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.stats import ks_2samp
-from test_learners import explored, seeded
+from seeds_and_numbers import seeded
+from test_learners import explored
 from torch import nn
 from torch.utils._pytree import tree_flatten_with_path
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic
+from seeds_and_numbers import seeded
 from test_saved_files import Full
 from torch import nn
 
@@ -22,14 +23,10 @@ from rt_torchrl.plants.signal import Signal
 ROUNDING = 1e-12
 
 
-def generator():
-    return torch.Generator().manual_seed(0)
-
-
 def policies_of_the_plants():
     for name, kind in shipped_plants().items():
         plant = kind()
-        yield pytest.param(plant, plant.make_policy(generator()), id=name)
+        yield pytest.param(plant, plant.make_policy(seeded()), id=name)
 
 
 WITHOUT_THE_LIBRARY = """
@@ -46,9 +43,9 @@ print(extra["interface.json"])
 
 def test_a_program_needs_torch_alone(tmp_path):
     plant = shipped_plants()["wind_turbine"]()
-    policy = SaturatedMLP(2, plant.actions, generator=generator())
+    policy = SaturatedMLP(2, plant.actions, generator=seeded())
     assert export_program(policy, tmp_path / "policy.pt2", plant) < ROUNDING
-    rows = torch.randn(7, 2, generator=generator(), dtype=torch.float64)
+    rows = torch.randn(7, 2, generator=seeded(), dtype=torch.float64)
     command = [sys.executable, "-c", WITHOUT_THE_LIBRARY, tmp_path / "policy.pt2", str(rows.tolist())]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -66,7 +63,7 @@ def test_programs_take_any_batch(plant, policy, tmp_path):
     assert export_program(policy, tmp_path / "policy.pt2", plant) < ROUNDING
     loaded = torch.export.load(tmp_path / "policy.pt2").module()
     for batch in (1, 2, 17):
-        e = torch.randn(batch, len(plant.observations), generator=generator(), dtype=torch.float64)
+        e = torch.randn(batch, len(plant.observations), generator=seeded(), dtype=torch.float64)
         torch.testing.assert_close(loaded(e), policy(e).detach(), rtol=ROUNDING, atol=ROUNDING)
 
 
@@ -86,7 +83,7 @@ def test_onnx_models_take_any_batch(plant, policy, tmp_path):
     assert [signal["name"] for signal in json.loads(described)["action"]] == [s.name for s in plant.actions]
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     for batch in (1, 2, 17):
-        e = torch.randn(batch, len(plant.observations), generator=generator(), dtype=torch.float64)
+        e = torch.randn(batch, len(plant.observations), generator=seeded(), dtype=torch.float64)
         (found,) = session.run(["action"], {"observation": e.numpy()})
         torch.testing.assert_close(torch.from_numpy(found), policy(e).detach(), rtol=ROUNDING, atol=1e-9)
 
@@ -132,7 +129,7 @@ def test_what_onnxruntime_cannot_run_is_refused(tmp_path, monkeypatch):
 
 
 def test_exporting_leaves_the_policy_as_it_was(tmp_path):
-    policy = SaturatedMLP(2, LinearQuadratic.actions, generator=generator()).train()
+    policy = SaturatedMLP(2, LinearQuadratic.actions, generator=seeded()).train()
     export_program(policy, tmp_path / "policy.pt2", LinearQuadratic())
     assert policy.training and all(weight.requires_grad for weight in policy.parameters())
 

@@ -5,12 +5,14 @@ import re
 
 import pytest
 import torch
-from c_build import c_array, generator, library, needs_compiler, printed
+from c_build import library, needs_compiler, printed
 from linear_quadratic import LinearGain, LinearQuadratic
+from seeds_and_numbers import seeded
 from torch import nn
 
 from rt_torchrl import shipped_plants
 from rt_torchrl.export import c_compiler, export_c
+from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP, SmoothClip
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.programs.c_source import CSource, literal
@@ -38,11 +40,11 @@ def called(function, observation, n_actions):
 def policies_of_the_plants():
     for name, kind in shipped_plants().items():
         plant = kind()
-        yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
-        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(8, 5), generator=generator())
+        yield pytest.param(plant, plant.make_policy(seeded()), id=f"{name}-own")
+        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(8, 5), generator=seeded())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
     turbine = shipped_plants()["wind_turbine"]()
-    yield pytest.param(turbine, turbine.make_policy(generator(), bias=True), id="wind_turbine-bias")
+    yield pytest.param(turbine, turbine.make_policy(seeded(), bias=True), id="wind_turbine-bias")
 
 
 @needs_compiler
@@ -50,11 +52,11 @@ def policies_of_the_plants():
 def test_policies_of_the_plants(plant, policy, tmp_path):
     with torch.no_grad():
         for weight in policy.parameters():  # biases too, as a training leaves them
-            weight.add_(0.5 * torch.randn(weight.shape, generator=generator(), dtype=torch.float64))
+            weight.add_(0.5 * torch.randn(weight.shape, generator=seeded(), dtype=torch.float64))
     assert export_c(policy, tmp_path / "policy.c", plant, function="act") < ROUNDING
     function = library(tmp_path / "policy.c").act
     low, high = bounds(plant.actions)
-    for observation in 2.0 * torch.randn(50, len(plant.observations), generator=generator(), dtype=torch.float64):
+    for observation in 2.0 * torch.randn(50, len(plant.observations), generator=seeded(), dtype=torch.float64):
         error = (called(function, observation.tolist(), len(plant.actions)) - policy(observation)).abs() / (high - low)
         assert error.max() < ROUNDING
 
@@ -62,7 +64,7 @@ def test_policies_of_the_plants(plant, policy, tmp_path):
 @needs_compiler
 def test_an_affine_law_is_its_closed_form(tmp_path):
     plant = shipped_plants()["wind_turbine"]()
-    policy = SaturatedAffine(2, plant.actions, generator=generator())
+    policy = SaturatedAffine(2, plant.actions, generator=seeded())
     with torch.no_grad():
         policy.linear.weight.copy_(torch.tensor([[1.0, -2.0], [0.5, 3.0]]))
         policy.linear.bias.copy_(torch.tensor([0.25, -1.0]))
@@ -78,7 +80,7 @@ def test_an_affine_law_is_its_closed_form(tmp_path):
 @needs_compiler
 def test_a_program_in_c_that_includes_the_header(tmp_path):
     plant = shipped_plants()["flapping_wing"]()
-    policy = SaturatedMLP(4, plant.actions, hidden=(6,), generator=generator())
+    policy = SaturatedMLP(4, plant.actions, hidden=(6,), generator=seeded())
     export_c(policy, tmp_path / "wing.c", plant, function="fly")
     header = (tmp_path / "wing.h").read_text()
     for signal in (*plant.observations, *plant.actions):
@@ -102,8 +104,8 @@ class Formula(nn.Module):
     def __init__(self, formula):
         super().__init__()
         self.formula = formula
-        self.W = nn.Parameter(torch.randn(4, 4, generator=generator(), dtype=torch.float64))
-        self.b = nn.Parameter(torch.randn(4, generator=generator(), dtype=torch.float64))
+        self.W = nn.Parameter(torch.randn(4, 4, generator=seeded(), dtype=torch.float64))
+        self.b = nn.Parameter(torch.randn(4, generator=seeded(), dtype=torch.float64))
 
     def forward(self, e):
         return self.formula(e, self.W, self.b)

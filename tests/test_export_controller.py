@@ -6,13 +6,15 @@ import re
 
 import pytest
 import torch
-from c_build import c_array, generator, library, needs_compiler, printed
+from c_build import library, needs_compiler, printed
 from linear_quadratic import LinearGain, LinearQuadratic
 from scipy.linalg import expm
+from seeds_and_numbers import seeded
 
 from rt_torchrl import export_controller, shipped_plants
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.export.controller import Controller
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.plants.signal import Signal
@@ -57,7 +59,7 @@ def flown(plant, state, exogenous, act):
 
 def law(plant):
     """A policy that holds the turbine near its reference, so that speed and wind move all filters."""
-    policy = SaturatedAffine(len(plant.observations), plant.actions, generator=generator(3))
+    policy = SaturatedAffine(len(plant.observations), plant.actions, generator=seeded(3))
     with torch.no_grad():
         policy.linear.weight[:] = 0.0
         policy.linear.weight[:, :2] = torch.tensor([[1.0, 0.4], [0.6, 0.3]], dtype=torch.float64)
@@ -77,7 +79,7 @@ def test_a_turbine_flies_an_episode_by_its_controller_in_c(observe, tmp_path, mo
     n_memory = len(plant.states) - 1
     agreement = export_controller(policy, tmp_path / "turbine.c", plant, name="turbine")
     assert agreement.difference < CLOSE and agreement.intervals == 50
-    start, exogenous = plant.draw_initial_state(1, generator(1)), plant.draw_exogenous(1, generator(2))
+    start, exogenous = plant.draw_initial_state(1, seeded(1)), plant.draw_exogenous(1, seeded(2))
     in_c = InC(tmp_path / "turbine.c", 2, n_memory, 2)
     in_c.start(start[0, 0].item(), exogenous[0, 0, 0].item())
     in_c.state.memory[:] = start[0, 1:].tolist()
@@ -164,7 +166,7 @@ def test_filters_clock_and_order_of_the_states(tmp_path):
     agreement = export_controller(LinearGain(GAINS), tmp_path / "lag.c", plant, name="lag")
     assert agreement.difference < CLOSE
     in_c = InC(tmp_path / "lag.c", 1, 2, 2)
-    positions = torch.cumsum(torch.randn(50, generator=generator(), dtype=torch.float64), 0).tolist()
+    positions = torch.cumsum(torch.randn(50, generator=seeded(), dtype=torch.float64), 0).tolist()
     in_c.start(positions[0], 0.0)
     f, before = 0.0, positions[0]
     for k, x in enumerate(positions):
@@ -216,14 +218,14 @@ def test_linear_dynamics_against_the_matrix_exponential(tmp_path):
 def every_controller():
     for name, kind in shipped_plants().items():
         plant = kind()
-        yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-own")
-        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=generator())
+        yield pytest.param(plant, plant.make_policy(seeded()), id=f"{name}-own")
+        mlp = SaturatedMLP(len(plant.observations), plant.actions, hidden=(32, 32), generator=seeded())
         yield pytest.param(plant, mlp, id=f"{name}-mlp")
         for observe in plant.observation_sets:
             plant = kind(observe=(observe,))
-            yield pytest.param(plant, plant.make_policy(generator()), id=f"{name}-{observe}")
+            yield pytest.param(plant, plant.make_policy(seeded()), id=f"{name}-{observe}")
     plant = WindTurbine(observe=("scheduled",))
-    yield pytest.param(plant, GainScheduled(plant, generator=generator()), id="gain-scheduled")
+    yield pytest.param(plant, GainScheduled(plant, generator=seeded()), id="gain-scheduled")
 
 
 @needs_compiler
@@ -241,7 +243,7 @@ def test_controllers_of_the_plants(plant, policy, tmp_path, monkeypatch):
 def test_only_signals_that_matter_are_measured(tmp_path, monkeypatch):
     monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 10)
     tank = shipped_plants()["cryogenic_tank"]()
-    export_controller(tank.make_policy(generator()), tmp_path / "tank.c", tank, name="tank")
+    export_controller(tank.make_policy(seeded()), tmp_path / "tank.c", tank, name="tank")
     lines = (tmp_path / "tank.h").read_text().splitlines()
     assert [line.split()[1:3] for line in lines if line.startswith(" * measured[")] == [["measured[0]", "pressure"]]
 

@@ -4,13 +4,15 @@ import ctypes
 
 import pytest
 import torch
-from c_build import c_array, generator, library, needs_compiler
+from c_build import library, needs_compiler
 from linear_quadratic import LinearClosure, LinearQuadratic
 from scipy.linalg import expm
+from seeds_and_numbers import seeded
 from torch import nn
 
 from rt_torchrl import export_twin, shipped_plants
 from rt_torchrl.export import c_compiler
+from rt_torchrl.export.c_compiler import c_array
 from rt_torchrl.programs.c_source import CSource
 
 CLOSE = 1e-9
@@ -32,10 +34,10 @@ def build(path):
 def closures():
     for name, kind in shipped_plants().items():
         plant = kind()
-        yield pytest.param(plant, plant.make_closure(generator()), id=f"{name}-own")
+        yield pytest.param(plant, plant.make_closure(seeded()), id=f"{name}-own")
         yield pytest.param(plant, plant.closure, id=f"{name}-true")
         if name != "pendulum":
-            yield pytest.param(plant, plant.make_neural_closure(generator(), (16, 16)), id=f"{name}-mlp")
+            yield pytest.param(plant, plant.make_neural_closure(seeded(), (16, 16)), id=f"{name}-mlp")
 
 
 @needs_compiler
@@ -45,7 +47,7 @@ def test_twins_of_the_plants(plant, closure, tmp_path):
     assert export_twin(closure, tmp_path / "twin.c", plant) < CLOSE
     export_twin(closure, tmp_path / "twin.c", plant, name="twin")
     step = build(tmp_path / "twin.c")
-    state, exogenous = plant.draw_initial_state(1, generator()), plant.draw_exogenous(1, generator())
+    state, exogenous = plant.draw_initial_state(1, seeded()), plant.draw_exogenous(1, seeded())
     found, middle = state[0], torch.tensor([[0.5 * (a.low + a.high) for a in plant.actions]], dtype=torch.float64)
     with torch.no_grad():
         for k in range(50):

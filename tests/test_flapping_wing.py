@@ -7,6 +7,7 @@ import pytest
 import torch
 from flapping_wing_reference import reference_force
 from scipy.optimize import brentq, fsolve
+from seeds_and_numbers import double, seeded
 from torch import nn
 
 from rt_torchrl.envs.flapping_wing.closures import QuasiSteadyPolar
@@ -17,14 +18,6 @@ from rt_torchrl.trajectories.rollout import Rollout
 
 MASS, GRAVITY, RHO, FREQUENCY = 3e-3, 9.81, 1.225, 20.0
 WEIGHT = MASS * GRAVITY
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def double(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 class Converged(FlappingWing):

@@ -4,6 +4,7 @@ import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import seeded
 from torch import nn
 
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
@@ -39,10 +40,6 @@ class PerceptronClosure(nn.Module):
 
     def forward(self, features):
         return self.offset + 0.1 * self.network(features / 5.0)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 class Case:

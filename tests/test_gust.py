@@ -5,13 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def test_wind_has_the_mean_and_covariance_of_the_process():

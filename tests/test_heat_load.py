@@ -4,9 +4,7 @@ import math
 
 import pytest
 import torch
-from cryogenic_tank_reference import (
-    seeded,
-)
+from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 

@@ -6,13 +6,10 @@ import re
 import pytest
 import torch
 from scipy.optimize import brentq
+from seeds_and_numbers import double
 from torchdiffeq import odeint
 
 from rt_torchrl.plants.sampling import RK4_REAL_STABILITY, require_stable_step, rk4_step
-
-
-def tensor(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def scalar(value):
@@ -44,7 +41,7 @@ def test_is_of_fourth_order_in_time_and_state():
     exact = 1.0 / (1.0 + 2.0**2) + math.sin(2.0)
     errors = []
     for n in (20, 40, 80, 160):
-        state, h = tensor(1.0), 2.0 / n
+        state, h = double(1.0), 2.0 / n
         for k in range(n):
             state = rk4_step(field, scalar(k * h), state, h)
         errors.append(abs(state.item() - exact))
@@ -55,7 +52,7 @@ def test_is_of_fourth_order_in_time_and_state():
 
 def test_exact_where_the_quadrature_is_exact():
     """With a field of t alone the step is the 3/8 rule, exact for cubics."""
-    end = rk4_step(lambda t, s: 4.0 * t**3 - 3.0 * t**2 + 0.0 * s, scalar(0.3), tensor(1.0), 0.9)
+    end = rk4_step(lambda t, s: 4.0 * t**3 - 3.0 * t**2 + 0.0 * s, scalar(0.3), double(1.0), 0.9)
     # A few roundings of numbers of order one.
     assert end.item() == pytest.approx(1.0 + (1.2**4 - 1.2**3) - (0.3**4 - 0.3**3), rel=1e-14)
 
@@ -66,7 +63,7 @@ def test_stability_limit_is_the_root_of_the_stability_function():
     assert 0.0 < root - RK4_REAL_STABILITY < 1e-3
 
     def amplification(rate):
-        return abs(rk4_step(lambda t, s: -rate * s, scalar(0.0), tensor(1.0), 1.0).item())
+        return abs(rk4_step(lambda t, s: -rate * s, scalar(0.0), double(1.0), 1.0).item())
 
     assert amplification(RK4_REAL_STABILITY) < 1.0 < amplification(RK4_REAL_STABILITY + 1e-3)
 

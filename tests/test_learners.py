@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic, discounted_cost, optimal_gain
+from seeds_and_numbers import seeded
 from tensordict import TensorDict
 from torch.utils._pytree import tree_flatten
 
@@ -18,10 +19,6 @@ from rt_torchrl.twinning.learners.long_term_memory import LongTermMemory
 
 GAMMA = 0.9
 GAMMA_IN_TORCHRL = torch.tensor(GAMMA, dtype=torch.float32).item()  # DDPGLoss keeps it in single precision
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def learner(seed=0, kind=DDPG, **options):

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from seeds_and_numbers import double, seeded
 
 from rt_torchrl import Rollout, SaturatedAffine, SaturatedMLP, check_plant, control_cost, shipped_plants
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
@@ -18,14 +19,6 @@ from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
 CHOICES = [(name, kind, which) for name, kind in shipped_plants().items() for which in kind.observation_sets]
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def double(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def short(kind, **options):

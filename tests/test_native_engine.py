@@ -10,7 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic
-from test_gradients import OUTPUTS, PerceptronClosure, relative_gap, seeded
+from seeds_and_numbers import seeded
+from test_gradients import OUTPUTS, PerceptronClosure, relative_gap
 from torch import nn
 from traced_function import marched
 

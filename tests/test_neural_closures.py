@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import seeded
 from test_sensitivity import recorded
 from torch import nn
 from torch.nn.utils import parameters_to_vector
@@ -31,10 +32,6 @@ RANGES = {
     "flapping_wing": ((-1.0, 1.0), (-1.0, 1.0)),
     "cryogenic_tank": ((0.9, 1.1), (0.6, 0.7), (0.0, 2.0), (0.0, 1.0)),
 }
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def points(plant, count=200):

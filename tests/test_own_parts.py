@@ -59,6 +59,9 @@ def test_a_discrepancy_counts_states_in_their_sizes_and_an_angle_the_short_way()
     Turning.states = Turning.states[:1]
     with pytest.raises(ValueError, match=r"state_sizes=\(2.0, 0.5\) of plant 'turning'.*position \[m\]"):
         Turning().discrepancy(one[:, :1], other[:, :1])
+    Turning.discrepancy_scales = (0.0,)
+    with pytest.raises(ValueError, match=r"discrepancy_scales=\(0.0,\) of plant 'turning'"):
+        Turning().discrepancy(one[:, :1], other[:, :1])
 
 
 def test_a_discrepancy_that_is_no_sum_of_squares_is_refused_with_what_to_give_instead():

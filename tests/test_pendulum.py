@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from seeds_and_numbers import seeded
 from tensordict.nn import TensorDictModule
 from test_export_recipe import recipe
 
@@ -27,10 +28,6 @@ from rt_torchrl.twinning.assimilation import Assimilation, AssimilationConfig
 
 recorded = recipe("record_log").recorded
 RECIPE = Path(__file__).parent.parent / "recipes" / "pendulum.py"
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def gymnasium_steps(states, commands, *, mass=1.0, length=1.0):

@@ -4,6 +4,7 @@ import fresh_process
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import seeded
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
@@ -21,10 +22,6 @@ def shortened(kind, steps):
     """A plant whose episode has at most this number of steps."""
     plant = kind()
     return plant if plant.n_steps <= steps else kind(dt=plant.dt, horizon=steps * plant.dt)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.fixture(params=CLASSES)

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearQuadratic
+from seeds_and_numbers import seeded
 
 from rt_torchrl.control.forecasts import Decaying
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
@@ -20,10 +21,6 @@ from rt_torchrl.trajectories.trajectory import control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 
 PLANT = LinearQuadratic(horizon=2.0, noise=0.5)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def control(plant=PLANT, closure=None, **options):

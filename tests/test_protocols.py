@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import seeded
 from test_algorithm import twinning, weights
 
 from rt_torchrl.systems.environment import PlantEnv
@@ -35,10 +36,6 @@ def documented(page, name):
     scope = {}
     exec(code, scope)
     return scope[name]
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 LEARNERS = {

@@ -6,16 +6,13 @@ import CoolProp.CoolProp as CP
 import numpy as np
 import pytest
 import torch
+from seeds_and_numbers import double
 
 from rt_torchrl.envs.cryogenic_tank import saturation
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 
 LOW, HIGH = 80e3, 900e3
 KEYS = {"T": ("T", 0), "rho_l": ("D", 0), "rho_v": ("D", 1), "h_l": ("H", 0), "h_v": ("H", 1)}
-
-
-def double(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def pressures(n=301):

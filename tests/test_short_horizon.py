@@ -6,6 +6,7 @@ import dataclasses
 import pytest
 import torch
 from linear_quadratic import LinearQuadratic
+from seeds_and_numbers import seeded
 
 from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
@@ -13,10 +14,6 @@ from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizon, ShortHorizonConfig, make_planner
 
 CONFIG = ShortHorizonConfig(window=10, critic_hidden=(32, 32))
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def episodes(plant, count, seed):

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from seeds_and_numbers import seeded
 from small_runs import SMALL
 from test_classical import PD
 
@@ -48,10 +49,6 @@ def small_config(folder, **options):
 
 def run_of(config, **options):
     return Run(config, config.plant(), believed=config.believed(), **options)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def test_a_run_judges_on_the_true_system_and_keeps_its_hidden_states_hidden(tmp_path):
@@ -110,7 +107,7 @@ def test_state_feedback_acts_on_readings(kind):
         controller = PD(BASE)
     else:
         controller = PredictiveControl(BASE, BASE.closure, PredictiveConfig(horizon=0.5))
-    generators = generator(1)
+    generators = seeded(1)
     state, exogenous = plant.draw_initial_state(2, generators), plant.draw_exogenous(2, generators)
     flown = controller.fly(state, exogenous, plant=plant)
     assert flown.states.shape == (2, 21, 5)
@@ -127,7 +124,7 @@ def test_machine_code_flies_as_steps_do(controller):
     found = []
     for kind in (collector_of, EpisodeCollector):
         env = PlantEnv(real(), seed=3, noise=0.01)
-        actor = LivePolicy(BASE, controller, ExplorationConfig(), generator=generator())
+        actor = LivePolicy(BASE, controller, ExplorationConfig(), generator=seeded())
         actor.begin(controller, strength=0.5)
         found.append(kind(env, actor, BASE).rollout())
     for key in ("state", "observation", "action", ("next", "reward")):
@@ -140,7 +137,7 @@ def test_a_safety_layer_sees_readings_alone(tmp_path):
     limits = SafetyConfig(interval=plant.dt, log=tmp_path / "log.jsonl")
     guarded = SafetyLayer(PlantEnv(plant), limits, fallback=lambda reported: torch.zeros(1, 1, dtype=torch.float64))
     system = RealSystem(guarded, BASE, state=state, exogenous=exogenous, applied=applied)
-    policy = LivePolicy(BASE, LinearGain([[0.3, 0.3]]), ExplorationConfig(), generator=generator())
+    policy = LivePolicy(BASE, LinearGain([[0.3, 0.3]]), ExplorationConfig(), generator=seeded())
     policy.begin(policy.policy, strength=0.0)
     episode = EpisodeCollector(system, policy, BASE).rollout()
     system.close()

@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 import torch
 from scipy import integrate, signal
+from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_hh, read_wind
 
 DT, N = 0.5, 1200
 MEAN, SIGMA, LENGTH = 11.0, 1.76, 340.2
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def kaimal(f):

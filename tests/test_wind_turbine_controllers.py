@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from seeds_and_numbers import double, seeded
 
 from rt_torchrl.envs.wind_turbine.controllers import GainScheduled, JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import FAST_FILTER, WindTurbine
@@ -51,23 +52,15 @@ def test_a_steady_wind_above_rated_is_held_at_rated_speed(controller):
     assert power == pytest.approx(controller.power, rel=1e-3)
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def tensor(*values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
 def nominal(plant):
-    return GainScheduled(plant, detuning=0.0, generator=generator())
+    return GainScheduled(plant, detuning=0.0, generator=seeded())
 
 
 def observed(plant, omega, beta, rate=0.0):
     """Observation at a fast-filtered speed [rad/s], a pitch [deg] and a speed above the filtered one [rad/s]."""
-    state = tensor(0.0, 0.0, 11.0, 0.0, 0.0, beta, omega)
+    state = double(0.0, 0.0, 11.0, 0.0, 0.0, beta, omega)
     state[0] = (omega + rate) / plant.gear_ratio
-    return plant.observe(torch.zeros(()).double(), state, tensor(11.0))
+    return plant.observe(torch.zeros(()).double(), state, double(11.0))
 
 
 def test_torque_is_the_square_law_far_below_and_constant_power_far_above():
@@ -92,20 +85,20 @@ def test_pitch_moves_by_the_increment_of_the_scheduled_law(omega, rate, beta):
 
 def test_commands_stay_in_their_ranges_and_gains_start_detuned():
     plant = WindTurbine(observe=("scheduled",))
-    policy = GainScheduled(plant, generator=generator(3))
+    policy = GainScheduled(plant, generator=seeded(3))
     seen = torch.stack([observed(plant, w, b, r) for w in (0.0, 90.0, 200.0) for b in (0.0, 30.0) for r in (-9.0, 9.0)])
     commands = policy(seen)
     for column, action in zip(commands.unbind(-1), plant.actions, strict=True):
         assert column.min() >= action.low and column.max() <= action.high and column.isfinite().all()
-    factors = tensor(*[policy.gains()[name].item() / value for name, value in policy.NOMINAL.items()])
-    assert factors.log().abs().max() <= torch.log(tensor(2.0)) and factors.log().abs().min() > 0.0
+    factors = double(*[policy.gains()[name].item() / value for name, value in policy.NOMINAL.items()])
+    assert factors.log().abs().max() <= torch.log(double(2.0)) and factors.log().abs().min() > 0.0
 
 
 def test_instruments_change_nothing_of_the_turbine():
     rich, plain = WindTurbine(horizon=50.0, observe=("scheduled",)), WindTurbine(horizon=50.0)
-    state, wind = rich.draw_initial_state(3, generator()), rich.draw_exogenous(3, generator())
+    state, wind = rich.draw_initial_state(3, seeded()), rich.draw_exogenous(3, seeded())
     low, high = bounds(plain.actions)
-    command = low + (high - low) * torch.rand(3, rich.n_steps, 2, generator=generator(1), dtype=torch.float64)
+    command = low + (high - low) * torch.rand(3, rich.n_steps, 2, generator=seeded(1), dtype=torch.float64)
     found = Rollout(rich, rich.closure)(state, wind, command).states
     expected = Rollout(plain, plain.closure)(state[:, :6], wind, command).states
     # The same operations on the same numbers.
@@ -113,7 +106,7 @@ def test_instruments_change_nothing_of_the_turbine():
     # An exact low-pass of a speed that is about linear over an interval. Random commands bend it: by the rotor's time
     # constant of 16 s, some Δt²/8·(1 rad/s²) = 0.03 rad/s within it, which the filter hands on.
     speed, filtered = rich.gear_ratio * found[..., 0], found[..., 6]
-    decay = torch.exp(tensor(-0.5 * FAST_FILTER))
+    decay = torch.exp(double(-0.5 * FAST_FILTER))
     ramp = (1.0 - decay) / (0.5 * FAST_FILTER)
     exact = decay * filtered[:, :-1] + (ramp - decay) * speed[:, :-1] + (1.0 - ramp) * speed[:, 1:]
     torch.testing.assert_close(filtered[:, 1:], exact, rtol=0.0, atol=0.1)
@@ -121,7 +114,7 @@ def test_instruments_change_nothing_of_the_turbine():
 
 def test_with_jonkmans_constants_it_flies_as_his_controller():
     plant = WindTurbine(observe=("scheduled",))
-    state, wind = plant.draw_initial_state(4, generator(5)), plant.draw_exogenous(4, generator(5))
+    state, wind = plant.draw_initial_state(4, seeded(5)), plant.draw_exogenous(4, seeded(5))
     policy = nominal(plant)
     policy.reference_speed, policy.switch_speed = JonkmanController.reference_speed, 120.0
     flown = Rollout(plant, plant.closure, policy)(state, wind)
@@ -135,8 +128,8 @@ def test_with_jonkmans_constants_it_flies_as_his_controller():
 
 def test_the_exact_gradient_of_the_gains_is_that_of_finite_differences():
     plant = WindTurbine(horizon=60.0, observe=("scheduled",))
-    state, wind = plant.draw_initial_state(2, generator(2)), plant.draw_exogenous(2, generator(2)) + 2.0
-    policy = GainScheduled(plant, generator=generator(4))
+    state, wind = plant.draw_initial_state(2, seeded(2)), plant.draw_exogenous(2, seeded(2)) + 2.0
+    policy = GainScheduled(plant, generator=seeded(4))
     rollout = Rollout(plant, plant.closure, policy)
 
     def cost():

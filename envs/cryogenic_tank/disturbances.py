@@ -2,29 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.sampling import require_request
+from rt_torchrl.plants.shapes import Draws
 
 LOWEST = 600.0
 """Time that no orbit takes: one close to the ground of the Earth takes 5060 s [s]."""
-
-
-Draw = Float[Tensor, "{batch} {n_steps}"]
-"""A sample of each episode and interval."""
-
-
-@runtime_checkable
-class LoadModel(Protocol):
-    """Anything that draws histories of the heat load."""
-
-    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draw:
-        """Heat load Q_h [W] of ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +59,7 @@ class CyclicLoad:
         """Mean load [W] over whole orbits; exact if the noise, within ±√3σ_n, never reaches the floor at zero."""
         return self.minimum + self.peak * self.width * math.sqrt(2.0 * math.pi) / self.period
 
-    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draw:
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
         """Heat load Q_h [W] of ``batch`` independent episodes, in float64 on the generator's device.
 
         Args:

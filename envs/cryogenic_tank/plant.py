@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.cryogenic_tank import unknown
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients, CubicVentLaw, NeuralCoefficients
-from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad, LoadModel
+from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
-from rt_torchrl.plants.sampling import require_stable_step, rk4_step
+from rt_torchrl.plants.sampling import DisturbanceModel, require_stable_step, rk4_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Phase, Signal
 
@@ -223,7 +223,7 @@ class CryogenicTank(Plant):
         dt: float = 30.0,
         horizon: float = 4.32e5,
         closure: nn.Module | None = None,
-        load: LoadModel | None = None,
+        load: DisturbanceModel | None = None,
         fluid: str = "Hydrogen",
         wall: Wall = "explicit",
         wall_heat_capacity: float = 500e3,

@@ -2,29 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.sampling import require_request
+from rt_torchrl.plants.shapes import Draws
 
 GREATEST = 30.0
 """Speed of a wind in which no drone flies [m/s]."""
-
-
-Draw = Float[Tensor, "{batch} {n_steps}"]
-"""A sample of each episode and interval."""
-
-
-@runtime_checkable
-class GustModel(Protocol):
-    """Anything that draws histories of the headwind."""
-
-    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draw:
-        """Headwind u_∞ [m/s] of ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +57,7 @@ class GaussianGust:
         require_range("std", self.std, 0.0, GREATEST, unit="m/s", of=of)
         require_range("time_scale", self.time_scale, 0.01, 3600.0, unit="s", of=of)
 
-    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draw:
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
         """Headwind u_∞ [m/s] of ``batch`` independent episodes, in float64 on the generator's device.
 
         Args:

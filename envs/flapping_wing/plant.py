@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.flapping_wing import unknown
 from rt_torchrl.envs.flapping_wing.closures import NeuralPolar, QuasiSteadyPolar
-from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust, GustModel
+from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
 from rt_torchrl.options import require_range
 from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
 from rt_torchrl.plants.policies import SaturatedAffine
-from rt_torchrl.plants.sampling import between, lag, require_stable_step
+from rt_torchrl.plants.sampling import DisturbanceModel, between, lag, require_stable_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
 from rt_torchrl.plants.signal import Measurement, Phase, Signal
 
@@ -244,7 +244,7 @@ class FlappingWing(Plant):
         dt: float = 5e-4,
         horizon: float = 5.0,
         closure: nn.Module | None = None,
-        wind: GustModel | None = None,
+        wind: DisturbanceModel | None = None,
         target: tuple[float, float] = (5.0, 5.0),
         cost: RunningCost | None = None,
         mass: float = 3e-3,

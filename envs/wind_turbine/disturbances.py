@@ -12,7 +12,8 @@ from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord
 from rt_torchrl.options import require_range
-from rt_torchrl.plants.sampling import require_request
+from rt_torchrl.plants.sampling import DisturbanceModel, require_request
+from rt_torchrl.plants.shapes import Draws
 
 CUT_IN_WIND = 3.0
 """Cut-in wind speed of the NREL 5-MW turbine [m/s]; Jonkman et al., NREL/TP-500-38060, table 1-1."""
@@ -21,18 +22,12 @@ STORM = 120.0
 
 
 @runtime_checkable
-class WindModel(Protocol):
-    """Anything that draws wind histories for the turbine."""
+class WindModel(DisturbanceModel, Protocol):
+    """A model of the longitudinal wind speed u [m/s] that has a mean."""
 
     @property
     def mean(self) -> float:
         """Mean wind speed [m/s]."""
-        ...
-
-    def draw(
-        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
-    ) -> Float[Tensor, "{batch} {n_steps}"]:
-        """Longitudinal wind speed u [m/s] of ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt."""
         ...
 
 
@@ -93,9 +88,7 @@ class KaimalWind:
         transit = self.length_scale / self.mean
         return 4.0 * transit / (1.0 + 6.0 * f * transit) ** (5.0 / 3.0)
 
-    def draw(
-        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
-    ) -> Float[Tensor, "{batch} {n_steps}"]:
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
         """Wind speed u [m/s] of independent episodes, in float64 on the generator's device, by an inverse real FFT.
 
         Args:
@@ -156,9 +149,7 @@ class RecordedWind:
         """Mean wind speed of all records together [m/s]."""
         return float(np.concatenate([record.speed for record in self.records]).mean())
 
-    def draw(
-        self, batch: int, n_steps: int, dt: float, generator: torch.Generator
-    ) -> Float[Tensor, "{batch} {n_steps}"]:
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
         """Longitudinal wind speed u [m/s] of ``batch`` episodes, in float64 on the generator's device.
 
         Args:

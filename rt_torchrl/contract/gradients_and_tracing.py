@@ -104,17 +104,16 @@ def gradients(calls: Calls) -> Iterator[str]:
 
 
 class _Derivative(NamedTuple):
-    """A directional derivative by reverse mode and by finite differences; ``reached`` if autograd saw a path."""
+    """A directional derivative by reverse mode and by finite differences."""
 
     reverse: Tensor
     differences: Tensor
-    reached: bool
 
 
 def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: str) -> Iterator[str]:
     measure = _measure(method, arguments, calls.seed)
     value = arguments[argument].clone().requires_grad_()
-    reached, gradient = _gradient(lambda: measure({**arguments, argument: value}), [value])
+    gradient = _gradient(lambda: measure({**arguments, argument: value}), [value])
     signals = getattr(calls.plant, SIGNALS[argument])
     for k, signal in enumerate(signals):
         shift = torch.zeros_like(value.detach())
@@ -122,25 +121,25 @@ def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: s
         shift[..., k] = STEP * size
         with torch.no_grad():
             ends = [measure({**arguments, argument: value + sign * shift}) for sign in (1.0, -1.0)]
-        found = _Derivative(gradient[0][..., k] * size, (ends[0] - ends[1]) / (2.0 * STEP), reached)
-        yield from _verdict(method.name, f"{argument} {signal.name!r}", found)
+        derivative = _Derivative(gradient[0][..., k] * size, (ends[0] - ends[1]) / (2.0 * STEP))
+        yield from _verdict(method.name, f"{argument} {signal.name!r}", derivative)
 
 
 def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.Module, whose: str) -> Iterator[str]:
     """Wrong derivatives along one random direction for each tensor of weights."""
     measure = _measure(method, arguments, calls.seed)
     weights = {name: w for name, w in module.named_parameters() if w.requires_grad}
-    reached, gradient = _gradient(lambda: measure(arguments).sum(), list(weights.values()))
+    gradient = _gradient(lambda: measure(arguments).sum(), list(weights.values()))
     generator, dormant = seeded(calls.seed), _dormant(module)
     for (name, weight), slope in zip(weights.items(), gradient, strict=True):
         direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
         direction *= 1e-3 + weight.detach().abs().max()
         differences = _along(weight, direction, lambda: measure(arguments).sum())
-        found = _Derivative((slope * direction).sum(), differences, reached)
-        of_all = list(_verdict(method.name, f"{whose} weight {name!r}", found))
-        yield from of_all
+        derivative = _Derivative((slope * direction).sum(), differences)
+        violations = list(_verdict(method.name, f"{whose} weight {name!r}", derivative))
+        yield from violations
         matters = slope.any() or differences.any() or id(weight) in dormant
-        if not of_all and method.name == "vector_field" and not matters:
+        if not violations and method.name == "vector_field" and not matters:
             yield (
                 f"vector_field: closure weight {name!r} changes it at none of {measure(arguments).numel()} states; "
                 "leave the weight out, or start it where it matters."
@@ -181,18 +180,17 @@ def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[Argum
     return measure
 
 
-def _gradient(measure: Callable[[], Tensor], inputs: list[Tensor]) -> tuple[bool, list[Tensor]]:
-    """Whether autograd sees a path at all, and the gradients, which are zero where it sees none."""
+def _gradient(measure: Callable[[], Tensor], inputs: list[Tensor]) -> list[Tensor]:
+    """The gradients by inputs, which are zero where autograd sees no path."""
     with torch.enable_grad():
         total = measure().sum()
         if not total.requires_grad:
-            return False, [torch.zeros_like(x) for x in inputs]
-        found = torch.autograd.grad(total, inputs, allow_unused=True)
-    return True, [torch.zeros_like(x) if g is None else g for x, g in zip(inputs, found, strict=True)]
+            return [torch.zeros_like(x) for x in inputs]
+        return list(torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True))
 
 
-def _verdict(method: str, by: str, found: _Derivative) -> Iterator[str]:
-    reverse, differences = torch.broadcast_tensors(found.reverse.detach(), found.differences)
+def _verdict(method: str, by: str, derivative: _Derivative) -> Iterator[str]:
+    reverse, differences = torch.broadcast_tensors(derivative.reverse.detach(), derivative.differences)
     gap = (reverse - differences).abs()
     bad = ~(gap <= ABSOLUTE + RELATIVE * differences.abs())
     if not bad.any():

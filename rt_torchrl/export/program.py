@@ -20,21 +20,19 @@ INTERFACE = "interface.json"
 """Name of the extra file of a program that describes its observations and actions."""
 
 
-def trace(policy: nn.Module, plant: Plant, *, batch: int | None = None) -> ExportedProgram:
-    """The graph of a policy, ``(batch, n_o) -> (batch, n_a)``.
+def trace(policy: nn.Module, plant: Plant) -> ExportedProgram:
+    """The graph of a policy for any number of observations, ``(batch, n_o) -> (batch, n_a)``.
 
     Args:
         policy: policy from :func:`detached`.
         plant: plant with the policy's observations.
-        batch: number of observations; None for any number.
 
     Raises:
         ValueError: if torch.export cannot trace the policy, or the policy draws random numbers.
     """
-    name, observations = type(policy).__name__, sample_observations(plant.observations, batch or 3)
-    shapes = None if batch else ({0: Dim("batch")},)
+    name, observations = type(policy).__name__, sample_observations(plant.observations, 3)
     try:
-        program = torch.export.export(policy, (observations,), dynamic_shapes=shapes)
+        program = torch.export.export(policy, (observations,), dynamic_shapes=({0: Dim("batch")},))
         # This takes no operator apart, but removes those that do nothing in evaluation, such as dropout.
         program = program.run_decompositions({})
     except Exception as error:  # torch.export raises many kinds, of several modules

@@ -94,20 +94,20 @@ def multi_start(
     """
     generator = torch.Generator().manual_seed(0)
     origin = copy.deepcopy(closure.state_dict()) if first is None else first
-    found = [descend(0)]
-    least, best = found[0].best, copy.deepcopy(closure.state_dict())
+    results = [descend(0)]
+    least, best = results[0].best, copy.deepcopy(closure.state_dict())
     for number in range(1, count):
         closure.load_state_dict(origin if number % 2 else best)
         if number > 1 or first is None:
             move(closure, generator)
         try:
-            found.append(descend(number))
+            results.append(descend(number))
         except FloatingPointError:  # weights drawn at random may be nonsense
             continue
-        if found[-1].best < least:
-            least, best = found[-1].best, copy.deepcopy(closure.state_dict())
+        if results[-1].best < least:
+            least, best = results[-1].best, copy.deepcopy(closure.state_dict())
     closure.load_state_dict(best)
-    return found
+    return results
 
 
 R = TypeVar("R")
@@ -224,23 +224,24 @@ class Estimate(NamedTuple):
 
     def warnings(self) -> list[str]:
         """What a user must know before using the estimate, in plain words; empty if there is nothing."""
-        found, dt = [], self.likelihood.plant.dt
+        warnings, dt = [], self.likelihood.plant.dt
         if self.segment:
-            found.append(
-                "over whole records the twin leaves what was read, as that of an unstable system does: it was fitted "
-                f"over segments of {self.segment} control intervals ({self.segment * dt:g} s), as all errors here are"
+            warnings.append(
+                f"the twin was fitted over segments of {self.segment} control intervals ({self.segment * dt:g} s) with "
+                "first states of their own, as all errors here are; over whole records it may leave what was read, as "
+                "that of an unstable system does"
             )
         rms, scatter = judged(self.likelihood).rms, scatter_of(self.likelihood.sensors, self.likelihood.records)
         for sensor, error, size in zip(self.likelihood.sensors, rms.tolist(), scatter.tolist(), strict=True):
             if error > 5.0 * EXPLAINED * size > 0.0:
-                found.append(
+                warnings.append(
                     f"the twin does not explain {sensor.name}: its RMS error is {error:.3g} {sensor.measurement.unit}, "
                     f"and the readings scatter by {size:.3g}. Check columns and units, the inputs that act on the "
                     "system, and what the plant leaves out; then try other first weights (starts)"
                 )
         if self.before and all(self.after[name] == value for name, value in self.before.items()):
-            found.append("no weight has moved: the fit has found no step that lowers its cost. Try other first weights")
-        return found + self.uncertainty.warnings()
+            warnings.append("no weight has moved: no step lowers the cost of the fit. Try other first weights")
+        return warnings + self.uncertainty.warnings()
 
 
 class _Minimum(NamedTuple):
@@ -310,10 +311,10 @@ class Estimation:
         before = {name: value.item() for name, value in named_values(closure).items()}
         self._require_process(records)
         if self.config.segment is None and self.process is None and all(r.course is not None for r in records):
-            found = self._longest(records, belief)
+            minimum = self._longest(records, belief)
         else:
-            found = self._minimum(records, belief, self.config.segment or 0)
-        likelihood, prior = found.likelihood, found.likelihood.prior
+            minimum = self._minimum(records, belief, self.config.segment or 0)
+        likelihood, prior = minimum.likelihood, minimum.likelihood.prior
         names = [sensor.name for sensor in self.sensors]
         return Estimate(
             before,
@@ -324,8 +325,8 @@ class Estimation:
             0.0 if prior is None else prior.stiffness,
             likelihood,
             Uncertainty(likelihood, errors=self.config.errors),
-            found.iterations,
-            found.segment,
+            minimum.iterations,
+            minimum.segment,
         )
 
     def _minimum(self, records: Sequence[SensorRecord], belief: BeliefPrior | None, length: int) -> _Minimum:
@@ -335,13 +336,13 @@ class Estimation:
             records = [part for record in records for part in segments(record, length, self.twin.plant.dt)]
         prior = WeightPrior(closure, 1.0 if config.prior is None else config.prior) if belief is None else belief
         tried = multi_start(closure, config.starts, lambda number: self._both_ways(records, prior, number))
-        found, iterations = min(tried, key=lambda one: one.best), sum(one.iterations for one in tried)
+        minimum, iterations = min(tried, key=lambda minimum: minimum.best), sum(minimum.iterations for minimum in tried)
         for _ in range(config.rounds):
-            rest = self._follow_residuals(found.likelihood)
-            iterations += self._descended(found.likelihood).iterations
+            rest = self._follow_residuals(minimum.likelihood)
+            iterations += self._descended(minimum.likelihood).iterations
             if rest:
                 break
-        return found._replace(iterations=iterations, segment=length)
+        return minimum._replace(iterations=iterations, segment=length)
 
     def _longest(self, records: Sequence[SensorRecord], belief: BeliefPrior | None) -> _Minimum:
         """The fit over whole records, or over the longest segments that the twin follows as well as shorter ones."""
@@ -354,9 +355,9 @@ class Estimation:
             nonlocal done
             if length and free * sum(-(-n // length) for n in lengths) > min(MOST_UNKNOWNS, samples // 2):
                 raise FloatingPointError(f"segments of {length} control intervals have too many first states")
-            found = self._minimum(records, belief, length)
-            done += found.iterations
-            return found, judged(found.likelihood).rms
+            minimum = self._minimum(records, belief, length)
+            done += minimum.iterations
+            return minimum, judged(minimum.likelihood).rms
 
         enough = torch.maximum(EXPLAINED * scatter, given)
         return over_segments(self.twin.closure, max(lengths), fit, enough)._replace(iterations=done)
@@ -399,15 +400,15 @@ class Estimation:
     @torch.no_grad()
     def _guesses(self, records: Sequence[SensorRecord]) -> Float[Tensor, "records n_s"]:
         """First guesses of the initial states; a record that follows begins where the twin ends the one before."""
-        found: list[Tensor] = []
+        guesses: list[Tensor] = []
         for number, record in enumerate(records):
             if record.follows and number:
                 before = records[number - 1]
-                given = (found[-1][None], before.exogenous[None], before.actions[None])
-                found.append(self.twin.replay(*given, start=before.start).states[0, -1])
+                given = (guesses[-1][None], before.exogenous[None], before.actions[None])
+                guesses.append(self.twin.replay(*given, start=before.start).states[0, -1])
             else:
-                found.append(record.guess)
-        return torch.stack(found)
+                guesses.append(record.guess)
+        return torch.stack(guesses)
 
     def _require_process(self, records: Sequence[SensorRecord]) -> None:
         follows = [record.follows for record in records]
@@ -431,7 +432,7 @@ class Estimation:
         if number:
             return self._staged(records, prior)
         together = self._descended(self.likelihood(records, prior=prior))
-        found = copy.deepcopy(closure.state_dict())
+        weights_together = copy.deepcopy(closure.state_dict())
         closure.load_state_dict(start)
         try:
             staged = self._staged(records, prior)
@@ -440,20 +441,20 @@ class Estimation:
         done = together.iterations + staged.iterations
         if staged.best < together.best:
             return staged._replace(iterations=done)
-        closure.load_state_dict(found)
+        closure.load_state_dict(weights_together)
         return together._replace(iterations=done)
 
     def _staged(self, records: Sequence[SensorRecord], prior: WeightPrior) -> _Minimum:
         done = 0
         if self.process is None:
             done = self._descended(self.likelihood(records, prior=prior, known=True)).iterations
-        found = self._descended(self.likelihood(records, prior=prior))
-        return found._replace(iterations=done + found.iterations)
+        minimum = self._descended(self.likelihood(records, prior=prior))
+        return minimum._replace(iterations=done + minimum.iterations)
 
     def _descended(self, likelihood: Likelihood) -> _Minimum:
         optimiser = LevenbergMarquardt(likelihood.unknowns, tolerance=NOISE_TOLERANCE)
-        found = optimiser.run(likelihood.normal_equations, self.config.iterations)
-        return _Minimum(likelihood, found.best, found.iterations)
+        descended = optimiser.run(likelihood.normal_equations, self.config.iterations)
+        return _Minimum(likelihood, descended.best, descended.iterations)
 
     def _follow_residuals(self, likelihood: Likelihood) -> bool:
         """Set noise levels and prior by the residuals; whether they rest."""
@@ -491,15 +492,15 @@ def scatter_of(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Fl
     if not records:
         raise ValueError("records=[] of the estimation must hold at least one record.")
     readings = torch.cat([record.readings for record in records])
-    found = []
+    scatter = []
     for sensor, values in zip(sensors, readings.T, strict=True):
         seen = values[~values.isnan()]
         if not len(seen):
             raise ValueError(f"sensor {sensor.name!r} has no sample in any record; leave it out.")
         origin = seen[:1].expand_as(seen)
         change = differences([sensor.measurement], seen[:, None], origin[:, None])
-        found.append(change.square().mean().sqrt())
-    return torch.stack(found)
+        scatter.append(change.square().mean().sqrt())
+    return torch.stack(scatter)
 
 
 def first_noise(sensors: Sequence[Sensor], records: Sequence[SensorRecord]) -> Float[Tensor, " n_y"]:
@@ -566,7 +567,7 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
     closure, dt = estimation.twin.closure, estimation.twin.plant.dt
     start = copy.deepcopy(closure.state_dict())
     estimate = estimation.run(training)
-    noise, length, found = estimate.likelihood.noise, estimate.segment, copy.deepcopy(closure.state_dict())
+    noise, length, trained = estimate.likelihood.noise, estimate.segment, copy.deepcopy(closure.state_dict())
     sides = [estimate.likelihood.records, list(held_out)]
     if length:
         sides[1] = [part for record in held_out for part in segments(record, length, dt)]
@@ -574,7 +575,7 @@ def identify(estimation: Estimation, training: Sequence[SensorRecord], held_out:
     closure.load_state_dict(start)
     first = first_noise(estimation.sensors, training)
     before = [judged(estimation.fit_initial_states(records, first)) for records in sides]
-    closure.load_state_dict(found)
+    closure.load_state_dict(trained)
     on_training, on_held_out = zip(before, after, strict=True)
     return Identified(estimate, on_training, on_held_out, autocorrelation(estimate.likelihood))
 

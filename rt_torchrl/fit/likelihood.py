@@ -183,9 +183,9 @@ class Likelihood:
     @property
     def first_stiffness(self) -> Float[Tensor, "records n_free"]:
         """Stiffness of the offsets of every initial state about its guess; zero for a record that follows another."""
-        each = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
-        own = [float(not record.follows) for record in self.records]
-        return each.new_tensor(own)[:, None] * each
+        stiffness = (self.initial.unit.sum(-1) / self.spread[list(self.initial.free)]).square()
+        first = [float(not record.follows) for record in self.records]
+        return stiffness.new_tensor(first)[:, None] * stiffness
 
     @torch.no_grad()
     def replays(self) -> list[Replays]:
@@ -243,10 +243,10 @@ class Likelihood:
     @torch.no_grad()
     def simulated(self) -> list[Float[Tensor, "samples n_y"]]:
         """What the sensors would read along every record, bias included, whether there is a sample or not."""
-        found: dict[int, Tensor] = {}
+        readings: dict[int, Tensor] = {}
         for replay in self.replays():
-            found |= dict(zip(replay.group.numbers, self._read(replay), strict=True))
-        return [found[number] for number in range(len(self.records))]
+            readings |= dict(zip(replay.group.numbers, self._read(replay), strict=True))
+        return [readings[number] for number in range(len(self.records))]
 
     @torch.no_grad()
     def normal_equations(self, residuals: Sequence[Residuals] | None = None) -> NormalEquations:
@@ -267,16 +267,16 @@ class Likelihood:
             cost = cost + 0.5 * r.square().sum()
             gradient.index_put_((places,), (A.mT @ r.unsqueeze(-1)).squeeze(-1), accumulate=True)
             matrix.index_put_((places.unsqueeze(-1), places.unsqueeze(-2)), A.mT @ A, accumulate=True)
-        found = self._with_first_states(NormalEquations(cost, gradient, matrix))
-        return self.prior.added(found) if self.prior is not None and self._shown else found
+        equations = self._with_first_states(NormalEquations(cost, gradient, matrix))
+        return self.prior.added(equations) if self.prior is not None and self._shown else equations
 
-    def _with_first_states(self, found: NormalEquations) -> NormalEquations:
+    def _with_first_states(self, equations: NormalEquations) -> NormalEquations:
         """The equations with the prior of the initial states."""
         stiffness, offsets = self.first_stiffness, self.initial.offsets
         held = slice(self._shown, self._shown + offsets.numel())
-        found.gradient[held] += (stiffness * offsets).flatten()
-        found.matrix.diagonal()[held] += stiffness.flatten()
-        return found._replace(cost=found.cost + 0.5 * (stiffness * offsets.square()).sum())
+        equations.gradient[held] += (stiffness * offsets).flatten()
+        equations.matrix.diagonal()[held] += stiffness.flatten()
+        return equations._replace(cost=equations.cost + 0.5 * (stiffness * offsets.square()).sum())
 
     @torch.no_grad()
     def pushes(self, replays: Sequence[Replays] | None = None) -> list[Residuals]:
@@ -287,18 +287,18 @@ class Likelihood:
         for replay in self.replays() if replays is None else replays:
             ends = zip(replay.states[:, [0, -1]], replay.sensitivity[:, [0, -1]], strict=True)
             states |= dict(zip(replay.group.numbers, ends, strict=True))
-        found, biases = [], self.biases.offsets.numel()
+        pushes, biases = [], self.biases.offsets.numel()
         for number, record in enumerate(self.records):
             if not record.follows:
                 continue
             (s, S), (before, S_before) = states[number], states[number - 1]
             values = differences(self.plant.states, s[0], before[1]) / self.process
-            own, places = S[0][:, self._shown :], self._places(number)
+            own_jacobian, places = S[0][:, self._shown :], self._places(number)
             rest = self._places(number - 1)
-            jacobian = torch.cat([-S_before[1], own], -1) / self.process[:, None]
+            jacobian = torch.cat([-S_before[1], own_jacobian], -1) / self.process[:, None]
             kept = slice(len(rest) - biases)
             joined = torch.cat([rest[kept], places[self._shown : len(places) - biases]])
-            found.append(
+            pushes.append(
                 Residuals(
                     [number],
                     torch.ones_like(values, dtype=torch.bool)[None, None],
@@ -307,17 +307,17 @@ class Likelihood:
                     joined[None],
                 )
             )
-        return found
+        return pushes
 
     def held_back(self, inverse: Float[Tensor, "n n"]) -> float:
         """Number of unknowns that priors determine instead of the data, by the inverse of the information."""
         n = self.weight_count
         stiffness = self.first_stiffness.flatten()
-        found = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
+        determined = (stiffness * inverse.diagonal()[n : n + len(stiffness)]).sum()
         for push in self.pushes():
             A, (places,) = push.jacobian[0, 0], push.places
-            found = found + (A.T @ A * inverse[places[:, None], places]).sum()
-        return float(found if self.prior is None else found + self.prior.determined(inverse))
+            determined = determined + (A.T @ A * inverse[places[:, None], places]).sum()
+        return float(determined if self.prior is None else determined + self.prior.determined(inverse))
 
     def _places(self, number: int) -> Int[Tensor, " n_local"]:
         free = len(self.initial.free)

@@ -241,9 +241,8 @@ class Plant(nn.Module, ABC):
         scales = self.discrepancy_scales
         if len(scales) != len(self.states) or not all(scale > 0.0 for scale in scales):
             named = ", ".join(f"{signal.name} [{signal.unit}]" for signal in self.states)
-            raise ValueError(
-                f"state_sizes={scales} of plant {self.name!r} must have one positive number each: {named}."
-            )
+            argument = "state_sizes" if scales is self.state_sizes else "discrepancy_scales"
+            raise ValueError(f"{argument}={scales} of plant {self.name!r} must have one positive number each: {named}.")
         compared = [k for k, scale in enumerate(scales) if scale < math.inf]
         signals = [self.states[k] for k in compared]
         difference = differences(signals, state[..., compared], measured[..., compared])
@@ -356,9 +355,9 @@ def _steps_by_runge_kutta(plant: Plant) -> bool:
     low, high = bounds(plant.actions, device=device)
     command = (low + 0.3 * (high - low)).nan_to_num(0.0, 0.0, 0.0).expand(2, -1)
     applied = plant.actuate(state, command)
-    own = plant.step(t, state, command, exogenous, plant.closure).state
+    end = plant.step(t, state, command, exogenous, plant.closure).state
     runge_kutta = plant.latch(Plant.advance(plant, t, state, applied, exogenous, plant.closure), applied)
-    return torch.allclose(own, runge_kutta, rtol=1e-12, atol=1e-12)
+    return torch.allclose(end, runge_kutta, rtol=1e-12, atol=1e-12)
 
 
 def require_end_cost(plant: Plant) -> None:

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rt_torchrl.options import require_number
-from rt_torchrl.plants.shapes import State, Time
+from rt_torchrl.plants.shapes import Draws, State, Time
 
 RK4_REAL_STABILITY = 2.785
 """Length of the stability interval of a fourth-order, four-stage Runge-Kutta step on the negative real axis."""
@@ -89,6 +90,14 @@ def whole_steps(plant: str, dt: float, horizon: float) -> int:
             f"try {max(1, steps) * dt} s."
         )
     return steps
+
+
+@runtime_checkable
+class DisturbanceModel(Protocol):
+    """Anything that draws histories of an exogenous input, such as a wind or a heat load."""
+
+    def draw(self, batch: int, n_steps: int, dt: float, generator: torch.Generator) -> Draws:
+        """The input in ``batch`` episodes at the times 0, dt, …, (n_steps − 1)·dt, in the unit of its signal."""
 
 
 def require_request(batch: int, n_steps: int, dt: float, *, least_steps: int = 1) -> None:

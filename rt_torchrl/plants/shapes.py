@@ -25,6 +25,8 @@ Actions = Float[Tensor, "batch n n_a"]
 """Applied actions of whole episodes."""
 Inputs = Float[Tensor, "batch n n_z"]
 """Exogenous inputs of whole episodes."""
+Draws = Float[Tensor, "{batch} {n_steps}"]
+"""Samples of one signal, as a method with the arguments ``batch`` and ``n_steps`` draws them."""
 Scalar = Float[Tensor, "*batch"]
 """A quantity per realisation."""
 Memory = Float[Tensor, "*batch n_m"]

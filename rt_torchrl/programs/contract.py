@@ -143,15 +143,15 @@ class Holdings:
         return [self._mention(type(x)), *map(self._mention, parts)]
 
     def _read_tensor(self, x: Tensor) -> list[object]:
-        found = [type(x).__name__, tuple(x.shape), str(x.dtype), x.requires_grad]
+        description = [type(x).__name__, tuple(x.shape), str(x.dtype), x.requires_grad]
         if x.layout is not torch.strided or x.device.type != "cpu":
             self._complete = False
-            return [*found, *self._address(x)]
+            return [*description, *self._address(x)]
         self._tensors.append(x)
         if id(x) in self._inputs:
-            return found
+            return description
         self._constants.append(x)
-        return [*found, hashlib.sha256(_bytes(x)).digest()]
+        return [*description, hashlib.sha256(_bytes(x)).digest()]
 
     def _elements(self, x: Any) -> Iterable[object]:
         """What a collection or a function holds."""
@@ -175,8 +175,8 @@ class Holdings:
             cells = [cell for cell in x.__closure__ or () if cell != types.CellType()]
             self._parts += [(cell, "cell_contents") for cell in cells]
             self._complete &= len(cells) == len(x.__closure__ or ())  # a variable without a value may get one
-            own = [x.__code__, x.__defaults__, x.__kwdefaults__, x.__dict__]
-            return [*own, *(cell.cell_contents for cell in cells)]
+            parts = [x.__code__, x.__defaults__, x.__kwdefaults__, x.__dict__]
+            return [*parts, *(cell.cell_contents for cell in cells)]
         return ()
 
     def _slots(self, x: Any) -> Iterator[object]:
@@ -369,13 +369,13 @@ class _Reads:
         kind = x if isinstance(x, type) else type(x)
         if foreign(kind.__module__):
             return
-        own = {} if isinstance(x, type) else getattr(x, "__dict__", {})
-        for name in own.keys() & named.keys():
-            if isinstance(own[name], contextvars.ContextVar):  # of which nothing is known but its address
-                raise _refusal(named[name], f"the attribute {name}", own[name])
+        attributes = {} if isinstance(x, type) else getattr(x, "__dict__", {})
+        for name in attributes.keys() & named.keys():
+            if isinstance(attributes[name], contextvars.ContextVar):  # of which nothing is known but its address
+                raise _refusal(named[name], f"the attribute {name}", attributes[name])
         functions = {name: _function_of(f) for owner in kind.__mro__ for name, f in vars(owner).items()}
         methods = {name: f.__code__ for name, f in functions.items() if f is not None and f.__code__ in self._codes}
-        for name, code in {name: code for name, code in (methods | named).items() if name not in own}.items():
+        for name, code in {name: code for name, code in (methods | named).items() if name not in attributes}.items():
             owner = next((k for k in kind.__mro__ if name in vars(k)), None)
             if owner is not None and not foreign(owner.__module__) and (id(owner), name) not in self.places:
                 self._take(code, owner, name, f"the class attribute {owner.__name__}.")
@@ -555,9 +555,9 @@ def _culprit(module: nn.Module, arguments: tuple[Any, ...], other: tuple[Any, ..
     asked: list[list[tuple[nn.Module, list[Tensor], list[Tensor]]]] = []
     here = threading.get_ident()
 
-    def note(asked_module: nn.Module, given: object, found: object) -> None:
+    def note(asked_module: nn.Module, given: object, answer: object) -> None:
         if threading.get_ident() == here:
-            asked[-1].append((asked_module, _tensors(given), _tensors(found)))
+            asked[-1].append((asked_module, _tensors(given), _tensors(answer)))
 
     handle = register_module_forward_hook(note)
     try:
@@ -566,8 +566,8 @@ def _culprit(module: nn.Module, arguments: tuple[Any, ...], other: tuple[Any, ..
             module(*question)
     finally:
         handle.remove()
-    for (inner, given, found), (again, *rest) in zip(asked[0], asked[2], strict=False):
-        if inner is again and _equal(given, rest[0]) and not _equal(found, rest[1]):
+    for (inner, given, answer), (again, given_again, answer_again) in zip(asked[0], asked[2], strict=False):
+        if inner is again and _equal(given, given_again) and not _equal(answer, answer_again):
             paths = [path for path, held in module.named_modules() if held is inner]
             return _called(module, paths[0] if paths else "")
     return _called(module, "")

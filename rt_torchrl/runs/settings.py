@@ -71,7 +71,7 @@ def config_of(config_class: type[RunConfig], options: dict[str, Any]) -> RunConf
     try:
         return _converter().structure(options, config_class)
     except cattrs.BaseValidationError as error:
-        raise ValueError("; ".join(cattrs.transform_error(error, "options", _told))) from error
+        raise ValueError("; ".join(cattrs.transform_error(error, "options", _message))) from error
 
 
 def class_of(folder: Path, settings: dict[str, Any]) -> type[RunConfig]:
@@ -203,7 +203,8 @@ def _primitive(value: Any, kind: type) -> Any:
     return value
 
 
-def _told(error: BaseException, kind: type | None) -> str:
+def _message(error: BaseException, kind: type | None) -> str:
+    """An error of cattrs in words, which hands over the expected type, too."""
     if isinstance(error, cattrs.ForbiddenExtraKeysError):
         unknown = ", ".join(sorted(error.extra_fields))
         return f"{error.cl.__name__} has no option {unknown}; it is of another version or recipe."

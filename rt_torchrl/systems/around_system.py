@@ -42,6 +42,14 @@ class AroundSystem(EnvBase):
             self.env.begin_window()
         self._count_window()
 
+    def close(self, **kwargs: Any) -> None:
+        """Close the system too, such as its connection or its window."""
+        self.env.close(**kwargs)
+        super().close(**kwargs)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.env.set_seed(seed)
+
     def _count_window(self) -> None:
         """Count a window; by default nothing is counted."""
 

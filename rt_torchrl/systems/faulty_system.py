@@ -205,9 +205,6 @@ class FaultySystem(AroundSystem):
             reading[at] = torch.nan if injection.kind == "nan" else injection.value
         return reading
 
-    def _set_seed(self, seed: int | None) -> None:
-        self.env.set_seed(seed)
-
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """State of the system, and the number of its episodes, on which the faults depend."""
         return {"system": self.env.state_dict(*args, **kwargs), "episode": self._episode}
@@ -215,7 +212,3 @@ class FaultySystem(AroundSystem):
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.env.load_state_dict(state["system"], *args, **kwargs)
         self._episode = state["episode"]
-
-    def close(self, **kwargs: Any) -> None:
-        self.env.close(**kwargs)
-        super().close(**kwargs)

@@ -269,17 +269,9 @@ class SafetyLayer(AroundSystem):
     def _flag(self, value: bool) -> Tensor:
         return torch.full((*self.batch_size, 1), value, dtype=torch.bool, device=self.device)
 
-    def _set_seed(self, seed: int | None) -> None:
-        self.env.set_seed(seed)
-
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """State of the system; the layer itself has none that outlives an episode."""
         return self.env.state_dict(*args, **kwargs)
 
     def load_state_dict(self, state: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.env.load_state_dict(state, *args, **kwargs)
-
-    def close(self, **kwargs: Any) -> None:
-        """Close the system too, such as its connection or its window."""
-        self.env.close(**kwargs)
-        super().close(**kwargs)

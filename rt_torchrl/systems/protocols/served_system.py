@@ -20,26 +20,26 @@ from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 Protocol = Literal["opcua", "modbus"]
 ANSWER = 0.8
 """Share of the period within which the plant must answer a request."""
-
+HOST = "127.0.0.1"
+"""Address of the server, which is on this machine."""
 NONE = (-0.5, 0.5)
 """Range of a number of skipped samples that are none."""
 
 
-def link_to(protocol: Protocol, tags: Tags, port: int, *, period: float, host: str = "127.0.0.1") -> Link:
-    """The link to a served plant.
+def link_to(protocol: Protocol, tags: Tags, port: int, *, period: float) -> Link:
+    """The link to a plant that is served on this machine.
 
     Args:
         protocol: what the server speaks.
         tags: tags of the plant.
         port: port of the server.
         period: control period on the wall clock [s].
-        host: name or address of the server.
     """
     timeout = ANSWER * period
     if protocol == "opcua":
-        return OpcUaLink(f"opc.tcp://{host}:{port}", own_nodes(tags.read), own_nodes(tags.written), timeout=timeout)
+        return OpcUaLink(f"opc.tcp://{HOST}:{port}", own_nodes(tags.read), own_nodes(tags.written), timeout=timeout)
     read, written = own_registers(tags.read), own_registers(tags.written, WRITTEN_AT)
-    return ModbusLink(host, port, read, written, timeout=timeout)
+    return ModbusLink(HOST, port, read, written, timeout=timeout)
 
 
 def served_system(

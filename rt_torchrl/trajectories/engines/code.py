@@ -70,11 +70,11 @@ class Inputs:
 
     def row(self, read: Iterable[int] | None = None) -> np.ndarray:
         """The present numbers of all of them as one row, or of those that are read."""
-        found = np.empty(max(1, *self._ends, 1))
+        numbers = np.empty(max(1, *self._ends, 1))
         for k in range(len(self._all)) if read is None else read:
             x = self._arrays[k]
-            found[self._ends[k] - x.size : self._ends[k]] = x.ravel()
-        return found
+            numbers[self._ends[k] - x.size : self._ends[k]] = x.ravel()
+        return numbers
 
     def split(self, gradients: np.ndarray) -> list[Tensor]:
         """A row of gradients by the learned weights, in their own shapes."""
@@ -99,13 +99,13 @@ class Group(NamedTuple):
 
     def gather(self, *arrays: np.ndarray) -> np.ndarray:
         """Rows ``n batch signals`` of arrays, side by side as ``n signals lanes``."""
-        found, first = np.empty((len(arrays[0]), sum(x.shape[-1] for x in arrays), self.lanes)), 0
+        gathered, first = np.empty((len(arrays[0]), sum(x.shape[-1] for x in arrays), self.lanes)), 0
         for x in arrays:
             last = first + x.shape[-1]
-            found[:, first:last, : self.live] = x[:, self.first : self.last].transpose(0, 2, 1)
+            gathered[:, first:last, : self.live] = x[:, self.first : self.last].transpose(0, 2, 1)
             first = last
-        found[:, :, self.live :] = found[:, :, self.live - 1 : self.live]
-        return found
+        gathered[:, :, self.live :] = gathered[:, :, self.live - 1 : self.live]
+        return gathered
 
     def scatter(self, lanes: np.ndarray, array: np.ndarray) -> None:
         """Put ``n signals lanes`` into the rows of an array ``n batch signals``."""
@@ -114,12 +114,12 @@ class Group(NamedTuple):
 
 def signals_of(drive: Iterable[Tensor]) -> np.ndarray:
     """The address of every signal of tensors ``n batch signals``, and the bytes to the next realisation and row."""
-    found = []
+    signals = []
     for x in drive:
         step, lane, signal = x.stride()
         first, lane = x.data_ptr(), lane if x.shape[1] > 1 else 0  # one row for all realisations
-        found += [(first + 8 * signal * j, 8 * lane, 8 * step) for j in range(x.shape[2])]
-    return np.array(found, np.int64).reshape(-1, 3)
+        signals += [(first + 8 * signal * j, 8 * lane, 8 * step) for j in range(x.shape[2])]
+    return np.array(signals, np.int64).reshape(-1, 3)
 
 
 def for_each_group(batch: int, lanes: int, work: Callable[[Group], None]) -> None:
@@ -255,8 +255,8 @@ class IntervalCode:
         parts = [state], [*drive] if driven else [], learned
         leaves = [leaf.requires_grad_() for part in parts for leaf in part]
         with torch.enable_grad(), tracer.following():
-            found = _gradients(with_weights(interval, weights, state, drive), leaves, costate)
-        values = map(tracer.outputs, found)
+            gradients = _gradients(with_weights(interval, weights, state, drive), leaves, costate)
+        values = map(tracer.outputs, gradients)
         outputs = [[*chain.from_iterable(islice(values, len(part)))] for part in parts]
         code = ObjectCode(sweep_text(tracer.program, outputs, self.sizes, self.lanes), "sweep", SWEEP)
         self.read |= _read_by(tracer, interval, chain.from_iterable(outputs))
@@ -271,7 +271,7 @@ class IntervalCode:
         by_weights = np.zeros((sum(inputs.sizes), self.lanes.number))
         sweep(*x, states, np.zeros_like(states), 0, by_state, inputs.row(), by_drive, by_weights, 1)
         rows = torch.ones(len(self.point.state), dtype=torch.bool)
-        exact = self._exactly(interval, inputs, rows, costate)
+        exact = self._expected(interval, inputs, rows, costate)
         known = exact[0].isfinite().all(-1) & exact[1].isfinite().all(-1)
         if not known.all():  # such as where(x > 0, sqrt(x), 0): compared where torch has a gradient
             rows = known
@@ -281,17 +281,17 @@ class IntervalCode:
                     "branch of torch.where that is not taken may have none: give it an argument for which it has one, "
                     "torch.sqrt(torch.where(x > 0, x, 1)) in the place of torch.sqrt(x)"
                 )
-            exact = self._exactly(interval, inputs, rows, costate)
+            exact = self._expected(interval, inputs, rows, costate)
         at = rows.numpy()
-        found = [by_state.T[at], by_drive[0].T[at] if driven else exact[1]]
-        found += inputs.split(by_weights[:, at].sum(-1))
+        computed = [by_state.T[at], by_drive[0].T[at] if driven else exact[1]]
+        computed += inputs.split(by_weights[:, at].sum(-1))
         largest = max((x.abs().amax().item() for x in exact if x.numel()), default=0.0)
         names = ["state", "drive", *(name for name, w in interval.named_parameters() if w.requires_grad)]
-        for name, part, exactly in zip(names, found, exact, strict=True):
-            floor = np.full(exactly.shape, ROUNDING / AGREEMENT * largest)
-            require_equal(f"the gradient by {name}", np.asarray(part), exactly.numpy(), floor)
+        for name, part, expected in zip(names, computed, exact, strict=True):
+            floor = np.full(expected.shape, ROUNDING / AGREEMENT * largest)
+            require_equal(f"the gradient by {name}", np.asarray(part), expected.numpy(), floor)
 
-    def _exactly(self, interval: nn.Module, inputs: Inputs, rows: Tensor, costate: np.ndarray) -> list[Tensor]:
+    def _expected(self, interval: nn.Module, inputs: Inputs, rows: Tensor, costate: np.ndarray) -> list[Tensor]:
         """The gradients by states, drive and weights that torch computes for some realisations."""
         point = self.point.rows(rows)
         leaves = [x.clone().requires_grad_() for x in (point.state, *point.drive)]
@@ -309,7 +309,7 @@ def _gradients(end: Tensor, leaves: list[Tensor], costate: Tensor) -> Sequence[T
     return torch.autograd.grad(end, leaves, costate, allow_unused=True, materialize_grads=True)
 
 
-def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
+def require_equal(what: str, computed: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> None:
     """Refuse machine code that differs from torch.
 
     Raises:
@@ -317,13 +317,13 @@ def require_equal(what: str, found: np.ndarray, exact: np.ndarray, scale: np.nda
         UncomparedError: if it differs only where torch finds no numbers.
     """
     sizes = np.abs(np.where(np.isfinite(exact), exact, 0.0)) + np.abs(np.where(np.isfinite(scale), scale, 0.0))
-    equal = np.isclose(found, exact, rtol=0.0, atol=AGREEMENT * sizes.max(0, initial=0.0) + 1e-300, equal_nan=True)
+    equal = np.isclose(computed, exact, rtol=0.0, atol=AGREEMENT * sizes.max(0, initial=0.0) + 1e-300, equal_nan=True)
     wrong = ~equal & np.isfinite(exact) if (~equal & np.isfinite(exact)).any() else ~equal
     if wrong.any():
         kind = UntraceableError if np.isfinite(exact[wrong]).all() else UncomparedError
         raise kind(
-            f"{what} differs from what torch computes, for example {found[wrong][0]} instead of {exact[wrong][0]}. A "
-            "number has left torch where tracing cannot follow it, such as by .numpy()"
+            f"{what} differs from what torch computes, for example {computed[wrong][0]} instead of {exact[wrong][0]}. "
+            "A number has left torch where tracing cannot follow it, such as by .numpy()"
         )
 
 
@@ -387,23 +387,23 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
         (holdings, inputs), sums = known, getattr(interval, "sums", 0)
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (holdings.digest, lanes_of_this_machine(), *widths)
-        found, alive = _kept.get(key, (None, tuple(holdings.alive)))
-        if isinstance(found, IntervalCode) and not found.outside.unchanged():
-            found, alive = None, tuple(holdings.alive)
+        code, alive = _kept.get(key, (None, tuple(holdings.alive)))
+        if isinstance(code, IntervalCode) and not code.outside.unchanged():
+            code, alive = None, tuple(holdings.alive)
         driven = any(x.requires_grad for x in drive)
         wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
-        if found is None or (isinstance(found, IntervalCode) and wanted and driven not in found.sweeps):
+        if code is None or (isinstance(code, IntervalCode) and wanted and driven not in code.sweeps):
             if not all(bool(x.isfinite().all()) for x in (initial_state, *interval.parameters())):
                 return None  # nothing to compare with; the next call may have numbers
             point = point_of(initial_state, drive, lanes_of_this_machine().number, sums)
-            found = _made(found, key, interval, point, holdings, driven if wanted else None)
-            if found is None:
+            code = _made(code, key, interval, point, holdings, driven if wanted else None)
+            if code is None:
                 return None
-            _kept[key] = found, alive
+            _kept[key] = code, alive
             while len(_kept) > KEPT:
                 _kept.popitem(last=False)
         _kept.move_to_end(key)
-        return None if isinstance(found, UntraceableError) else (found, inputs)
+        return None if isinstance(code, UntraceableError) else (code, inputs)
 
 
 def _made(
@@ -427,9 +427,9 @@ def _made(
         _tries[key] += 1
         if isinstance(error, UncomparedError) and _tries[key] < TRIES:
             return None
-        found = _reason(error)
-        warnings.warn(f"engine 'autograd' takes the place of 'native': {found}.", stacklevel=2)
-        return found
+        reason = _reason(error)
+        warnings.warn(f"engine 'autograd' takes the place of 'native': {reason}.", stacklevel=2)
+        return reason
     return code
 
 
