@@ -6,9 +6,10 @@ import fresh_process
 import numpy as np
 import pytest
 import torch
-from c_build import generator, needs_compiler
+from c_build import needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
 from printed_commands import blocks
+from seeds_and_numbers import seeded
 from small_runs import SMALL
 from test_export_controller import InC
 from test_real_system import Rig, connected
@@ -51,7 +52,7 @@ def residual(plant):
     found = NeuralResidual(plant, {"velocity": 1.0}, inputs=("force",))
     with torch.no_grad():
         for weight in found.closure.own.parameters():
-            weight.copy_(torch.randn(weight.shape, generator=generator(), dtype=weight.dtype))
+            weight.copy_(torch.randn(weight.shape, generator=seeded(), dtype=weight.dtype))
     return found
 
 
@@ -67,8 +68,8 @@ EXTENSIONS = {
 
 def flight(plant, n=12, batch=3):
     """Initial states, inputs, and commands within the range of the actions."""
-    start, exogenous = plant.draw_initial_state(batch, generator(1)), plant.draw_exogenous(batch, generator(2))[:, :n]
-    share = torch.rand(batch, n, len(plant.actions), generator=generator(3), dtype=torch.float64)
+    start, exogenous = plant.draw_initial_state(batch, seeded(1)), plant.draw_exogenous(batch, seeded(2))[:, :n]
+    share = torch.rand(batch, n, len(plant.actions), generator=seeded(3), dtype=torch.float64)
     low, high = (torch.tensor([getattr(a, end) for a in plant.actions], dtype=torch.float64) for end in ("low", "high"))
     return start, exogenous, low + share * (high - low)
 
@@ -95,7 +96,7 @@ def test_observations_are_those_by_hand_in_whatever_order_the_plant_is_extended(
     expected = by_hand(observed(plain, flown.states, exogenous), 3)
     for plant in (StackedObservations(plain, 3), extend(StackedObservations(base, 3))):
         assert plant.unread == plain.unread and len(plant.observations) == 8
-        stacked = plant.draw_initial_state(3, generator(1))
+        stacked = plant.draw_initial_state(3, seeded(1))
         found = Rollout(plant, plant.closure, engine=engine)(stacked, exogenous, commands)
         # The own scheme of a stacked plant has the residual push before and after, to second order.
         close = 1e-3 if kind == "residual" and plant.base is not plain else 1e-13
@@ -130,8 +131,8 @@ def test_the_plants_and_all_that_they_suspect(name):
 @pytest.mark.parametrize("extend", [EXTENSIONS["none"], EXTENSIONS["lag"]], ids=["none", "lag"])
 def test_gradients_of_native_are_those_of_autograd_and_of_differences(extend):
     plant = extend(StackedObservations(Timed(), 2))
-    policy, (start, exogenous, _) = plant.make_policy(generator(4)), flight(plant, n=20)
-    closure = plant.make_closure(generator(5))
+    policy, (start, exogenous, _) = plant.make_policy(seeded(4)), flight(plant, n=20)
+    closure = plant.make_closure(seeded(5))
     weights = [*policy.parameters(), *(w for w in closure.parameters() if w.requires_grad)]
 
     def cost(engine="autograd"):
@@ -200,7 +201,7 @@ def test_two_positions_hold_a_mass_that_no_law_of_one_position_holds():
         alone = np.polyadd([1.0, -2.0, 1.0], 0.5 * DT**2 * gain * np.array([1.0, 1.0]))
         assert np.abs(np.roots(alone)).max() >= 1.0 - 1e-7
     plant = StackedObservations(Mass(dt=DT, horizon=n * DT, noise=0.0), 1)
-    start, exogenous = plant.draw_initial_state(4, generator()), torch.zeros(4, n, 1, dtype=torch.float64)
+    start, exogenous = plant.draw_initial_state(4, seeded()), torch.zeros(4, n, 1, dtype=torch.float64)
     flown = Rollout(plant, plant.closure, LinearGain(gains[None]))(start, exogenous)
     x, v = start[:, :2].unbind(-1)
     before, expected = x, [x]
@@ -231,7 +232,7 @@ def test_a_controller_with_filters_and_limits_beside_past_observations(tmp_path,
     monkeypatch.setattr("rt_torchrl.export.controller_check.INTERVALS", 50)
     base = shipped_plants()["wind_turbine"]()
     plant = StackedObservations(base, 1)
-    agreement = export_controller(plant.make_policy(generator(3)), tmp_path / "turbine.c", plant, name="turbine")
+    agreement = export_controller(plant.make_policy(seeded(3)), tmp_path / "turbine.c", plant, name="turbine")
     assert agreement.difference < 1e-9 and agreement.from_plant < 2e-3
 
 
