@@ -185,8 +185,6 @@ import sys, torch
 sys.path.insert(0, "tests")
 from test_pendulum import Pendulum, Rollout, control_cost, seeded
 
-recorded = recipe("record_log").recorded
-
 plant = Pendulum(horizon=0.25)
 # A window of a short horizon has a start for each realisation; lengths and numbers of realisations both change.
 for n, batch, start in ((5, 1, 0.0), (4, 3, 0.0), (3, 5, torch.arange(5.0).double())):
