@@ -46,7 +46,7 @@ class TwoZones(Extension):
         mixing_time: T_m [s].
 
     Raises:
-        ValueError: if the ratio is below 1, or the mixing time is not positive and finite.
+        ValueError: if the ratio is below 1, the mixing time is not positive and finite, or the base is an extension.
     """
 
     def __init__(self, base: Plant, ratio: float, mixing_time: float):
@@ -54,6 +54,8 @@ class TwoZones(Extension):
             raise ValueError(
                 f"ratio={ratio} of the zones must be at least 1, and mixing_time={mixing_time} s positive; both finite."
             )
+        if base.innermost is not base:
+            raise ValueError(f"base={type(base).__name__} of TwoZones must be the tank itself; extend the result.")
         super().__init__(base, [Signal(symbol="x", name="mixed_pressure", unit="Pa")])
         self.ratio, self.mixing_time = ratio, mixing_time
         self._left = math.exp(-base.dt / mixing_time)

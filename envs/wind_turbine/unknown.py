@@ -46,7 +46,7 @@ class LaggedInflow(Extension):
         of: what lags. The time constant of the torque is no coefficient of the closure.
 
     Raises:
-        ValueError: if the time constant is not positive and finite.
+        ValueError: if the time constant is not positive and finite, or the base is an extension.
     """
 
     advance = Plant.advance
@@ -54,6 +54,10 @@ class LaggedInflow(Extension):
     def __init__(self, base: Plant, time_constant: float, of: Literal["torque", "power"] = "power"):
         if not 0.0 < time_constant < math.inf:
             raise ValueError(f"time_constant={time_constant} s of the {of} must be positive and finite.")
+        if base.innermost is not base:
+            raise ValueError(
+                f"base={type(base).__name__} of LaggedInflow must be the turbine itself; extend the result."
+            )
         if of == "torque":
             super().__init__(base, [Signal(symbol=r"\tau", name="lagged_torque", unit="N m")])
         else:

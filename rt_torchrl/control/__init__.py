@@ -1,1 +1,1 @@
-"""Classical controllers, and optimal commands over a receding horizon or over whole episodes."""
+"""Classical controllers, and optimal commands over a receding horizon."""

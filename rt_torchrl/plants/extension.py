@@ -161,9 +161,14 @@ class Extension(Plant):
         return closure.get_submodule("base") if self._parameterised else closure
 
     def coefficients(self, closure: nn.Module) -> Float[Tensor, " n"]:
-        """The extension's own coefficients in a closure, where its parameters are :class:`PositiveCoefficients`."""
+        """The extension's own coefficients in a closure.
+
+        Raises:
+            TypeError: if its parameters are no :class:`PositiveCoefficients`.
+        """
         own = closure.get_submodule("own")
-        assert isinstance(own, PositiveCoefficients)
+        if not isinstance(own, PositiveCoefficients):
+            raise TypeError(f"own={type(own).__name__} of {type(self).__name__} must be PositiveCoefficients.")
         return own.coefficients
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
