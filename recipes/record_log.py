@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -173,7 +174,8 @@ def recorded(
         if k < n and own_scheme:
             state = plant.step(times[k], state, command, z, plant.closure).state
         elif k < n:
-            state = _held(plant, times[k], state, applied, z, (times[k + 1] - times[k]).item())
+            scheme = partial(_held, plant, (times[k + 1] - times[k]).item())
+            state = plant.step_by(scheme, times[k], state, command, z, plant.closure).state
     return _log(plant, times, torch.cat(rows), generator, noise)
 
 
@@ -189,10 +191,11 @@ def _require_recordable(plant: Plant, jitter: float, noise: float) -> None:
         )
 
 
-def _held(plant: Plant, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, length: float) -> Tensor:
+def _held(
+    plant: Plant, length: float, t: Tensor, state: Tensor, applied: Tensor, z: Tensor, closure: nn.Module
+) -> Tensor:
     """The state after an interval of any length, over which action and input are held."""
-    end = rk4_step(lambda t, s: plant.vector_field(t, s, applied, z, plant.closure), t, state, length)
-    return plant.latch(end, applied)
+    return rk4_step(lambda t, s: plant.vector_field(t, s, applied, z, closure), t, state, length)
 
 
 def _log(plant: Plant, times: Tensor, rows: Tensor, generator: torch.Generator, noise: float) -> SensorLog:

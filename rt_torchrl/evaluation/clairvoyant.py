@@ -57,7 +57,8 @@ class RelaxedInterval(PenalisedInterval):
         z, shifted = drive.exogenous[..., :n_z], command + self.span * drive.exogenous[..., n_z:]
         excess = ((shifted - self.plant.actuate(s, shifted)) / self.span).square().sum(-1)
         cost = self.plant.running_cost(drive.t, s, command, z) + self.penalty * excess
-        end = self.plant.latch(self.plant.advance(drive.t, s, command, z, self.closure), command)
+        memorised = self.plant.memorise(drive.t, s, z)
+        end = self.plant.latch(self.plant.advance(drive.t, memorised, command, z, self.closure), command)
         return torch.cat([end, (state[..., -1] + cost).unsqueeze(-1)], -1)
 
 

@@ -20,7 +20,8 @@ episode lasts, and the value of what comes after the end is known: a learner wit
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -179,9 +180,15 @@ class Plant(nn.Module, ABC):
 
         The closure is the true one in the real system, and the learned one in the twin.
         """
+        return self.step_by(self.advance, t, state, command, exogenous, closure)
+
+    def step_by(
+        self, scheme: Callable[..., State], t: Time, state: State, command: Action, exogenous: Input, closure: nn.Module
+    ) -> Transition:
+        """One control interval in which another scheme than :meth:`advance`, with its arguments, integrates."""
         state = self.memorise(t, state, exogenous)
         applied = self.actuate(state, command)
-        return Transition(self.latch(self.advance(t, state, applied, exogenous, closure), applied), applied)
+        return Transition(self.latch(scheme(t, state, applied, exogenous, closure), applied), applied)
 
     def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
@@ -354,9 +361,8 @@ def _steps_by_runge_kutta(plant: Plant) -> bool:
     t = torch.zeros(1, dtype=state.dtype, device=device)
     low, high = bounds(plant.actions, device=device)
     command = (low + 0.3 * (high - low)).nan_to_num(0.0, 0.0, 0.0).expand(2, -1)
-    applied = plant.actuate(state, command)
     end = plant.step(t, state, command, exogenous, plant.closure).state
-    runge_kutta = plant.latch(Plant.advance(plant, t, state, applied, exogenous, plant.closure), applied)
+    runge_kutta = plant.step_by(partial(Plant.advance, plant), t, state, command, exogenous, plant.closure).state
     return torch.allclose(end, runge_kutta, rtol=1e-12, atol=1e-12)
 
 

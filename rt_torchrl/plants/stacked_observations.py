@@ -47,6 +47,11 @@ class StackedObservations(Extension):
         self.observations = (*base.observations, *_past(base.observations, count))
         self.observed = (*base.observed, *_past(base.observed, count))
 
+    @property
+    def own_scheme(self) -> bool:
+        """That of the plant: past observations stand still between samples, whatever integrates."""
+        return self.base.own_scheme
+
     # The past observations, which stand behind what sensors read and before what none reads
 
     def split(self, state: State) -> tuple[Float[Tensor, "*batch n_b"], Hidden]:

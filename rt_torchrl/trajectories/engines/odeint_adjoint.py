@@ -33,15 +33,19 @@ class OdeintAdjoint(GradientEngine):
         field = _HeldField(interval, initial_state.shape[-1])
         weights = tuple(w for w in interval.closure.parameters() if w.requires_grad)
         interval_span = torch.tensor([0.0, interval.plant.dt], dtype=torch.float64, device=drive.t.device)
+
+        def integrated(t: Tensor, state: Tensor, applied: Tensor, exogenous: Tensor, closure: nn.Module) -> Tensor:
+            held = torch.cat([state, applied, exogenous], -1)
+            # The span is in absolute time: the backward pass evaluates the field again, long after this call.
+            span = t + interval_span
+            end = odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1]
+            return end[..., : state.shape[-1]]
+
         state, states = initial_state, []
         for k in range(drive.t.shape[0]):
             now = Drive(drive.t[k], drive.exogenous[k], drive.command[k])
-            applied = interval.plant.actuate(state, interval.command(state, now))
-            held = torch.cat([state, applied, now.exogenous], -1)
-            # The span is in absolute time: the backward pass evaluates the field again, long after this loop moved on.
-            span = drive.t[k] + interval_span
-            end = odeint_adjoint(field, held, span, method="rk4", adjoint_params=weights)[-1]
-            state = interval.plant.latch(end[..., : state.shape[-1]], applied)
+            command = interval.command(state, now)
+            state = interval.plant.step_by(integrated, now.t, state, command, now.exogenous, interval.closure).state
             states.append(state)
         return torch.stack(states)
 
