@@ -61,13 +61,14 @@ PAPER = TwinningConfig(
     planner=PlannerConfig(
         iterations=5,
         realisations=20,
+        starts=0,
         episode_gradient_limit=math.inf,
         extremes=0,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         # Twelve hours of duty cycles, each held for half an hour; a plan is made every hour.
         receding_horizon=PredictiveConfig(horizon=43_200.0, hold=1800.0, period=3600.0),
     ),
-    referee=RefereeConfig(patience=4, clone_patience=20),
+    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=20),
     hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
@@ -75,13 +76,13 @@ CONVERGED = dataclasses.replace(
     planner=dataclasses.replace(
         PAPER.planner,
         iterations=12,
+        starts=32,
         episode_gradient_limit=10.0,
         extremes=1000,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
     ),
     hypotheses=HypothesesConfig(),
-    referee=dataclasses.replace(PAPER.referee, rule="weight_of_evidence"),
-    corrected_plans=True,
+    referee=dataclasses.replace(PAPER.referee, rule="expected_cost"),
 )
 """Configuration of the training by default, whose plans converge."""
 NEURAL = dataclasses.replace(

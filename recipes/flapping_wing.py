@@ -61,12 +61,13 @@ PAPER = TwinningConfig(
     assimilation=AssimilationConfig(iterations=15, method="levenberg_marquardt"),
     planner=PlannerConfig(
         iterations=5,
+        starts=0,
         episode_gradient_limit=math.inf,
         extremes=0,
         descent=DescentConfig(rate=0.2, gradient_limit=0.5),
         receding_horizon=PREDICTIVE,
     ),
-    referee=RefereeConfig(patience=4, clone_patience=4),
+    referee=RefereeConfig(rule="decision_tree", patience=4, clone_patience=4),
     hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
@@ -81,8 +82,7 @@ CONVERGED = dataclasses.replace(
         receding_horizon=PREDICTIVE,
     ),
     hypotheses=HypothesesConfig(),
-    referee=dataclasses.replace(PAPER.referee, rule="weight_of_evidence"),
-    corrected_plans=True,
+    referee=dataclasses.replace(PAPER.referee, rule="expected_cost"),
 )
 """Configuration of the training by default."""
 HOP = dataclasses.replace(
@@ -92,8 +92,7 @@ HOP = dataclasses.replace(
     virtual_episodes=120,
     # On one record a lag that is not there may replay better than the twin alone.
     records=3,
-    # A plan on the gust of the first flight may lie in a minimum that is poor in others.
-    planner=dataclasses.replace(CONVERGED.planner, realisations=40, anew=2),
+    planner=dataclasses.replace(CONVERGED.planner, realisations=40),
 )
 """Configuration of the training with ``--task hop``."""
 NEURAL = dataclasses.replace(

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 WITH_HYPOTHESES = (
     *("--twinning.hypotheses.which", "automatic"),
-    *("--twinning.referee.rule", "weight_of_evidence", "--twinning.corrected-plans"),
+    *("--twinning.referee.rule", "expected_cost"),
 )
 ALONE = (
     *("--twinning.hypotheses.which", "none"),
-    *("--twinning.referee.rule", "decision_tree", "--twinning.no-corrected-plans"),
+    *("--twinning.referee.rule", "decision_tree"),
 )
 
 

@@ -49,11 +49,13 @@ PAPER = TwinningConfig(
     learner=LearnerConfig(return_steps=10),
     planner=PlannerConfig(
         iterations=10,
+        starts=0,
         episode_gradient_limit=math.inf,
         extremes=0,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),
+    referee=RefereeConfig(rule="decision_tree"),
     hypotheses=HypothesesConfig(which="none"),
 )
 CONVERGED = dataclasses.replace(
@@ -65,13 +67,11 @@ CONVERGED = dataclasses.replace(
     planner=PlannerConfig(
         iterations=25,
         realisations=50,
-        scouts=32,
         descent=DescentConfig(optimiser="lbfgs", rate=1.0, tolerance=1e-6),
         receding_horizon=PredictiveConfig(horizon=20.0),
     ),
     hypotheses=HypothesesConfig(),
-    referee=RefereeConfig(rule="weight_of_evidence"),
-    corrected_plans=True,
+    referee=RefereeConfig(),
 )
 """Configuration of the training by default."""
 NEURAL = dataclasses.replace(

@@ -34,22 +34,19 @@ FEW = 8
 
 HYPOTHESES: Options = ("--twinning.hypotheses.which", "automatic")
 ALONE: Options = ("--twinning.hypotheses.which", "none")
-EVIDENCE: Options = ("--twinning.referee.rule", "weight_of_evidence")
+EVIDENCE: Options = ("--twinning.referee.rule", "expected_cost")
 TREE: Options = ("--twinning.referee.rule", "decision_tree")
-CORRECTED: Options = ("--twinning.corrected-plans",)
-UNCORRECTED: Options = ("--twinning.no-corrected-plans",)
 RANDOM: Options = ("--start", "random")
 PARTS = {
     "without hypotheses": "hypotheses",
-    "without corrected plans": "the correction of plans by paired differences",
-    "without the referee": "the referee that weighs evidence",
+    "without the belief": "the belief about costs on the real system",
 }
 """Name of each part, by the arm that lacks it."""
 
 
 def arms_of(case: str) -> dict[str, Options]:
     """Options of every arm on a plant, by name."""
-    every = (*HYPOTHESES, *EVIDENCE, *CORRECTED)
+    every = (*HYPOTHESES, *EVIDENCE)
     planned = ("--twinning.arm", "model_based")
     free = ("--paper", "--twinning.arm", "model_free")
     found: dict[str, Options] = {
@@ -57,16 +54,15 @@ def arms_of(case: str) -> dict[str, Options]:
         "twinning of the paper": ("--paper",),
         "model-free, DDPG": free,
         "twinning from random weights": (*every, *RANDOM),
-        "the same without the referee": (*HYPOTHESES, *TREE, *CORRECTED, *RANDOM),
-        "model-based": (*planned, *ALONE, *TREE, *UNCORRECTED),
+        "the same without the belief": (*HYPOTHESES, *TREE, *RANDOM),
+        "model-based": (*planned, *ALONE, *TREE),
         "model-based, hypotheses": (*planned, *every),
-        "without hypotheses": (*ALONE, *EVIDENCE, *CORRECTED),
-        "without corrected plans": (*HYPOTHESES, *EVIDENCE, *UNCORRECTED),
-        "without the referee": (*HYPOTHESES, *TREE, *CORRECTED),
+        "without hypotheses": (*ALONE, *EVIDENCE),
+        "without the belief": (*HYPOTHESES, *TREE),
     }
     if case == "wind_turbine":  # it plans in real time there; the tank's half-open valve has no plans by gradients
         mpc = ("--twinning.planner.method", "receding_horizon")
-        found["predictive control"] = (*planned, *ALONE, *TREE, *UNCORRECTED, *mpc)
+        found["predictive control"] = (*planned, *ALONE, *TREE, *mpc)
     return found
 
 

@@ -59,8 +59,7 @@ from .twinning.assimilation import AssimilationConfig
 from .twinning.hypotheses.config import HypothesesConfig
 from .twinning.hypotheses.ensemble import TwinEnsemble
 from .twinning.config import TwinningConfig
-from .twinning.distillation import DistillationConfig
-from .twinning.exogenous import ExogenousConfig
+from .steps.inputs import ExogenousConfig
 from .twinning.learners import (
     DDPG,
     TD3,
@@ -70,7 +69,7 @@ from .twinning.learners import (
     LongTermMemoryConfig,
     TD3Config,
 )
-from .twinning.planners import (
+from .steps.plan import (
     ConstraintsConfig,
     Planner,
     PlannerConfig,
@@ -79,7 +78,7 @@ from .twinning.planners import (
     ShortHorizonConfig,
     WholeEpisodes,
 )
-from .twinning.referees import DecisionTree, Evidence, Referee, RefereeConfig, WeightOfEvidence
+from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee, RefereeConfig
 from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results
@@ -121,7 +120,6 @@ __all__ = [
     "Descended",
     "DescentConfig",
     "DigitalTwin",
-    "DistillationConfig",
     "DivergenceError",
     "EarlierPolicies",
     "EarlyStopping",
@@ -132,6 +130,7 @@ __all__ = [
     "EstimationConfig",
     "Evidence",
     "ExogenousConfig",
+    "ExpectedCost",
     "ExplorationConfig",
     "ExportedPolicy",
     "ExtendedClosure",
@@ -218,7 +217,6 @@ __all__ = [
     "TwinningConfig",
     "Uncertainty",
     "UnreadInput",
-    "WeightOfEvidence",
     "WholeEpisodes",
     "begin_loading",
     "check_options",

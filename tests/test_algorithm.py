@@ -9,6 +9,8 @@ from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -16,8 +18,6 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.referees import RefereeConfig
 
 STEPS = ["interact", "update_model_free", "fit_exogenous", "assimilate", "examine", "plan", "switch_policies"]
 

@@ -13,13 +13,11 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.belief import TrackRecord
+from rt_torchrl.steps.inputs import ExogenousConfig, VirtualEpisodes
+from rt_torchrl.steps.plan import Constraints, ConstraintsConfig, Planning, WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.exogenous import ExogenousConfig
 from rt_torchrl.twinning.judgement import Judgement
-from rt_torchrl.twinning.planners import Constraints, ConstraintsConfig, WholeEpisodes
-from rt_torchrl.twinning.planning import Planning
-from rt_torchrl.twinning.track_record import TrackRecord
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 POSITION = {"position": (-1.0, 3.0)}
 

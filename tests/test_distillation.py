@@ -7,18 +7,18 @@ from seeds_and_numbers import seeded
 from test_algorithm import STEPS, twinning, weights
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.architecture import same_architecture
-from rt_torchrl.twinning.distillation import (
+from rt_torchrl.steps.imitation import (
     Distillation,
     DistillationConfig,
     ShareOfRange,
     match_actions,
 )
-from rt_torchrl.twinning.referees import RefereeConfig
+from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.trajectory import Scenario
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.architecture import same_architecture
 
 PLANT = LinearQuadratic(horizon=2.0)
 

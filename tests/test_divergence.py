@@ -9,10 +9,10 @@ from tensordict import TensorDict
 from test_algorithm import twinning, weights
 
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.findings import EpisodeReport
-from rt_torchrl.twinning.referees import RefereeConfig
 
 
 def unsound(found, monkeypatch, episodes):

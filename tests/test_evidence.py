@@ -12,6 +12,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from test_algorithm import twinning
 
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.steps.belief import Differences, Flown, TrackRecord
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.plan import PlannerConfig, Planning
+from rt_torchrl.steps.switch import Evidence, RefereeConfig, make_referee
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
@@ -31,11 +35,6 @@ from rt_torchrl.twinning.evidence.paired_differences import (
 from rt_torchrl.twinning.evidence.real_judge import RealJudge
 from rt_torchrl.twinning.findings import findings, weight_vector
 from rt_torchrl.twinning.judgement import Costs, Judgement
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.planning import Planning
-from rt_torchrl.twinning.referees import Evidence, RefereeConfig, make_referee
-from rt_torchrl.twinning.track_record import Differences, Flown, TrackRecord
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 def test_the_belief_is_that_of_a_gaussian_process():
@@ -198,7 +197,7 @@ def test_a_state_without_trials_is_read():
 
 
 def test_stakes_are_those_of_a_simulation():
-    from rt_torchrl.twinning.referees.weight_of_evidence import stakes
+    from rt_torchrl.steps.switch import stakes
 
     mean, deviation, draws = math.log(1.1), math.hypot(0.3, 0.05), random.Random(0)
     ratios = [math.exp(draws.gauss(mean, deviation)) for _ in range(200_000)]

@@ -9,9 +9,8 @@ from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.steps.inputs import ExogenousConfig, ExogenousProcess, VirtualEpisodes, mixed
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.exogenous import ExogenousConfig, ExogenousProcess, mixed
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 FREE = (Signal(symbol="d", name="free", unit="m/s"),)
 DT = 0.5

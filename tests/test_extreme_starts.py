@@ -9,14 +9,12 @@ from test_first_controller import twinning
 
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.optimisers.descent import Descended
+from rt_torchrl.steps.belief import TrackRecord
+from rt_torchrl.steps.inputs import ExtremeStarts, VirtualEpisodes, astray
+from rt_torchrl.steps.plan import PlannerConfig, Planning
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.extreme_starts import ExtremeStarts, astray
 from rt_torchrl.twinning.judgement import Judgement
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.planning import Planning
-from rt_torchrl.twinning.track_record import TrackRecord
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 CPU = torch.device("cpu")
 

@@ -10,6 +10,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.plan import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -17,7 +18,6 @@ from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.twinning.starts import FirstController
 
 GAINS = (0.4, 0.3)

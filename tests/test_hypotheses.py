@@ -15,6 +15,7 @@ from rt_torchrl.runs.results import hypotheses_of, twin_entries
 from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.plan import PlannerConfig, make_planner
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -28,7 +29,6 @@ from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
 from rt_torchrl.twinning.hypotheses.fit import AGAIN, FIRST, misfit
 from rt_torchrl.twinning.hypotheses.hidden_states import with_hidden_states
 from rt_torchrl.twinning.hypotheses.reread import Reread, reread
-from rt_torchrl.twinning.planners import PlannerConfig, make_planner
 
 LAG = 0.6
 ASSIMILATION = AssimilationConfig(iterations=8, method="levenberg_marquardt", inputs="record")

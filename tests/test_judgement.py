@@ -10,15 +10,13 @@ from tensordict import TensorDict
 from test_evidence import Content, judge_of
 from test_first_controller import twinning
 
+from rt_torchrl.steps.belief import TrackRecord
+from rt_torchrl.steps.imitation import Cloning, DistillationConfig
+from rt_torchrl.steps.plan import PlannerConfig, Planning
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.twinning.cloning import Cloning
-from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.judgement import Costs, Judgement
 from rt_torchrl.twinning.learning import Learning
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.planning import Planning
-from rt_torchrl.twinning.track_record import TrackRecord
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
 REFUTED = judge_of([2.0, 3.0], [2.0, 0.0])

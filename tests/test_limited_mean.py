@@ -10,8 +10,8 @@ from torch import nn
 from rt_torchrl import DigitalTwin, PlannerConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.optimisers.limited_mean import limited_mean
+from rt_torchrl.steps.plan import WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario
-from rt_torchrl.twinning.planners import WholeEpisodes
 
 SIZE = 14.0**0.5
 """Norm of the weights."""

@@ -12,10 +12,9 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import rosco_turbine
 from rt_torchrl.plants.signal import Measurement, Named, Preview
+from rt_torchrl.steps.inputs import ExogenousConfig, VirtualEpisodes
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.exogenous import ExogenousConfig
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 TIME_ZERO = torch.zeros((), dtype=torch.float64)
 CHOICES = [(name, kind, which) for name, kind in shipped_plants().items() for which in kind.observation_sets]

@@ -11,19 +11,19 @@ from linear_quadratic import LinearQuadratic
 from seeds_and_numbers import seeded
 from test_algorithm import twinning, weights
 
-from rt_torchrl.systems.environment import PlantEnv
-from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.learners import DDPG, TD3, Learner, LearnerConfig
-from rt_torchrl.twinning.learners.config import TD3Config
-from rt_torchrl.twinning.planners import (
+from rt_torchrl.steps.plan import (
     Planner,
     PlannerConfig,
     ShortHorizon,
     ShortHorizonConfig,
     WholeEpisodes,
 )
-from rt_torchrl.twinning.referees import DecisionTree, Referee, RefereeConfig, WeightOfEvidence
+from rt_torchrl.steps.switch import DecisionTree, Referee, RefereeConfig, WeightOfEvidence
+from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.algorithm import ReinforcementTwinning
+from rt_torchrl.twinning.learners import DDPG, TD3, Learner, LearnerConfig
+from rt_torchrl.twinning.learners.config import TD3Config
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLANT = LinearQuadratic(horizon=2.0)

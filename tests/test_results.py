@@ -16,9 +16,9 @@ from rt_torchrl.runs import results
 from rt_torchrl.runs.results_table import results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.imitation import of_each_role
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.cloning import of_each_role
 
 
 def refused(name):

@@ -18,14 +18,14 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.referees import RefereeConfig
 
 
 def test_a_run_leaves_its_results_readable(tmp_path):

@@ -10,11 +10,9 @@ from test_evidence import Content
 from test_judgement import EPISODES, REFUTED, Other, judgement, said
 
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.plan import PlannerConfig, Planning, ShortHorizonConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.planners.planner import ShortHorizonConfig
-from rt_torchrl.twinning.planning import Planning
 from rt_torchrl.twinning.scouts import Scouts
 
 

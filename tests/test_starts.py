@@ -22,17 +22,16 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.imitation import DistillationConfig, clones
+from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.switch import ROLES
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.cloning import clones
-from rt_torchrl.twinning.distillation import DistillationConfig
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.referees import ROLES
 from rt_torchrl.twinning.starts.recorded_flights import transitions_of
 
 record_log = recipe("record_log")

@@ -8,14 +8,14 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from test_algorithm import twinning
 
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.belief import LATEST, REFUTING, TrackRecord
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.plan import PlannerConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.evidence.alarm import BEYOND_CHANCE
 from rt_torchrl.twinning.evidence.paired_differences import EXPLORED
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.track_record import LATEST, REFUTING, TrackRecord
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class AlwaysOne(VirtualEpisodes):

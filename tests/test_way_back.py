@@ -8,12 +8,11 @@ from linear_quadratic import LinearGain, LinearQuadratic
 
 from rt_torchrl import DigitalTwin, PlannerConfig
 from rt_torchrl.optimisers.descent import DescentConfig, stuck
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.plan import Planning, ShortHorizon, ShortHorizonConfig, WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
 from rt_torchrl.twinning.judgement import Judgement
-from rt_torchrl.twinning.planners import ShortHorizon, ShortHorizonConfig, WholeEpisodes
-from rt_torchrl.twinning.planning import Planning
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 from rt_torchrl.twinning.way_back import WayBack
 
 EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.trajectory import Trajectory
-from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
     from rt_torchrl.twinning.algorithm import ReinforcementTwinning  # only its type: it loads TorchRL

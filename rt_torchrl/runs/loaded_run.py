@@ -16,14 +16,13 @@ from rt_torchrl.runs.command_line import load_recipe
 from rt_torchrl.runs.configured_plant import MakesPlant, plant_of, require_plant
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
-from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.hypotheses.choice import make_twin
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.twinning.referees import Role
 
 if TYPE_CHECKING:
     import pandas
@@ -77,11 +76,6 @@ class LoadedRun:
         """Role of the policy that is live at the end."""
         role: Role = self.metrics["summary"]["live"]
         return role
-
-    @property
-    def preferred(self) -> Role:
-        """Role that is expected to cost less: the live one, unless it is on trial at the end."""
-        return preferred_role(self.metrics["summary"])
 
     def table(self) -> "pandas.DataFrame":
         """The episodes as a table: a row for each, a column for each entry; nested entries are ``seconds.plan``.

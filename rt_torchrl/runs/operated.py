@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.cores import chosen_core
 from rt_torchrl.systems.operation.event_log import EventLog
@@ -19,7 +20,6 @@ from rt_torchrl.systems.operation.process import ProcessOperation
 from rt_torchrl.systems.operation.simulated import SimulatedOperation
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.starts import Start
 
 EVENTS = "events.jsonl"

@@ -14,13 +14,13 @@ from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
+from rt_torchrl.steps.imitation import of_each_role
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
-from rt_torchrl.twinning.cloning import of_each_role
 from rt_torchrl.twinning.hypotheses.ensemble import ALONE, TwinEnsemble
-from rt_torchrl.twinning.referees import Role
 
 ROLES: tuple[Role, ...] = ("model_based", "model_free")
 
@@ -105,7 +105,6 @@ def summarise(
         | results(unseen, judged),
         "cost_of_learning": cost_of_learning(episodes),
         "live": live,
-        "preferred": preferred(algorithm),
         "better": better,
         "better_chosen_on": chosen_on,
         "closure": {name: named_weights(law) for name, law in laws.items() if law is not None}
@@ -122,19 +121,13 @@ def better_of(algorithm: ReinforcementTwinning, unseen: UnseenEpisodes) -> tuple
     """The better policy, and the name of the episodes that decided; its cost is reported on other episodes.
 
     It is the policy with the smaller mean J_a on validation episodes. On a real system of unknown closure these would
-    have to be flown; there it is the one that the referee prefers.
+    have to be flown; there it is the live one.
     """
     validation = unseen.validation()
     if validation is None:
-        return preferred(algorithm), "twin"
+        return algorithm.referee.live, "twin"
     costs = of_each_role(algorithm.policies, lambda policy: validation.control_costs(policy).mean().item())
     return min(ROLES, key=costs.__getitem__), "validation episodes"
-
-
-def preferred(algorithm: ReinforcementTwinning) -> Role:
-    """The policy that the referee expects to cost less; of a referee of one's own that has no trials, the live one."""
-    role: Role = getattr(algorithm.referee, "preferred", algorithm.referee.live)
-    return role
 
 
 def over_untrained(after: dict[Role, float], untrained: Float[Tensor, " starts"] | None) -> dict[str, float]:

@@ -7,7 +7,7 @@ from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.console import call_of
 from rt_torchrl.runs.results import ROLES
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.runs.summary import on_the_twin, preferred_role
+from rt_torchrl.runs.summary import on_the_twin
 from rt_torchrl.twinning.findings import in_words
 
 SCREEN = 24
@@ -65,9 +65,7 @@ def results_table(metrics: dict[str, Any]) -> str:
     lines.append(
         f"  paid on the real system: sum of J_a {least} over {paid['episodes']} episodes{judging}, largest {most}"
     )
-    live, preferred = (role.replace("_", "-") for role in (found["live"], preferred_role(found)))
-    trial = "" if preferred == live else f", on trial: {preferred} is expected to cost less"
-    lines.append(f"  live at the end: {live}{trial}")
+    lines.append(f"  live at the end: {found['live'].replace('_', '-')}")
     lines += hypothesis_lines(found.get("hypotheses", {}), found.get("believed"))
     lines += alarm_lines(metrics["episodes"])
     room = SCREEN - len(lines) - 4  # the seconds, where the results are, and what to do next

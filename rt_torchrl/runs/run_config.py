@@ -18,11 +18,11 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.callbacks import EarlyStopping
 from rt_torchrl.runs.loggers import LoggerName, require_loggers
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
-from rt_torchrl.twinning.referees import Role
 
 SPREAD_OF_IMITATION = 0.02
 """Exploration around the imitation of a controller, as a share of half the range of each action."""
@@ -260,15 +260,14 @@ class RunConfig:
         """Hyper-parameters for the start of this run: the imitation of a controller explores less than random weights.
 
         A real system that a controller has held so far need not meet the noise that finds out what actions do at all.
-        Without that noise the critic cannot be trusted far, and updates of the model-free policy are judged. Hypotheses
-        replay the whole state, and are left out where the twin is fitted to some sensors alone.
+        Hypotheses replay the whole state, and are left out where the twin is fitted to some sensors alone.
         """
         if self.twinning.assimilation.sensors:
             twinning = dataclasses.replace(twinning, hypotheses=HypothesesConfig(which="none"))
         if self.start == "random":
             return twinning
         exploration = dataclasses.replace(twinning.exploration, spread=SPREAD_OF_IMITATION)
-        return dataclasses.replace(twinning, exploration=exploration, judged_updates=True)
+        return dataclasses.replace(twinning, exploration=exploration)
 
     def defaults(self) -> "RunConfig":
         """The defaults of all options on a command line, given the start, closure and sensors that it asks for.

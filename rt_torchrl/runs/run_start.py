@@ -20,12 +20,11 @@ from rt_torchrl.runs.configured_plant import MakesPlant
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run_config import STARTS, RunConfig
 from rt_torchrl.runs.settings import read_settings
-from rt_torchrl.runs.summary import preferred_role
+from rt_torchrl.steps.switch import ROLES, Role
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.hypotheses.choice import make_twin
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.twinning.referees import ROLES, Role
 from rt_torchrl.twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 SHORTEST = 10
@@ -99,7 +98,7 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
             )
     _require_same_closure(folder, run.closure, config.make_closure(plant, torch.Generator()))
     hypotheses = _hypotheses(folder, run.twin, config, plant)
-    arm, preferred = run.config.twinning.arm, _preferred(folder)
+    arm = run.config.twinning.arm
     policies = {role: run.policies[role] for role in ROLES if arm in ("twinning", role)}
 
     def start(physics: Plant, closure: nn.Module) -> EarlierPolicies:
@@ -107,7 +106,7 @@ def _of_run(folder: Path, config: RunConfig, plant: Plant) -> MakesStart:
         return EarlierPolicies(
             {role: policy.to(device) for role, policy in policies.items()},
             run.closure.to(device),
-            preferred,
+            _live(folder),
             hypotheses,
         )
 
@@ -146,11 +145,11 @@ def _hypotheses(folder: Path, its: DigitalTwin, config: RunConfig, plant: Plant)
     return found
 
 
-def _preferred(folder: Path) -> Role:
-    """The role that was expected to cost less at the end of a run: the live one, unless it was on trial."""
+def _live(folder: Path) -> Role:
+    """The role that was live at the end of a run."""
     file = folder / "metrics.json"
     try:
-        role = preferred_role(json.loads(file.read_text(encoding="utf-8"))["summary"])
+        role = json.loads(file.read_text(encoding="utf-8"))["summary"]["live"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file} does not say which policy was live ({error!r}); take a finished run.") from error
     if role not in ROLES:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rt_torchrl.twinning.referees import Role
+    from rt_torchrl.steps.switch import Role
 
 
 def on_the_twin(unseen: Mapping[str, Any]) -> bool:
@@ -28,7 +28,7 @@ def judged_on_the_system(summary: Mapping[str, Any]) -> "tuple[Mapping[str, Any]
     """
     unseen = summary["unseen"]
     if not on_the_twin(unseen):
-        return unseen, preferred_role(summary)
+        return unseen, summary["live"]
     real, live = summary.get("real_unseen", {"controllers": {}}), summary["live"]
     if live not in real["controllers"]:
         raise ValueError(
@@ -40,9 +40,3 @@ def judged_on_the_system(summary: Mapping[str, Any]) -> "tuple[Mapping[str, Any]
     merit = {name: found["merit"] for name, found in flown.items()}
     count, cost = flown[live]["episodes"], {f"J_a_{live}": flown[live]["J_a"]}
     return {"episodes": count, "costs": real["costs"], "merit": merit, "baselines": others} | cost, live
-
-
-def preferred_role(summary: Mapping[str, Any]) -> "Role":
-    """The role that the referee prefers at the end; in the summary of an earlier version the live one."""
-    role: Role = summary.get("preferred", summary["live"])
-    return role

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from rt_torchrl.study.results import Entry, arm_entry
 from rt_torchrl.study.training import Training
-from rt_torchrl.twinning.evidence import alarm
 
 MATTERS = 0.1
 """Gap over the oracle from which an alarm is missed if it does not rise."""
@@ -121,7 +120,7 @@ def trained_arm(name: str, trainings: Sequence[Training]) -> Arm:
     watched = all("alarm" in one for seed in found for one in seed)
     alarms = [[bool(one["alarm"]) for one in seed] for seed in found] if watched else []
     differences = [[one.get("paired_difference", 0.0) for one in seed] for seed in found] if watched else []
-    wrong = [[abs(d) > alarm.MATTERS for d in seed] for seed in differences]
+    wrong = [[abs(d) > MATTERS for d in seed] for seed in differences]
     entry = arm_entry(name, list(trainings))
     return Arm(entry=entry, paid=paid, alarms=alarms, wrong=wrong)
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rt_torchrl.runs.summary import preferred_role
 from rt_torchrl.study.bootstrap import mean_interval
 from rt_torchrl.study.training import Training
 
@@ -85,10 +84,10 @@ def named(entries: list[Entry]) -> dict[str, Entry]:
 
 
 def arm_entry(name: str, trainings: list[Training]) -> Entry:
-    """Entry of an arm, perhaps with another policy, from its trainings: of the policies that the referee prefers."""
+    """Entry of an arm, perhaps with another policy, from its trainings: of the live policies."""
     found = [training.metrics() for training in trainings]
     summaries = [metrics["summary"] for metrics in found]
-    acting = [preferred_role(summary) for summary in summaries]
+    acting = [summary["live"] for summary in summaries]
     merits = [merit_means(summary["unseen"]["merit"][live]) for summary, live in zip(summaries, acting, strict=True)]
     twinned = trainings[0].arm != "model_free"
     return Entry(

@@ -4,17 +4,23 @@ There are two policies of the same observation, π_mf (model-free) and π_mb (mo
 real system. The other is idle: it learns at the same time and can take over.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.interruption import safe_point
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
+from rt_torchrl.steps.switch import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation.operation import Operation, system_of
@@ -22,28 +28,17 @@ from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.clearance import Clearance
-from rt_torchrl.twinning.cloning import Cloning
 from rt_torchrl.twinning.config import TwinningConfig
-from rt_torchrl.twinning.cost_to_go import share_critic
 from rt_torchrl.twinning.earlier_closure import EarlierClosure
-from rt_torchrl.twinning.evidence.examination import Examination
 from rt_torchrl.twinning.findings import EpisodeReport, findings, merged, weight_change, weight_vector
 from rt_torchrl.twinning.flight import Flight, RealFlights
 from rt_torchrl.twinning.hypotheses.choice import make_assimilation
-from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.learners import Learner, make_learner
 from rt_torchrl.twinning.learning import Learning
 from rt_torchrl.twinning.operating import Operating
-from rt_torchrl.twinning.own_policies import require_own_policies
-from rt_torchrl.twinning.planners import Planner, make_planner
-from rt_torchrl.twinning.planning import Planning
-from rt_torchrl.twinning.referees import ROLES, Evidence, Referee, Role, make_referee
 from rt_torchrl.twinning.saved_state import load_parts, on_device
-from rt_torchrl.twinning.scouts import Scouts
 from rt_torchrl.twinning.short_term_memory import ShortTermMemory
 from rt_torchrl.twinning.starts import Start, first_live
-from rt_torchrl.twinning.track_record import TrackRecord
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class ReinforcementTwinning:
@@ -60,10 +55,10 @@ class ReinforcementTwinning:
         planner: planner of step 5, which trains ``model_based``; by default that of ``config.planner``.
         referee: referee of step 6; by default that of ``config.referee``.
         first: what is known beforehand, such as :class:`FirstController`; None begins with the policies as they are.
-        make_policy: function that draws a random policy like ``model_based``, a scout; by default that of the plant.
+        make_policy: function that draws a random policy like ``model_based``; by default that of the plant.
 
     Raises:
-        ValueError: if the real system's batch size is not 1, or learner, planner or scouts have another policy.
+        ValueError: if the real system's batch size is not 1, or learner or planner train other policies.
     """
 
     def __init__(
@@ -86,19 +81,26 @@ class ReinforcementTwinning:
         self.learner = learner or make_learner(twin.plant, model_free, config.learner, generator=generator)
         self.planner = planner or make_planner(twin, model_based, config.planner, generator=generator)
         self.referee = referee or make_referee(config.referee, first_live(config.arm, first))
-        require_own_policies(self.policies, {"model_free": self.learner, "model_based": self.planner})
+        for role, part in (("model_free", self.learner), ("model_based", self.planner)):
+            if part.policy is not self.policies[role]:
+                raise ValueError(f"{type(part).__name__} trains another policy than {role}; build it with that module.")
         share_critic(self.learner, model_based)
         self.fed_back = isinstance(model_based, StateFeedback)  # it plans on the twin alone while it acts
         self.assimilation = make_assimilation(twin, config.assimilation, config.hypotheses, always=self.fed_back)
-        self.short_term, self.track_record = ShortTermMemory(config.records), TrackRecord(self.policies)
-        self.virtual = VirtualEpisodes(twin, config.exogenous, config.experience, generator=generator)
-        self.virtual.judge_by(getattr(self.planner, "constraints", None), config.planner.extremes)
+        self.short_term = ShortTermMemory(config.records)
+        self.virtual = VirtualEpisodes(
+            twin,
+            config.exogenous,
+            config.experience,
+            constraints=getattr(self.planner, "constraints", None),
+            extremes=0 if self.fed_back else config.planner.extremes,
+            generator=generator,
+        )
+        self.belief = Belief(self.policies, self.virtual, corrects=config.referee.rule == "expected_cost")
         self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
-        self.examination = Examination(self.track_record, self.virtual)
         self.learning = Learning(self.learner, self.virtual)
-        self.planning = Planning(self.planner, self.virtual, config.planner)
-        self.planning.scouts = Scouts(self.virtual, model_based, config.scouts, make_policy)
-        self.cloning = Cloning(self.virtual, config.distillation, self.judged)
+        self.planning = MultiStart(self.planner, self.belief, config.planner, make_policy)
+        self.imitation = Imitation(self.belief, self.judged)
         self.actor = LivePolicy(twin.plant, self.policies[self.referee.live], config.exploration, generator=generator)
         self.collector = env if isinstance(env, Operation) else collector_of(env, self.actor, twin.plant)
         self.flights = RealFlights(env, self.actor, lambda: self.collector.rollout(), twin.plant, config.least_sound)
@@ -152,10 +154,10 @@ class ReinforcementTwinning:
             self.virtual.learn(flight.record) if on_twin else None
         if on_twin:
             self.assimilate(records)
-            self.assimilation.explain(self.examination.replayed(records), self.generator)
+            self.assimilation.explain(self.belief.replayed(records), self.generator)
             self.planning.remember() if "model_based" in pupils else None
         imitating = {role: self.policies[role] for role in pupils}
-        found = self.cloning.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
+        found = self.imitation.begin(self.first.teacher, imitating, batch_of(records), on_twin=on_twin)
         if len(records[-1].actions) != self.twin.plant.n_steps:
             self.short_term.clear()  # later records are whole episodes
             self.virtual.processes.clear()
@@ -172,7 +174,7 @@ class ReinforcementTwinning:
         self.keep(flight)
         explored = self.actor.strength * self.config.exploration.spread
         if flight.whole:  # costs of parts cannot be compared with those of episodes
-            self.track_record.append(flight.record, live, flight.cost.item(), explored, acting.state_dict())
+            self.belief.append(flight.record, live, flight.cost.item(), explored, acting.state_dict())
         report = merged(flight.report(), findings(exploration=self.actor.strength)).set_non_tensor("live", live)
         report = merged(merged(report, cleared.report), self.clearance.counted(flight.record))
         return report.update(findings(**acting.report()) if isinstance(acting, StateFeedback) else {})
@@ -202,64 +204,50 @@ class ReinforcementTwinning:
 
     def examine(self) -> TensorDict:
         """Compare what the latest real episodes cost with what the twin says of them, and seek an explanation."""
-        return self.examination.explained(self.assimilation, self.generator)
+        found = self.belief.examine()
+        if not self.assimilation.explain(self.belief.unexplained, self.generator):
+            return found
+        return merged(findings(**self.assimilation.report()), self.belief.examine())
 
     def plan(self) -> TensorDict:
-        """Step 5: the planner improves π_mb on the twin with w_p*; the plan stays unless the referee finds it worse."""
+        """Step 5: the planner improves π_mb on the twin with w_p*; a plan stays if it is expected to cost less."""
         count = self.config.planner.realisations or self.config.realisations
         plan_on, judged_on = map(self.virtual.draw, (count, self.judged))
-        return self.examination.told(self.planning.plan(self.episodes_done + 1, plan_on, judged_on, self.judgement()))
-
-    def judgement(self) -> Judgement:
-        """How new weights are judged after the latest real episode: by its evidence, if that contradicts the twin."""
-        evidence = self.examination.correction(self.short_term[-1]) if self.config.corrected_plans else None
-        return Judgement(self.referee.worse, self.track_record, evidence)
+        return self.planning.plan(self.episodes_done + 1, plan_on, judged_on)
 
     @torch.no_grad()
     def switch_policies(self) -> TensorDict:
-        """Step 6: the referee decides, with the mean J_a of both policies over the same N virtual episodes."""
-        judged_on = self.virtual.draw(self.judged)
-        judged = self.learning.judge(judged_on, self.judgement()) if self.config.judged_updates else findings()
-        costs = self.virtual_costs(judged_on)
-        live, idle = self.referee.live, self.referee.idle
-        change = weight_change(self.policies[idle], self._earlier_weights[idle])
-        judge = cache(lambda: self.examination.judge(self.short_term[-1]))
-        evidence = Evidence(
-            live_cost=costs[live].item(),
-            idle_cost=costs[idle].item(),
-            idle_weight_change=change.item(),
-            real_costs=self.track_record.real_costs,
-            predicted_costs=lambda: self.track_record.predicted_costs(self.virtual),
-            difference=lambda: judge().difference(*((self.policies[r], costs[r].item()) for r in (idle, live))),
-            contradicted=lambda: judge().contradicts,
-        )
-        event = self.referee.decide(evidence)
-        diverged = [f"{role} diverges on the twin" for role, cost in costs.items() if not cost.isfinite()]
-        report = findings(*diverged, **{f"J_a_{role}": cost for role, cost in costs.items()}, weight_change=change)
-        report = merged(judged, report).set_non_tensor("event", event)
-        return merged(report, self.clone(costs, judged_on)) if event == "clone" else report
-
-    def virtual_costs(self, episodes: Scenario) -> dict[Role, Tensor]:
-        """What both policies cost over virtual episodes; infinite for one with which a sound twin diverges.
+        """Step 6: the referee decides, by what both policies cost over the same N virtual episodes.
 
         Raises:
             DivergenceError: if the twin diverges under the weights that have just flown, too.
         """
-        costs = {role: self.virtual.price(self.policies[role], episodes) for role in ROLES}
-        if not all(cost.isfinite() for cost in costs.values()):
-            self.track_record.require_sound_twin(self.virtual, episodes)
-        return costs
+        judged_on, live, idle = self.virtual.draw(self.judged), self.referee.live, self.referee.idle
+        judged = self.learning.judge(judged_on, self.belief) if self.belief.corrects else findings()
+        costs = {role: self.belief.judge(self.policies[role], judged_on) for role in ROLES}
+        diverged = [f"{role} diverges on the twin" for role in ROLES if not math.isfinite(costs[role].price)]
+        if diverged:
+            self.belief.require_sound_twin(judged_on)
+        change = weight_change(self.policies[idle], self._earlier_weights[idle])
+        evidence = Evidence(
+            live_cost=costs[live].expected,
+            idle_cost=costs[idle].expected,
+            idle_weight_change=change.item(),
+            real_costs=tuple(one.cost for one in self.belief.flown),
+        )
+        event = self.referee.decide(evidence)
+        report = findings(*diverged, **{f"J_a_{role}": costs[role].price for role in ROLES}, weight_change=change)
+        report = merged(judged, report).set_non_tensor("event", event)
+        return merged(report, self.clone(judged_on)) if event == "clone" else report
 
-    def clone(self, costs: dict[Role, Tensor], judged_on: Scenario) -> TensorDict:
-        """Clone the live policy into the idle one, unless the clone is worse; ``costs`` are those on ``judged_on``."""
+    def clone(self, judged_on: Scenario) -> TensorDict:
+        """Clone the live policy into the idle one, unless the clone is worse."""
         live, idle = self.referee.live, self.referee.idle
-        report = self.cloning.clone(
+        report = self.imitation.clone(
             *(self.policies[role] for role in (live, idle)),
             seen=self.learner.observations,
             record=self.short_term[-1],
-            costs=(costs[live].item(), costs[idle].item()),
             judged_on=judged_on,
-            judgement=self.judgement(),
         )
         if "reason" not in report:
             (self.learner if idle == "model_free" else self.planner).restart()
@@ -289,5 +277,21 @@ class ReinforcementTwinning:
         self.episodes_done = state["episodes_done"]
 
 
-KEPT = ("virtual", "short_term", "track_record")  # they leave the tensors of their state on their device
+KEPT = ("virtual", "short_term", "belief")  # they leave the tensors of their state on their device
 COMPONENTS = ("env", "learner", "planner", "planning", "referee", "assimilation", "clearance", *KEPT)
+
+
+def share_critic(learner: object, policy: nn.Module) -> None:
+    """Give model predictive control the cost-to-go of the model-free half, if it is to price the end of its windows.
+
+    Raises:
+        ValueError: if the learner has no method ``cost_to_go``.
+    """
+    if isinstance(policy, PredictiveControl) and policy.terminal == "critic":
+        cost_to_go = getattr(learner, "cost_to_go", None)
+        if cost_to_go is None:
+            raise ValueError(
+                f"terminal='critic' of the receding horizon needs a learner with a method cost_to_go(observation); "
+                f"{type(learner).__name__} has none. Use terminal plant."
+            )
+        policy.value = cost_to_go

@@ -18,9 +18,9 @@ from rt_torchrl.fit.sensors import state_places, state_sensors
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
+from rt_torchrl.steps.inputs import ExogenousProcess
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, identification_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
-from rt_torchrl.twinning.exogenous import ExogenousProcess
 
 DAMPING = 1e-3
 """Damping μ of the first fit by Levenberg-Marquardt."""

@@ -9,13 +9,13 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.switch import ROLES, Role
 from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.referees import ROLES, Role
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class Cleared(NamedTuple):

@@ -4,15 +4,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rt_torchrl.options import check_options
+from rt_torchrl.steps.inputs import ExogenousConfig
+from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig
-from rt_torchrl.twinning.distillation import DistillationConfig
-from rt_torchrl.twinning.exogenous import ExogenousConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
 from rt_torchrl.twinning.learners import LearnerConfig
-from rt_torchrl.twinning.planners import PlannerConfig
-from rt_torchrl.twinning.referees import RefereeConfig
 
 Arm = Literal["twinning", "model_free", "model_based"]
 
@@ -32,13 +31,6 @@ class TwinningConfig:
             the episode is flown again.
         limits: limits of the real system, which a safety layer holds for every policy, and which the twin must predict
             to be kept before a policy may act.
-        judged_updates: whether step 6 takes an update of step 2 back that the referee finds worse, in the arm
-            twinning. Without much exploration the critic is wrong beside the actions that were taken, and an update
-            ruins the imitation of a good controller. A twin that is wrong may also refuse a real improvement.
-        corrected_plans: whether plans, judged updates and distilled clones are judged by what they are expected to cost
-            on the real system, as the paired differences of real episodes say, and step 5 goes back to weights that
-            have flown and are expected to cost less, where one of these episodes contradicts the twin; without it the
-            twin alone judges.
         exploration: parameters of step 1.
         learner: parameters of step 2.
         exogenous: parameters of step 3.
@@ -46,7 +38,6 @@ class TwinningConfig:
         hypotheses: parameters of the hypotheses about what the real system has beside its twin.
         planner: parameters of step 5.
         referee: parameters of step 6.
-        distillation: parameters of step 6 for a clone between policies of different architectures.
     """
 
     arm: Arm = "twinning"
@@ -55,8 +46,6 @@ class TwinningConfig:
     virtual_episodes: int = 20
     least_sound: float = 0.5
     limits: OperatingLimitsConfig = field(default_factory=OperatingLimitsConfig)
-    judged_updates: bool = False
-    corrected_plans: bool = False
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     exogenous: ExogenousConfig = field(default_factory=ExogenousConfig)
@@ -64,17 +53,11 @@ class TwinningConfig:
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     referee: RefereeConfig = field(default_factory=RefereeConfig)
-    distillation: DistillationConfig = field(default_factory=DistillationConfig)
 
     @property
     def experience(self) -> int:
         """Number of latest real episodes whose exogenous inputs are kept: enough for step 4, and for steps 5 and 6."""
         return max(self.records, self.planner.experience)
-
-    @property
-    def scouts(self) -> int:
-        """Number of scouts; 0 where nothing is planned, or not over whole episodes."""
-        return self.planner.scouts if self.planner.whole and self.arm != "model_free" else 0
 
     @property
     def bounded_states(self) -> dict[str, tuple[float, float]]:

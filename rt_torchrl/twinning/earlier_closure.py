@@ -8,11 +8,11 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from rt_torchrl.steps.plan import Planner
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.assimilation import Assimilation
 from rt_torchrl.twinning.findings import findings, merged
-from rt_torchrl.twinning.planners import Planner
 
 
 class EarlierClosure:

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.twinning.findings import findings
-from rt_torchrl.twinning.judgement import Judgement
 from rt_torchrl.twinning.learners import Learner
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 class Learning:
@@ -52,12 +52,12 @@ class Learning:
         return self.learner.update()
 
     @torch.no_grad()
-    def judge(self, judged_on: Scenario, judgement: Judgement) -> TensorDict:
-        """Go back to the policy before the update if the update is worse; the critic keeps what it has learned.
+    def judge(self, judged_on: Scenario, belief: Belief) -> TensorDict:
+        """Go back to the policy before the update if that is expected to cost less; the critic keeps what it learned.
 
         Args:
             judged_on: virtual episodes on which both are flown.
-            judgement: how both are judged.
+            belief: what policies cost.
 
         Returns:
             ``update_accepted``, and the reason if it is 0.
@@ -69,16 +69,16 @@ class Learning:
         if self._after is not None:  # it was taken back under another closure
             policy.load_state_dict(self._after)
         after = self._after = copy.deepcopy(policy.state_dict())
-        found = judgement.costs(policy, self.virtual, judged_on).expected
+        found = belief.judge(policy, judged_on)
         policy.load_state_dict(self._before)
-        earlier = judgement.costs(policy, self.virtual, judged_on).expected
-        if not (math.isfinite(found) or math.isfinite(earlier)):
+        earlier = belief.judge(policy, judged_on)
+        if not (math.isfinite(found.price) or math.isfinite(earlier.price)):
             policy.load_state_dict(after)  # an unsound twin judges nothing, and the step is repeated with another one
-            judgement.track_record.require_sound_twin(self.virtual, judged_on)
+            belief.require_sound_twin(judged_on)
             policy.load_state_dict(self._before)
-        if judgement.worse(found, earlier):
+        if found > earlier:
             self.learner.restart()
-            reason = f"update refused: J_a of model_free would be {found:.4g}, it was {earlier:.4g}"
+            reason = f"update refused: J_a of model_free would be {found.price:.4g}, it was {earlier.price:.4g}"
             return findings(reason, update_accepted=0.0)
         policy.load_state_dict(after)
         return findings(update_accepted=1.0)

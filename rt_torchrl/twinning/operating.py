@@ -6,15 +6,15 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.operation.order import FIRST, Order
 from rt_torchrl.twinning.clearance import Clearance
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.findings import as_findings, findings, merged, plain
 from rt_torchrl.twinning.flight import Flight, RealFlights, together
-from rt_torchrl.twinning.referees import Role
-from rt_torchrl.twinning.track_record import TrackRecord
-from rt_torchrl.twinning.virtual_episodes import VirtualEpisodes
 
 
 @runtime_checkable
@@ -25,7 +25,7 @@ class Trainer(Protocol):
     clearance: Clearance
     flights: RealFlights
     config: TwinningConfig
-    track_record: TrackRecord
+    belief: Belief
     virtual: VirtualEpisodes
 
     @property
@@ -105,7 +105,7 @@ class Operating:
             return  # costs of parts cannot be compared with those of windows
         role, cost = cast(Role, order.name), flight.cost.item()
         explored = order.strength * self._exploration.spread
-        self.trainer.track_record.append(flight.record, role, cost, explored, order.weights)
+        self.trainer.belief.append(flight.record, role, cost, explored, order.weights)
 
     def _report(self, flights: list[Flight]) -> TensorDict:
         order = self._order_of(flights[-1])

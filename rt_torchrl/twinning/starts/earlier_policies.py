@@ -5,12 +5,12 @@ from typing import Any
 
 from torch import nn
 
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.flight import Flight
 from rt_torchrl.twinning.hypotheses.ensemble import TwinEnsemble
-from rt_torchrl.twinning.referees import Role
 from rt_torchrl.twinning.starts.start import Fly
 
 

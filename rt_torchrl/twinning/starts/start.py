@@ -5,9 +5,9 @@ from typing import Protocol, runtime_checkable
 
 from torch import nn
 
+from rt_torchrl.steps.switch import Role
 from rt_torchrl.twinning.config import Arm
 from rt_torchrl.twinning.flight import Flight
-from rt_torchrl.twinning.referees import Role
 
 Fly = Callable[[nn.Module], Flight]
 """Function that lets a policy or state feedback fly one episode on the real system, without exploration."""

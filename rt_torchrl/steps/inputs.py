@@ -1,19 +1,32 @@
-"""Step 3: a Gaussian process around the large scale of a recorded exogenous input gives other possible inputs."""
+"""Step 3: the exogenous inputs of virtual episodes, and these episodes.
 
+A Gaussian process around the large scale of a recorded input gives other possible inputs. Virtual episodes draw from
+the processes of the latest real episodes, and policies are compared in them.
+"""
+
+import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Complex, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from rt_torchrl.options import check_options
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.steps.constraints import Constraints
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, pieces_of_equal_length
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.flight import Flight
 
-LargeScale = Literal["met", "redrawn", "mixed"]
+LargeScale = Literal["met", "mixed"]
 ENOUGH = 3
 """Number of episodes from which on their large scales say how much others may differ."""
 
@@ -29,10 +42,9 @@ class ExogenousConfig:
         penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
         tube: half-width ε of the regression's tube, in standard deviations of the record.
         large_scale: large scale of the inputs that steps 5 and 6 draw: met for those of the real episodes, as in the
-            paper, redrawn for new ones with their spectra at random phases, or mixed for new ones that differ from the
-            mean of those met as these do, see :func:`mixed`. A policy with hundreds of weights fits itself to a few
-            winds that were met, and few winds do not hold the rare ones that cost most. Redrawn inputs have no events
-            at fixed times, such as a step, and the means of those met; mixed ones keep events.
+            paper, or mixed for new ones that differ from the mean of those met as these do, see :func:`mixed`. A policy
+            with hundreds of weights fits itself to a few winds that were met, and few winds do not hold the rare ones
+            that cost most.
     """
 
     knots: int = 300
@@ -61,12 +73,7 @@ class ExogenousProcess:
     .. math:: \Gamma_{kl}(h) = \mathrm E\,\varepsilon_k(t + h)\,\varepsilon_l(t)
 
     are the sample covariances times a Parzen window, which keeps them positive semi-definite. Circulant embedding
-    samples them exactly. The large scales themselves do not vary between realisations, unless they are redrawn: then
-    they have other phases, which are uniform and the same for all components,
-
-    .. math:: \tilde d'_k(t) = \sum_f |\hat d_k(f)|\,e^{i(\arg \hat d_k(f) + \varphi_f)}\,e^{2\pi i f t}
-
-    so that means, spectra and cross-spectra stay as they are.
+    samples them exactly. The large scales themselves do not vary between realisations, unless they are mixed.
 
     Args:
         record: exogenous input z at every control interval.
@@ -77,8 +84,7 @@ class ExogenousProcess:
     Raises:
         ValueError: if the record holds NaN, or fewer samples than a regression needs.
 
-    Sources: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088, of the sampling; Prichard and Theiler, Phys. Rev.
-    Lett. 73 (1994) 951, of the random phases.
+    Source: Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997) 1088, of the sampling.
     """
 
     def __init__(
@@ -127,7 +133,6 @@ class ExogenousProcess:
         count: int,
         generator: torch.Generator,
         *,
-        redrawn: bool = False,
         large: Float[Tensor, "{count} n n_z"] | None = None,
     ) -> Float[Tensor, "{count} n n_z"]:
         """Realisations of the input, within the physical ranges of the signals.
@@ -135,8 +140,7 @@ class ExogenousProcess:
         Args:
             count: number of realisations.
             generator: source of the draws.
-            redrawn: whether each has a large scale of its own, with the spectrum of the record's.
-            large: large scale of each; by default that of the record, or a redrawn one.
+            large: large scale of each; by default that of the record.
         """
         n, n_z = self.mean.shape
         shape = (count, 2 * n, n_z)
@@ -145,18 +149,7 @@ class ExogenousProcess:
         )
         coloured = (self._root * noise.unsqueeze(-2)).sum(-1)
         small = torch.fft.fft(coloured, dim=1).real[:, :n]
-        if large is None:
-            large = self._redrawn(count, generator) if redrawn else self.mean
-        return (large + small).clamp(self._low, self._high)
-
-    def _redrawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "{count} n n_z"]:
-        """Large scales at random phases, of which the mean and the Nyquist frequency have none."""
-        n, spectrum = len(self.mean), torch.fft.rfft(self.mean, dim=0)
-        turns = torch.rand(count, len(spectrum), 1, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
-        turns[:, 0] = 0.0
-        if n % 2 == 0:
-            turns[:, -1] = 0.0
-        return torch.fft.irfft(spectrum * torch.polar(torch.ones_like(turns), 2.0 * torch.pi * turns), n, dim=1)
+        return ((self.mean if large is None else large) + small).clamp(self._low, self._high)
 
 
 def sample_experience(
@@ -179,8 +172,7 @@ def sample_experience(
     chosen = torch.cat(order)[:count].tolist()
     larges = mixed([one.mean for one in processes], count, generator) if large_scale == "mixed" else None
     each = [None] * count if larges is None else larges.split(1)
-    of_each, redrawn = zip(chosen, each, strict=True), large_scale == "redrawn"
-    return torch.cat([processes[k].sample(1, generator, redrawn=redrawn, large=large) for k, large in of_each])
+    return torch.cat([processes[k].sample(1, generator, large=large) for k, large in zip(chosen, each, strict=True)])
 
 
 def mixed(
@@ -270,3 +262,156 @@ def _spectral_root(covariance: Float[Tensor, "n n_z n_z"]) -> Complex[Tensor, "s
     values, vectors = torch.linalg.eigh(torch.fft.fft(circulant, dim=0).conj())
     scale = (values.clamp_min(0.0) / len(circulant)).sqrt()  # with a Parzen window only rounding makes them negative
     return (vectors * scale.unsqueeze(-2)) @ vectors.mH
+
+
+EXTREMES_SEED = 3_000_000
+"""Seed of the initial states among which the extreme ones are found: the same for every training."""
+RARE = 0.01
+"""Share of all episodes that begin like the extreme ones, by which their cost counts."""
+
+
+def extreme_states(plant: Plant, count: int, device: torch.device) -> Float[Tensor, "k n_s"]:
+    """The extremes of each state among many random initial states; none of a state that is always the same.
+
+    The weights of a policy that saturates hardly depend on what lies beyond the starts that it was planned on: a plan
+    may do the opposite there of what it does everywhere else, and twenty draws do not show it.
+
+    Args:
+        plant: the plant, which draws the initial states.
+        count: number of random initial states; 0 for no extremes.
+        device: device of the states.
+    """
+    drawn = plant.draw_initial_state(max(count, 1), torch.Generator(device=device).manual_seed(EXTREMES_SEED))
+    varied = drawn[:, (drawn != drawn[0]).any(0)]
+    return drawn[torch.cat([varied.argmin(0), varied.argmax(0)]).unique()]
+
+
+class VirtualEpisodes:
+    """Episodes on the twin with the disturbances that the real system has met.
+
+    Args:
+        twin: twin on which the episodes are flown.
+        config: parameters of the fit of a process to a real episode's exogenous input.
+        experience: number of latest real episodes whose processes are kept.
+        constraints: bounds on states, whose price counts where policies are compared; None for none.
+        extremes: number of random initial states whose extremes count where policies are compared; 0 for none.
+        generator: source of every draw.
+    """
+
+    def __init__(
+        self,
+        twin: DigitalTwin,
+        config: ExogenousConfig,
+        experience: int,
+        *,
+        constraints: Constraints | None = None,
+        extremes: int = 0,
+        generator: torch.Generator,
+    ):
+        self.twin, self.config, self.constraints, self.generator = twin, config, constraints, generator
+        self.processes: deque[ExogenousProcess] = deque(maxlen=experience)
+        self.extremes = extreme_states(twin.plant, extremes, generator.device)
+
+    def wanting(self, arm: str) -> bool:
+        """Whether an arm with a twin still needs the inputs of one whole real episode."""
+        return arm != "model_free" and not self.processes
+
+    def learn(self, record: Trajectory) -> None:
+        """Fit a process to the inputs that acted on the plant in a real episode, and keep it."""
+        self.processes.append(self._process(record))
+
+    def learn_flight(self, flight: Flight | None) -> None:
+        """The same of a flight, if it is whole; inputs of one that ended early are continued to the horizon."""
+        if flight is None or not flight.whole:
+            return
+        record, n = flight.record, self.twin.plant.n_steps
+        self.learn(record._replace(exogenous=continued(record.exogenous, n)) if flight.ended else record)
+
+    def repeated(self, record: Trajectory) -> Scenario:
+        """The start and the inputs of a real episode, which are continued to the horizon if it ended early."""
+        plant = self.twin.plant
+        acted = record.exogenous[:, : len(plant.acting_inputs)]
+        whole = len(acted) >= plant.n_steps or plant.end_cost is None
+        inputs = record.exogenous if whole else plant.with_previews(continued(acted, plant.n_steps))
+        return Scenario(record.states[:1], inputs[None])
+
+    def paired(self, records: Sequence[Trajectory]) -> tuple[list[Trajectory], list[ExogenousProcess]]:
+        """The latest records that have a process, and these processes, in pairs.
+
+        If only a part of an episode is sound, the records differ in length. Then they are cut to pieces of one length,
+        and each piece gets a process that is not kept.
+
+        Args:
+            records: the latest records, oldest first.
+        """
+        processes = list(self.processes)[-len(records) :]
+        latest = list(records)[-len(processes) :] if processes else []
+        if latest and all(len(a.actions) == len(b.mean) for a, b in zip(latest, processes, strict=True)):
+            return latest, processes
+        plant = self.twin.plant
+        pieces = pieces_of_equal_length(records, plant.n_steps, plant.dt)
+        return pieces, [self._process(piece) for piece in pieces]
+
+    def _process(self, record: Trajectory) -> ExogenousProcess:
+        plant, signals = self.twin.plant, self.twin.plant.acting_inputs
+        acted = record.exogenous[:, : len(signals)]
+        return ExogenousProcess(acted, dt=plant.dt, signals=signals, config=self.config)
+
+    def draw(self, count: int) -> Scenario:
+        """Draw random initial states, and exogenous inputs from the processes that are kept.
+
+        Note: the paper plans with the initial state and the disturbances of the last episode alone. Here the initial
+        states are random and the disturbances are those of the last ``experience`` episodes, because a policy that is
+        optimal for one wind can lie just beyond a cliff of another: the turbine's torque law then stalls the rotor in
+        one wind of twenty.
+        """
+        plant, large_scale = self.twin.plant, self.config.large_scale
+        initial_state = plant.draw_initial_state(count, self.generator)
+        exogenous = sample_experience(self.processes, count, self.generator, large_scale=large_scale)
+        return Scenario(initial_state, plant.with_previews(exogenous))
+
+    @torch.no_grad()
+    def cost(self, policy: nn.Module, episodes: Scenario) -> float:
+        """Mean J_a of a policy; infinite if the twin diverges under it."""
+        try:
+            cost = self.twin.cost(policy, *episodes).item()
+        except DivergenceError:
+            return math.inf
+        return cost if math.isfinite(cost) else math.inf
+
+    @torch.no_grad()
+    def price(self, policy: nn.Module, episodes: Scenario) -> float:
+        """Mean J_a, with the price of leaving the bounds if there are some."""
+        cost = self.cost(policy, episodes)
+        if not self.constraints or not math.isfinite(cost) or isinstance(policy, StateFeedback):
+            return cost
+        flown = self.twin.control(policy, *episodes)
+        return self.constraints.priced(flown.states.new_full((len(flown.states),), cost), flown).mean().item()
+
+    def judge(self, policy: nn.Module, episodes: Scenario) -> tuple[float, float]:
+        """The cost by which policies are compared, where one episode in a hundred is an extreme one; and the price.
+
+        Extreme episodes begin with the extremes of each state, under the inputs of the others in turn. State feedback
+        is asked for its price alone, because model predictive control takes too long in further episodes.
+        """
+        price = self.price(policy, episodes)
+        if not len(self.extremes) or isinstance(policy, StateFeedback):
+            return price, price
+        return (1.0 - RARE) * price + RARE * self.price(policy, self._extreme(episodes)), price
+
+    def with_extremes(self, episodes: Scenario) -> Scenario:
+        """Some episodes, and the extreme ones under their inputs."""
+        return Scenario(*(torch.cat(pair) for pair in zip(episodes, self._extreme(episodes), strict=True)))
+
+    def _extreme(self, episodes: Scenario) -> Scenario:
+        order = torch.arange(len(self.extremes), device=self.extremes.device) % len(episodes.exogenous)
+        return Scenario(self.extremes, episodes.exogenous[order])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"processes": [process.state_dict() for process in self.processes]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.processes.clear()
+        self.processes.extend(
+            ExogenousProcess.from_state(saved, self.twin.plant.acting_inputs) for saved in state["processes"]
+        )

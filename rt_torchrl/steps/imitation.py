@@ -1,0 +1,307 @@
+r"""Imitation: a policy learns from a controller or from the other policy, from which it cannot take weights.
+
+The imitation is behaviour cloning. It compares actions, as shares of their ranges, on observations from the real system
+and from the twin:
+
+.. math:: \min_w \mathbb E_e\,\Big\|\frac{\pi(e; w) - \pi_{live}(e)}{a_{hi} - a_{lo}}\Big\|^2
+
+A second round adds observations of virtual episodes that the pupil itself flies, so that it also learns what to do where
+its own errors lead (DAgger, Ross et al. 2011).
+"""
+
+import copy
+import functools
+import warnings
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.optimisers.descent import Descent, DescentConfig
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.signal import bounds
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.switch import Role
+from rt_torchrl.trajectories.rollout import DivergenceError
+from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost
+from rt_torchrl.twinning.architecture import same_architecture
+from rt_torchrl.twinning.findings import findings, merged
+
+Result = TypeVar("Result")
+
+ITERATIONS = 200
+"""Gradients of the imitation loss in each round (L-BFGS on all observations at once)."""
+SAMPLES = 5000
+"""Greatest number of observations from each source; a source with more is thinned evenly."""
+BLOWN_UP = 1e3
+"""Observation, which is of order one in a sound flight, beyond which a twin has blown up."""
+TWICE = 2.0
+"""Cost of an imitation with extreme episodes over the controller's, from which it also learns from these."""
+
+
+class Imitation:
+    """Lets policies imitate each other and controllers.
+
+    Args:
+        belief: what policies cost, by which clones are judged, and the virtual episodes.
+        count: number of virtual episodes that are drawn at a time.
+    """
+
+    def __init__(self, belief: Belief, count: int):
+        self.belief, self.virtual, self.count = belief, belief.virtual, count
+
+    def clone(
+        self,
+        live: nn.Module,
+        idle: nn.Module,
+        *,
+        seen: Callable[[], Float[Tensor, "n n_o"]],
+        record: Trajectory,
+        judged_on: Scenario,
+    ) -> TensorDict:
+        """Make ``idle`` a clone of ``live``; it keeps its weights if the clone is expected to cost more than it does.
+
+        Args:
+            live: the policy that is cloned; it is not changed.
+            idle: the policy that becomes the clone.
+            seen: function that gives observations of the real system; a copy of weights does not call it.
+            record: the real episode that ``live`` has just flown, from which a clone of state feedback learns.
+            judged_on: virtual episodes on which the clone is judged.
+
+        Returns:
+            A report, which is empty after a copy of weights. After an imitation it holds ``distillation_error`` and
+            ``distillation_cost_ratio``; if the clone is refused, the event is ``keep``, and ``reason`` says why. State
+            feedback has no weights that could imitate, so that a clone of it is refused.
+        """
+        if isinstance(idle, StateFeedback):
+            reason = f"no clone: {type(idle).__name__} plans its actions and cannot imitate a policy"
+            return findings(reason).set_non_tensor("event", "keep")
+        if same_architecture(live, idle):
+            idle.load_state_dict(live.state_dict())
+            return findings()
+        before, replaced = copy.deepcopy(idle.state_dict()), self.belief.judge(idle, judged_on)
+        source = record if isinstance(live, StateFeedback) else seen()
+        error = self.imitate(live, idle, seen=source, draw=lambda: self.virtual.draw(self.count))
+        clone, price = self.belief.judge(idle, judged_on), self.virtual.price(live, judged_on)
+        found = {"distillation_error": error, "distillation_cost_ratio": clone.price / price}
+        if clone <= replaced:
+            return findings(**found)
+        idle.load_state_dict(before)
+        reason = f"clone refused: its J_a is {clone.price:.4g}, that of the policy it replaces {replaced.price:.4g}"
+        return findings(reason, **found).set_non_tensor("event", "keep")
+
+    def begin(
+        self, teacher: nn.Module | None, policies: Mapping[Role, nn.Module], records: Trajectory, *, on_twin: bool
+    ) -> TensorDict:
+        """Make the policies imitate a controller; one that would fare worse on the twin than before stays as it was.
+
+        Args:
+            teacher: the controller, a policy or :class:`StateFeedback`; None if only the records show its actions.
+            policies: the policies by role; state feedback among them is left alone.
+            records: real episodes that the controller has flown.
+            on_twin: whether policies also learn from virtual episodes and are judged in them.
+
+        Returns:
+            ``start_error_`` of each role, the RMS difference of the actions as a share of their ranges, and on the twin
+            ``start_cost_ratio_``, J_a of the policy over the controller's.
+        """
+        pupils = {role: policy for role, policy in policies.items() if not isinstance(policy, StateFeedback)}
+        starts = {role: copy.deepcopy(policy) for role, policy in pupils.items()}
+        # Every virtual episode of model predictive control takes as long as its solves.
+        count = teacher.virtual_episodes if isinstance(teacher, PredictiveControl) else self.count
+        judged_on = self.virtual.draw(count) if on_twin else None
+        report = findings()
+        for role, policy in pupils.items():
+            first = next(other for other, start in starts.items() if clones(start, starts[role]))
+            if first != role:
+                policy.load_state_dict(pupils[first].state_dict())
+            elif judged_on is None:
+                report.update(findings(**{f"start_error_{role}": self.of_record(policy, records)}))
+            else:
+                report = merged(report, self._begun(teacher, role, policy, records, judged_on))
+        return report
+
+    def _begun(
+        self, teacher: nn.Module | None, role: Role, policy: nn.Module, records: Trajectory, judged_on: Scenario
+    ) -> TensorDict:
+        before, start = copy.deepcopy(policy.state_dict()), self.virtual.judge(policy, judged_on)
+        if teacher is None:
+            error = self.of_record(policy, records)
+            wanted = control_cost(self.virtual.twin.plant, records).mean().item()
+        else:
+            draw = functools.partial(self.virtual.draw, len(judged_on.initial_state))
+            error = self.imitate(teacher, policy, seen=records, draw=draw)
+            model, wanted = self.virtual.judge(teacher, judged_on)
+            if len(self.virtual.extremes) and self.virtual.judge(policy, judged_on)[0] > TWICE * abs(model):
+                policy.load_state_dict(before)
+                error = self.imitate(teacher, policy, seen=records, draw=lambda: self.virtual.with_extremes(draw()))
+        cost = self.virtual.judge(policy, judged_on)
+        found = {f"start_error_{role}": error, f"start_cost_ratio_{role}": cost[1] / wanted}
+        if cost <= start:
+            return findings(**found)
+        policy.load_state_dict(before)
+        return findings(
+            f"{role} does not imitate the controller: its J_a would be {cost[1]:.4g}, not {start[1]:.4g}", **found
+        )
+
+    def imitate(
+        self,
+        teacher: nn.Module,
+        pupil: nn.Module,
+        *,
+        seen: Float[Tensor, "n n_o"] | Trajectory,
+        draw: Callable[[], Scenario],
+    ) -> float:
+        """Train the pupil in place.
+
+        Args:
+            teacher: the teacher, which is not changed.
+            pupil: the pupil, which starts from its present weights.
+            seen: observations of the real system, or episodes that the teacher has flown there. State feedback needs
+                the episodes, because its actions are no function of the observation; they are taken as recorded.
+            draw: function that draws new initial states and disturbances of virtual episodes at each call.
+
+        Returns:
+            RMS difference between the two policies' actions on all observations, as a share of the actions' ranges.
+        """
+        pairs = [self._of_record(seen) if isinstance(seen, Trajectory) else self._asked(teacher, seen)]
+        pairs.append(self._flown(teacher, teacher, draw()))
+        self._match(pupil, pairs)
+        pairs.append(self._flown(teacher, pupil, draw()))
+        return self._match(pupil, pairs)
+
+    def of_record(self, pupil: nn.Module, record: Trajectory) -> float:
+        """Train the pupil in place to act as in records, without the twin; the error is that of :meth:`imitate`."""
+        return self._match(pupil, [self._of_record(record)])
+
+    def _match(self, pupil: nn.Module, pairs: list[tuple[Tensor, Tensor]]) -> float:
+        observations, actions = (torch.cat(part) for part in zip(*pairs, strict=True))
+        return match_actions(self.virtual.twin.plant, actions, pupil, observations, ITERATIONS)
+
+    @torch.no_grad()
+    def _flown(self, teacher: nn.Module, policy: nn.Module, episodes: Scenario) -> tuple[Tensor, Tensor]:
+        """Observations of virtual episodes that a policy flies, and what the teacher does there, where both are sound.
+
+        A twin that lacks dynamics of the real system may blow up in a flight, and says nothing of what comes after.
+        """
+        try:
+            observations, actions = self._all_flown(teacher, policy, self.virtual.twin.control(policy, *episodes))
+        except DivergenceError:
+            plant, like = self.virtual.twin.plant, episodes.initial_state
+            return like.new_empty(0, len(plant.observations)), like.new_empty(0, len(plant.actions))
+        sound = (observations.abs() <= BLOWN_UP).all(-1) & actions.isfinite().all(-1)
+        return observations[sound], actions[sound]
+
+    def _all_flown(self, teacher: nn.Module, policy: nn.Module, flown: Trajectory) -> tuple[Tensor, Tensor]:
+        if not isinstance(teacher, StateFeedback):
+            return self._asked(teacher, self._observed(flown))
+        if policy is teacher:
+            return self._of_record(flown)
+        return self._of_record(flown._replace(actions=commands_along(teacher, flown, self.virtual.twin.plant.dt)))
+
+    @torch.no_grad()
+    def _asked(self, teacher: nn.Module, observations: Float[Tensor, "n n_o"]) -> tuple[Tensor, Tensor]:
+        """Observations of a source, thinned, and the teacher's actions."""
+        thinned = self._thinned(observations)
+        return thinned, teacher(thinned)
+
+    def _of_record(self, flown: Trajectory) -> tuple[Tensor, Tensor]:
+        """Observations and actions of a record of one episode or several, thinned."""
+        return self._thinned(self._observed(flown)), self._thinned(flown.actions.reshape(-1, flown.actions.shape[-1]))
+
+    def _observed(self, flown: Trajectory) -> Float[Tensor, "n n_o"]:
+        plant, exogenous = self.virtual.twin.plant, flown.exogenous
+        clock = plant.dt * torch.arange(exogenous.shape[-2], dtype=torch.float64, device=exogenous.device)
+        t = (flown.start.unsqueeze(-1) if isinstance(flown.start, Tensor) else flown.start) + clock
+        seen = plant.observe(t, flown.states[..., :-1, :], exogenous)
+        return seen.reshape(-1, seen.shape[-1])
+
+    def _thinned(self, values: Float[Tensor, "n width"]) -> Float[Tensor, "m width"]:
+        return values[:: max(1, -(-len(values) // SAMPLES))]  # of none, none is left
+
+
+def match_actions(
+    plant: Plant,
+    wanted: Float[Tensor, "n n_a"],
+    student: nn.Module,
+    observations: Float[Tensor, "n n_o"],
+    iterations: int,
+) -> float:
+    """Fit the student's actions to a teacher's in place, by TorchRL's behaviour-cloning loss.
+
+    Args:
+        plant: plant that gives the ranges of the actions.
+        wanted: the teacher's actions.
+        student: policy whose weights are trained, from their present values.
+        observations: observations on which the two are to agree.
+        iterations: gradients of the loss on all observations.
+
+    Returns:
+        RMS difference between the actions as a share of their ranges.
+    """
+    from torchrl.objectives import BCLoss  # here, because it takes seconds to load
+
+    imitator = ShareOfRange(plant, student, device=observations.device)
+    expert = TensorDict(
+        {"observation": observations, "action": imitator.share(wanted)}, batch_size=observations.shape[:1]
+    )
+    actor = TensorDictModule(imitator, in_keys=["observation"], out_keys=["action"])
+    with warnings.catch_warnings():
+        # BCLoss has no target network; TorchRL warns that its class does not declare one.
+        warnings.filterwarnings("ignore", message="The name target_actor_network_params", category=UserWarning)
+        loss = BCLoss(actor, loss_function="l2")
+    descent = Descent(student, DescentConfig(optimiser="lbfgs", rate=1.0))
+    return descent.run(lambda: loss(expert)["loss_bc"], iterations).best ** 0.5
+
+
+class ShareOfRange(nn.Module):
+    """A policy whose actions are shares of their ranges, 0 at the low and 1 at the high end.
+
+    Args:
+        plant: plant that gives the ranges of the actions.
+        policy: policy whose actions are in physical units.
+        device: device of the observations; torch's default if None.
+    """
+
+    low: Tensor
+    range: Tensor
+
+    def __init__(self, plant: Plant, policy: nn.Module, *, device: torch.device | None = None):
+        super().__init__()
+        low, high = bounds(plant.actions, device=device)
+        self.policy = policy
+        self.register_buffer("low", low)
+        self.register_buffer("range", high - low)
+
+    def forward(self, observation: Float[Tensor, "*batch n_o"]) -> Float[Tensor, "*batch n_a"]:
+        return self.share(self.policy(observation))
+
+    def share(self, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
+        """Actions in physical units as shares of their ranges."""
+        return (action - self.low.to(action)) / self.range.to(action)
+
+
+def of_each_role(policies: Mapping[Role, nn.Module], flown: Callable[[nn.Module], Result]) -> dict[Role, Result]:
+    """What ``flown`` returns for each policy; it is called once if the two are clones of each other.
+
+    Args:
+        policies: both policies, by role.
+        flown: function of a policy's weights alone, such as its costs over given episodes.
+    """
+    first, second = policies
+    found = {first: flown(policies[first])}
+    return found | {second: found[first] if clones(*policies.values()) else flown(policies[second])}
+
+
+def clones(first: nn.Module, second: nn.Module) -> bool:
+    """Whether two policies are the same function with the same weights."""
+    if not same_architecture(first, second):
+        return False
+    pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
+    return all(torch.equal(one, other) for one, other in pairs)

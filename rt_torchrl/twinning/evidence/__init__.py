@@ -1,1 +1,0 @@
-"""What real episodes say about the twin's predictions."""
