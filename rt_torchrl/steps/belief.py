@@ -32,6 +32,7 @@ from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost
+from rt_torchrl.twinning.architecture import same_architecture
 from rt_torchrl.twinning.findings import findings
 
 if TYPE_CHECKING:
@@ -237,13 +238,19 @@ class Belief:
         shares = 2.0 * policy(observations) / (high - low)
         return shares.flatten().cpu().numpy() / math.sqrt(width)
 
-    def best_flown(self, role: Role, episodes: Scenario) -> dict[str, Tensor] | None:
-        """The weights that are expected to cost least of all that a role has flown; None if it has flown none."""
-        flown = [one for one in self.flown if one.role == role]
-        if not flown or isinstance(self._policies[role], StateFeedback):
+    @property
+    def contradicted(self) -> bool:
+        """Whether one of the real episodes cost more than the twin says, beyond chance and what exploration explains."""
+        pairs = zip(self.differences(), self.flown, strict=True)
+        return any(d - 2.0 * EXPLORED * one.exploration > ALARM for d, one in pairs)
+
+    def best_flown(self, like: nn.Module, episodes: Scenario) -> tuple[dict[str, Tensor], Judged] | None:
+        """The weights that are expected to cost least of all that have flown in an architecture; None if none has."""
+        flown = [policy for policy in map(self.policy_of, self.flown) if same_architecture(policy, like)]
+        if not flown:
             return None
-        costs = [self.judge(self.policy_of(one), episodes) for one in flown]
-        return copy.deepcopy(flown[costs.index(min(costs))].weights)
+        costs = [self.judge(policy, episodes) for policy in flown]
+        return flown[costs.index(min(costs))].state_dict(), min(costs)
 
     def require_sound_twin(self, episodes: Scenario) -> None:
         """Refuse a closure under which the twin diverges with the weights that have just flown on the real system.

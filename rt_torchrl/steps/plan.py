@@ -384,9 +384,20 @@ class MultiStart:
         if not math.isfinite(stays.price):
             self.belief.require_sound_twin(judged_on)
         best = self._from_the_present(present, stays, planned_on, judged_on)
-        if self._several(episode, best):
-            best = self._best(best, self._others(episode, planned_on, judged_on), planned_on, judged_on)
+        several = self._several(episode, best)
+        flown = self.belief.best_flown(policy, judged_on) if several or self._refuted else None
+        if several:
+            best = self._best(best, self._others(episode, planned_on, flown), planned_on, judged_on)
+        if flown is not None and self._refuted and flown[1] < best.cost:
+            best = Plan(*flown, findings(plan_accepted=0.0, recalled=1.0))
+            policy.load_state_dict(best.weights)
+            self.planner.restart()
         return merged(best.report, self._raised(planned_on))
+
+    @property
+    def _refuted(self) -> bool:
+        """Whether a policy that has flown may be better than all that the twin plans."""
+        return self.count > 0 and self.belief.corrects and self.belief.contradicted
 
     def _best(self, best: Plan, others: Iterable[Weights], planned_on: Scenario, judged_on: Scenario) -> Plan:
         """The best of a plan and of those from other weights; the policy gets its weights."""
@@ -452,15 +463,14 @@ class MultiStart:
         self._stalled = self._stalled + 1 if self.planner.stalled(plan.report) else 0
         return episode.bit_count() == 1 or self._stalled.bit_count() == 1
 
-    def _others(self, episode: int, planned_on: Scenario, judged_on: Scenario) -> Iterator[Weights]:
+    def _others(self, episode: int, planned_on: Scenario, flown: tuple[Weights, Judged] | None) -> Iterator[Weights]:
         """Other weights to begin with."""
         if self._first is not None:
             yield self._first
         if self.alike:
             yield self._random(episode, planned_on)
-        flown = self.belief.best_flown("model_based", judged_on)
         if flown is not None:
-            yield flown
+            yield flown[0]
 
     @torch.no_grad()
     def _random(self, episode: int, planned_on: Scenario) -> Weights:
