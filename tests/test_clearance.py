@@ -86,7 +86,7 @@ def test_a_policy_that_would_leave_them_does_not_act():
     assert last.role == idle and last.policy is not found.policies[idle] and "reason" in last.report
     assert torch.equal(last.policy.gain, torch.full_like(last.policy.gain, 0.05))
     assert found.interact()["live"] == idle
-    assert torch.equal(found.track_record.policy_flown().gain, last.policy.gain)
+    assert torch.equal(found.belief.policy_of(found.belief.flown[-1]).gain, last.policy.gain)
 
 
 def test_without_a_policy_that_may_act_the_training_says_so():

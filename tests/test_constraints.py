@@ -13,11 +13,10 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.belief import TrackRecord
+from rt_torchrl.steps.belief import Belief, Judged
 from rt_torchrl.steps.inputs import ExogenousConfig, VirtualEpisodes
-from rt_torchrl.steps.plan import Constraints, ConstraintsConfig, Planning, WholeEpisodes
+from rt_torchrl.steps.plan import Constraints, ConstraintsConfig, MultiStart, WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
-from rt_torchrl.twinning.judgement import Judgement
 
 POSITION = {"position": (-1.0, 3.0)}
 
@@ -70,14 +69,16 @@ def from_rest_at(*positions):
     return Scenario(start, torch.zeros(len(positions), 40, 1, dtype=torch.float64))
 
 
-JUDGEMENT = Judgement(lambda cost, than: not cost <= than, TrackRecord({}))
-
-
 def judged(planner):
     """Step 5 with this planner."""
-    virtual = VirtualEpisodes(planner.twin, ExogenousConfig(), 1, generator=torch.Generator().manual_seed(0))
-    virtual.judge_by(planner.constraints, 0)
-    return Planning(planner, virtual, planner.config)
+    virtual = VirtualEpisodes(
+        planner.twin,
+        ExogenousConfig(),
+        1,
+        constraints=planner.constraints,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return MultiStart(planner, Belief({}, virtual), dataclasses.replace(planner.config, starts=0))
 
 
 def test_plans_come_to_keep_bounds_that_the_cheapest_plan_leaves():
@@ -91,7 +92,7 @@ def test_plans_come_to_keep_bounds_that_the_cheapest_plan_leaves():
     softly.plan(episodes)
     steps = judged(bound)
     for episode in range(1, 9):
-        steps.plan(episode, episodes, episodes, JUDGEMENT)
+        steps.plan(episode, episodes, episodes)
     assert fastest(free) > 0.75
     assert 0.6 < fastest(softly) < fastest(free)
     # A thousandth of the width beyond.
@@ -107,12 +108,12 @@ def test_a_plan_and_the_policy_that_it_would_replace_have_the_same_price():
     planner, episodes = planner_of("augmented_lagrangian"), from_rest_at(-1.2, -0.6, 0.8, 1.2)
     steps, multipliers = judged(planner), []
     for episode in range(1, 13):
-        before = steps.virtual.price(planner.policy, episodes).item()
+        before = steps.virtual.price(planner.policy, episodes)
         mu = list(planner.constraints.multipliers)
-        report = steps.plan(episode, episodes, episodes, JUDGEMENT)
+        report = steps.plan(episode, episodes, episodes)
         raised, planner.constraints.multipliers = planner.constraints.multipliers, mu
         assert report["plan_accepted"] == 1.0
-        assert steps.virtual.price(planner.policy, episodes).item() <= before
+        assert steps.virtual.price(planner.policy, episodes) <= before
         planner.constraints.multipliers = raised
         multipliers += raised
     assert multipliers == sorted(multipliers) and multipliers[-1] - multipliers[5] < 0.1 * multipliers[5]
@@ -120,17 +121,17 @@ def test_a_plan_and_the_policy_that_it_would_replace_have_the_same_price():
 
 def test_what_is_refused_raises_no_multiplier():
     """Where a plan and others from wild weights are refused, the policy that stays raises it as much as without."""
-    episodes, refusing = from_rest_at(-1.2, -0.6, 0.8, 1.2), JUDGEMENT._replace(worse=lambda cost, than: True)
-    raised = []
+    episodes, raised = from_rest_at(-1.2, -0.6, 0.8, 1.2), []
     for iterations, others in ((0, ()), (40, ()), (40, (3.0, -0.05))):
         planner = planner_of("augmented_lagrangian")
         planner.policy.load_state_dict({"gain": torch.tensor([[0.5, 0.5]], dtype=torch.float64)})
         steps, stays = judged(planner), planner.policy.gain.clone()
         planner.config = dataclasses.replace(planner.config, iterations=iterations)
-        steps.others += [{"gain": torch.full((1, 2), gain, dtype=torch.float64)} for gain in others]
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr("rt_torchrl.twinning.planning.saves", lambda cost, of, share: False)
-            steps.plan(1, episodes, episodes, refusing)
+        wild = [{"gain": torch.full((1, 2), gain, dtype=torch.float64)} for gain in others]
+        steps._others, steps.count = lambda *arguments, wild=wild: iter(wild), len(wild)
+        dearer = iter([1.0, *[2.0] * 3])  # than what stays
+        steps.belief.judge = lambda policy, on, dearer=dearer: Judged(cost := next(dearer), cost)
+        steps.plan(1, episodes, episodes)
         assert torch.equal(planner.policy.gain, stays)
         raised.append(planner.constraints.multipliers)
     assert raised[0] == raised[1] == raised[2] and raised[0][0] > 0.0

@@ -7,18 +7,16 @@ from seeds_and_numbers import seeded
 from test_algorithm import STEPS, twinning, weights
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
-from rt_torchrl.steps.imitation import (
-    Distillation,
-    DistillationConfig,
-    ShareOfRange,
-    match_actions,
-)
+from rt_torchrl.steps.belief import Belief, Judged
+from rt_torchrl.steps.imitation import Imitation, ShareOfRange, match_actions
+from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.architecture import same_architecture
+from rt_torchrl.twinning.findings import findings
 
 PLANT = LinearQuadratic(horizon=2.0)
 
@@ -39,10 +37,14 @@ def draw(count=5, seed=2):
     return Scenario(PLANT.draw_initial_state(count, generator), PLANT.draw_exogenous(count, generator))
 
 
-def distilled(live, idle, **options):
-    distillation = Distillation(DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), DistillationConfig(**options))
+def imitation():
+    virtual = VirtualEpisodes(DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), None, 1, generator=seeded(0))
+    return Imitation(Belief({}, virtual), 5)
+
+
+def distilled(live, idle):
     seen = torch.randn(300, 2, generator=seeded(3), dtype=torch.float64)
-    return distillation.imitate(live, idle, seen=seen, draw=draw)
+    return imitation().imitate(live, idle, seen=seen, draw=draw)
 
 
 def test_a_perceptron_learns_an_affine_law():
@@ -64,8 +66,7 @@ def test_a_perceptron_learns_an_affine_law():
 
 def test_without_observations_of_the_real_system_the_clone_learns_from_the_twin():
     live, idle = affine([-0.8, -1.1]), perceptron()
-    distillation = Distillation(DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)), DistillationConfig())
-    found = distillation.imitate(live, idle, seen=torch.empty(0, 2, dtype=torch.float64), draw=draw)
+    found = imitation().imitate(live, idle, seen=torch.empty(0, 2, dtype=torch.float64), draw=draw)
     # As near as with 300 observations of the real system beside those of the twin.
     assert found < 5e-3
 
@@ -93,18 +94,18 @@ def test_an_affine_law_keeps_what_it_can_of_a_perceptron():
                     weight.view(-1)[k] -= step
 
 
-def test_what_the_clone_shows_itself_is_added_from_the_second_round_on():
-    distillation = Distillation(DigitalTwin(PLANT, PLANT.closure), DistillationConfig(iterations=1, rounds=3))
+def test_what_the_clone_shows_itself_is_added_in_the_second_round():
+    distillation = imitation()
     live, idle, flown = affine([-0.8, -1.1]), perceptron(), []
     fly = distillation._flown
     distillation._flown = lambda teacher, policy, episodes: flown.append(policy) or fly(teacher, policy, episodes)
     seen = torch.zeros(1, 2, dtype=torch.float64)
     distillation.imitate(live, idle, seen=seen, draw=draw)
-    assert flown == [live, idle, idle]
+    assert flown == [live, idle]
 
 
 def two_architectures(**options):
-    found = twinning(PLANT, referee=RefereeConfig(patience=0, clone_patience=0, stall=1e9), **options)
+    found = twinning(PLANT, referee=RefereeConfig(clone_patience=0, stall=1e9), **options)
     return ReinforcementTwinning(
         PlantEnv(PLANT, seed=0),
         DigitalTwin(PLANT, LinearClosure(PLANT.true_closure)),
@@ -122,9 +123,13 @@ def test_a_clone_event_distils(live):
     for step in STEPS[:-1]:
         getattr(found, step)()
     idle = found.referee.idle
-    costs = {live: torch.tensor(0.0), idle: torch.tensor(1e9)}
-    virtual_costs, before = found.virtual_costs, weights(found.policies[live])
-    found.virtual_costs = lambda episodes: costs | {live: virtual_costs(episodes)[live]}
+    before, replaced = weights(found.policies[live]), weights(found.policies[idle])
+    judge, poor = found.belief.judge, found.policies[idle]
+
+    def judged(policy, episodes):
+        return Judged(1e9, 1e9) if policy is poor and torch.equal(weights(poor), replaced) else judge(policy, episodes)
+
+    found.belief.judge = judged
     report = found.switch_policies()
     assert report["event"] == "clone" and torch.equal(weights(found.policies[live]), before)
     assert 0.0 < report["distillation_error"] < 0.05
@@ -140,7 +145,9 @@ def test_a_refused_clone_is_no_event_and_says_why():
     for step in STEPS[:-1]:
         getattr(found, step)()
     before = {role: weights(policy) for role, policy in found.policies.items()}
-    found.virtual_costs = lambda episodes: {"model_based": torch.tensor(1e-9), "model_free": torch.tensor(2e-9)}
+    costs = iter([2e-9, 1e-9, 2e-9, 1.0])  # of both policies, of that which is replaced, of its clone
+    found.learning.judge = lambda *arguments: findings()
+    found.belief.judge = lambda policy, episodes: Judged(cost := next(costs), cost)
     report = found.switch_policies()
     assert report["event"] == "keep" and "clone refused" in report["reason"]
     assert all(torch.equal(before[role], weights(policy)) for role, policy in found.policies.items())
@@ -152,12 +159,6 @@ def test_policies_of_two_architectures_train_and_clone_in_a_short_run():
     reports = [found.episode() for _ in range(3)]
     assert any("distillation_error" in report for report in reports)
     assert not same_architecture(*found.policies.values())
-
-
-@pytest.mark.parametrize("argument", ["iterations", "rounds", "samples"])
-def test_wrong_counts_are_refused(argument):
-    with pytest.raises(ValueError, match=f"{argument}=0 of the distillation must be at least 1"):
-        DistillationConfig(**{argument: 0})
 
 
 def test_a_copy_of_weights_is_no_clone_of_another_activation():

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from test_algorithm import twinning, weights
 
 from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.belief import Judged
 from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.twinning.assimilation import AssimilationConfig
@@ -89,7 +90,7 @@ def test_an_idle_policy_that_diverges_on_the_twin_loses_and_is_named(monkeypatch
 
 def test_a_live_policy_that_its_update_has_ruined_puts_no_closure_in_doubt(monkeypatch):
     """The weights that flew are sound; those that step 2 made of them diverge, cost infinitely much and lose."""
-    found = twinning(referee=RefereeConfig(patience=0))
+    found = twinning(referee=RefereeConfig(rule="decision_tree", patience=0))
     update = found.learner.update
 
     def ruined():
@@ -140,7 +141,7 @@ def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closure
     def unsound_twin(*arguments):
         raise DivergenceError("the twin diverged under what has flown")
 
-    monkeypatch.setattr(found.track_record, "require_sound_twin", unsound_twin)
+    monkeypatch.setattr(found.belief, "require_sound_twin", unsound_twin)
     with pytest.raises(KeyboardInterrupt):
         found.episode()
     assert left == -1 and torch.equal(weights(found.policies["model_based"]), before)
@@ -148,7 +149,8 @@ def test_an_interrupt_leaves_no_plan_that_nobody_has_judged(monkeypatch, closure
 
 def test_the_cost_of_a_refused_plan_is_that_of_the_policy_that_stays(monkeypatch):
     found = twinning()
-    monkeypatch.setattr(found.referee, "worse", lambda cost, than: True)
+    costs = iter(range(100))
+    monkeypatch.setattr(found.belief, "judge", lambda policy, episodes: Judged(float(next(costs)), 1.0))
     report = found.episode()
     assert report["plan_accepted"] == 0.0 and report["J_a_plan"] == report["J_a_plan_before"]
 

@@ -203,7 +203,7 @@ def test_a_right_twin_foretells_the_cost_of_an_episode_that_ended():
     found = algorithm(PlantEnv(plant, seed=1), plant, quiet, LinearClosure(plant.true_closure))
     found.interact()
     assert len(found.short_term[-1].actions) < plant.n_steps
-    (difference,) = found.track_record.differences(found.virtual).values
+    (difference,) = found.belief.differences()
     assert difference == pytest.approx(0.0, abs=1e-9)
 
 
@@ -227,10 +227,10 @@ def test_a_training_learns_from_episodes_of_unequal_length(system):
         assert len(snapshot.large_scale) == snapshot.realisations.shape[1] == n < plant.n_steps
         assert {"states", "actions", "exogenous"} <= figures_of(snapshot).keys()
     reports += [found.episode() for _ in range(4)]
-    lengths = [len(flown.trajectory.actions) for flown in found.track_record._flown]
+    lengths = [len(flown.trajectory.actions) for flown in found.belief.flown]
     first = reports[0]
     assert lengths[0] == first["ended_after"] < plant.n_steps and len(set(lengths)) > 1
-    record, n = found.track_record._flown[0].trajectory, lengths[0]
+    record, n = found.belief.flown[0].trajectory, lengths[0]
     t = plant.dt * torch.arange(n).double()
     running = plant.running_cost(t, record.states[:-1], record.actions, record.exogenous).sum()
     expected = (running + (plant.n_steps - n) * plant.end_cost) / plant.n_steps

@@ -81,8 +81,7 @@ def test_large_scale_follows_a_slow_sine_and_leaves_fast_noise():
     assert found.covariance[1:4, 0, 0].abs().max() < (0.25 + 0.08) * 0.04
 
 
-@pytest.mark.parametrize("redrawn", [False, True])
-def test_samples_have_the_mean_of_the_record(redrawn):
+def test_samples_have_the_mean_of_the_record():
     """Gusts are skewed: the regression, which follows the median rather than the mean, leaves residuals of one sign."""
     record = torch.stack(
         [torch.as_tensor(10.0 + np.exp(autoregressive(600, rho, seed))) for seed, rho in enumerate((0.9, 0.98))], -1
@@ -90,7 +89,7 @@ def test_samples_have_the_mean_of_the_record(redrawn):
     found = process(record, signals=FREE * 2)
     torch.testing.assert_close(found.mean.mean(0), record.mean(0), rtol=1e-12, atol=0)
     count = 4000
-    means = found.sample(count, seeded(3), redrawn=redrawn).mean((0, 1))
+    means = found.sample(count, seeded(3)).mean((0, 1))
     # Five standard errors of the mean over all samples, by the sum of the covariances over all lags.
     spread = (found.covariance.diagonal(dim1=1, dim2=2).abs().sum(0) * 2.0 / (600 * count)).sqrt()
     assert ((means - record.mean(0)).abs() < 5.0 * spread).all()
@@ -154,22 +153,6 @@ def test_two_equal_components_stay_equal_and_samples_differ():
     assert not torch.equal(drawn[0], drawn[1])
 
 
-@pytest.mark.parametrize("n", [299, 300])
-def test_redrawn_large_scales_keep_means_spectra_and_cross_spectra(n):
-    """The small scale of a seed is the same either way, so that a difference is that of the large scales."""
-    t = DT * np.arange(n)
-    slow = np.stack([11.0 + 2.0 * np.sin(t / 20.0), 3.0 + np.cos(t / 20.0) + 0.5 * np.sin(t / 7.0)], -1)
-    found = process(slow + bivariate(n, 0.0, 0, 0.5) * 0.1, FREE * 2)
-    met, redrawn = (found.sample(200, seeded(1), redrawn=redrawn) for redrawn in (False, True))
-    large = found.mean + (redrawn - met)
-    spectra, expected = torch.fft.rfft(large, dim=1), torch.fft.rfft(found.mean, dim=0)
-    torch.testing.assert_close(spectra.abs(), expected.abs().expand(200, -1, -1), rtol=1e-9, atol=1e-9)
-    cross = (spectra[..., 0] * spectra[..., 1].conj())[:, : (n + 1) // 2]
-    torch.testing.assert_close(cross, (expected[:, 0] * expected[:, 1].conj())[: (n + 1) // 2].expand_as(cross))
-    # At any time the mean over draws is that over time, but for the standard error of 200 draws, five of them.
-    assert (large.mean(0) - found.mean.mean(0)).abs().max() < 5 * found.mean.std(0).max() / math.sqrt(200)
-
-
 def test_mixed_large_scales_have_the_mean_and_the_covariance_of_the_next_one():
     """Their mean is that of those met, and their covariance 1 + 1/m times that of the sample."""
     m, n, count = 9, 40, 100_000
@@ -220,19 +203,6 @@ def test_large_scales_are_mixed_from_the_third_episode_on():
     assert len(new.unique()) > 150 and new.min() < 8.0 and new.max() > 14.0
     low, high = plant.inputs[0].low, plant.inputs[0].high
     assert (seen[3] >= low).all() and (seen[3] <= high).all()
-
-
-def test_virtual_episodes_have_new_large_scales_where_they_are_asked_for():
-    plant, draws = WindTurbine(horizon=60.0), {}
-    record = 11.0 + torch.sin(torch.arange(plant.n_steps, dtype=torch.float64) * (2.0 * torch.pi / 40.0))
-    for which in ("met", "redrawn"):
-        config = ExogenousConfig(large_scale=which)
-        virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), config, 1, generator=seeded())
-        virtual.processes.append(ExogenousProcess(record[:, None], dt=plant.dt, signals=plant.inputs))
-        draws[which] = virtual.draw(50).exogenous[..., 0]
-    errors = {which: (found - record).square().mean().item() for which, found in draws.items()}
-    # Two sines of random phases differ by the sum of their mean squares, half each.
-    assert errors["met"] < 0.01 and errors["redrawn"] == pytest.approx(1.0, abs=0.3)
 
 
 def test_seed_fixes_the_samples():

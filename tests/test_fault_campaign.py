@@ -487,7 +487,7 @@ def operated(layer, plant, policies):
 
 
 def require_true(plant, found, kind):
-    for flown in (one.trajectory for one in found.track_record._flown):
+    for flown in (one.trajectory for one in found.belief.flown):
         n = len(flown.actions)
         t = plant.dt * torch.arange(n, dtype=torch.float64)
         ends = plant.step(t, flown.states[:-1], flown.actions, flown.exogenous, plant.closure).state

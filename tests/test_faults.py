@@ -110,7 +110,7 @@ def test_an_episode_that_ends_early_is_kept_up_to_there(kind, records):
         assert [fault.kind for fault in found.flights.faults] == ["ended"]
         assert found.flights.faults[0].time == pytest.approx(kept * DT)
         assert report["J_p"].isfinite() and report["J_a_model_based"].isfinite()
-    assert "sound_intervals" not in found.episode() and len(found.track_record._flown) == 2
+    assert "sound_intervals" not in found.episode() and len(found.belief.flown) == 2
 
 
 def test_too_little_of_an_episode_is_flown_again():

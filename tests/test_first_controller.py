@@ -10,7 +10,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.plan import PlannerConfig, ShortHorizonConfig
+from rt_torchrl.steps.plan import PlannerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -23,13 +23,12 @@ from rt_torchrl.twinning.starts import FirstController
 GAINS = (0.4, 0.3)
 
 
-def twinning(*, gains=GAINS, iterations=0, model_free=None, approach=0, approach_at=3, rounds=1, **options):
+def twinning(*, gains=GAINS, iterations=0, model_free=None, **options):
     plant = LinearQuadratic(horizon=2.0)
     generator = torch.Generator().manual_seed(3)
     learner = LearnerConfig(critic_iterations=1, actor_iterations=1, batch_size=4, critic_hidden=(4,))
     descent = DescentConfig(optimiser="lbfgs", rate=1.0)
-    further = {"approach": approach, "approach_at": approach_at, "rounds": rounds}
-    planner = PlannerConfig(iterations=iterations, descent=descent, **further)
+    planner = PlannerConfig(iterations=iterations, descent=descent)
     assimilation = AssimilationConfig(iterations=3, descent=DescentConfig(rate=0.02))
     parts = {"learner": learner, "planner": planner, "assimilation": assimilation}
     return ReinforcementTwinning(
@@ -132,69 +131,6 @@ def test_the_next_plan_is_the_best_of_both_starts():
         assert torch.equal(now, weights["gain"] if kept else before) and not found.planning.others
         costs.append(found.virtual.cost(found.policies["model_based"], judged_on).item())
     assert set(other) == {"gain"} and costs[1] < costs[0]
-
-
-def test_an_approach_begins_from_the_first_weights_too_also_after_a_resumption():
-    """From the imitation no step is allowed to help; the weights before it are the optimum already."""
-    best = {"gain": torch.tensor([[0.9, 1.1]], dtype=torch.float64)}
-    begun, resumed = (twinning(approach=2, approach_at=2) for _ in range(2))
-    begun.policies["model_based"].load_state_dict(best)
-    begun.start()
-    begun.planning.others.clear()
-    resumed.load_state_dict(begun.state_dict())
-    resumed.episodes_done = 1
-    before = resumed.virtual.cost(resumed.policies["model_based"], judged_on := resumed.virtual.draw(50))
-    assert resumed.plan()["approached"] == 1.0 and not resumed.planning.state_dict()["first"]
-    assert resumed.virtual.cost(resumed.policies["model_based"], judged_on) < before
-    torch.testing.assert_close(resumed.policies["model_based"].gain.detach(), best["gain"], rtol=0, atol=0.05)
-
-
-def test_an_approach_by_small_steps_stays_where_it_costs_less():
-    """The planner itself takes no gradient here, so that what the policy gains comes from the small steps."""
-    for at, kept in ((1, True), (2, False)):
-        found = twinning(approach=40, approach_at=at)
-        flight = found.flights.fly(found.policies["model_based"], strength=0.0, whole=True)
-        found.keep(flight)
-        found.virtual.learn(flight.record)
-        before = found.policies["model_based"].gain.detach().clone()
-        report = found.plan()
-        assert ("approached" in report) == kept
-        assert torch.equal(found.policies["model_based"].gain, before) != kept
-
-
-def test_rounds_of_plans_have_draws_of_their_own(monkeypatch):
-    """One gradient is taken in each, so that three rounds go on where one ends."""
-    costs, fresh = {}, None
-    for rounds in (1, 3):
-        found, seen = twinning(iterations=2, rounds=rounds), []
-        flight = found.flights.fly(found.policies["model_based"], strength=0.0, whole=True)
-        found.keep(flight)
-        found.virtual.learn(flight.record)
-        plan = found.planner.plan
-        monkeypatch.setattr(
-            found.planner, "plan", lambda episodes, plan=plan, seen=seen: seen.append(episodes) or plan(episodes)
-        )
-        assert found.plan()["plan_accepted"] == 1.0
-        assert len({tuple(one.exogenous.flatten().tolist()) for one in seen}) == len(seen) == rounds
-        assert {len(one.initial_state) for one in seen} == {4}
-        fresh = fresh or found.virtual.draw(50)
-        costs[rounds] = found.virtual.cost(found.policies["model_based"], fresh).item()
-    assert costs[3] < costs[1]
-
-
-@pytest.mark.parametrize("options", [{"rounds": 0}, {"rounds": 2, "method": "receding_horizon"}])
-def test_wrong_rounds_are_refused(options):
-    with pytest.raises(ValueError, match=f"rounds={options['rounds']}"):
-        PlannerConfig(**options)
-
-
-WINDOW = {"approach": 5, "short_horizon": ShortHorizonConfig(window=5)}
-
-
-def test_an_approach_needs_whole_episodes():
-    for options in ({"approach": -1}, {"approach_at": 0}, {"approach": 5, "method": "receding_horizon"}, WINDOW):
-        with pytest.raises(ValueError, match="approach"):
-            PlannerConfig(**options)
 
 
 def run(folder, **options):

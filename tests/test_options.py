@@ -12,7 +12,6 @@ import pytest
 from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
-from rt_torchrl.steps.imitation import DistillationConfig
 from rt_torchrl.steps.inputs import ExogenousConfig
 from rt_torchrl.steps.plan import PlannerConfig, ShortHorizonConfig
 from rt_torchrl.steps.switch import RefereeConfig
@@ -89,7 +88,6 @@ CONFIGS = {
     AssimilationConfig: {"inputs": "x", "method": "x", "initial": "x", "prior": math.inf, "segment": math.nan},
     RefereeConfig: {"patience": math.nan, "clone_patience": math.inf, "tolerance": math.inf, "stall": math.nan},
     LongTermMemoryConfig: {"capacity": math.inf, "offset": math.inf},
-    DistillationConfig: {"iterations": math.nan, "rounds": 1.5, "samples": math.inf},
     PlannerConfig: {"iterations": math.nan, "realisations": 2.5, "experience": math.inf},
     LearnerConfig: {
         "critic_rate": math.inf,

@@ -170,9 +170,9 @@ class WithController(RunConfig):
 
 def test_the_command_line_of_an_own_recipe_explores_as_its_start_asks():
     found = from_command_line(WithController, []).twinning
-    assert found.judged_updates and found.exploration.spread == SPREAD_OF_IMITATION
+    assert found.exploration.spread == SPREAD_OF_IMITATION
     asked = from_command_line(WithController, ["--twinning.exploration.spread", "0.3"]).twinning
-    assert asked.judged_updates and asked.exploration.spread == 0.3
+    assert asked.exploration.spread == 0.3
     random = from_command_line(WithController, ["--start", "random"]).twinning
     assert random == RunConfig().twinning
 

@@ -20,7 +20,9 @@ from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.user_code import module_of
-from rt_torchrl.steps.imitation import Distillation, DistillationConfig
+from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.plan import PlannerConfig, ShortHorizonConfig, make_planner
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
@@ -56,7 +58,7 @@ def referee(**options):
 
 
 @pytest.mark.parametrize("name", ["ddpg", "td3"])
-@pytest.mark.parametrize("rule", ["decision_tree", "weight_of_evidence"])
+@pytest.mark.parametrize("rule", ["decision_tree", "expected_cost"])
 def test_it_acts_the_twin_is_fitted_and_the_other_half_learns(tmp_path, rule, name):
     run = training(tmp_path, 4, twinning=learner(name) | referee(rule=rule))
     records = run.train()["episodes"]
@@ -88,7 +90,7 @@ def test_what_it_plans_on_is_the_twins_closure():
     run._held.release()
 
 
-@pytest.mark.parametrize("rule", ["decision_tree", "weight_of_evidence"])
+@pytest.mark.parametrize("rule", ["decision_tree", "expected_cost"])
 def test_an_interrupted_training_goes_on_to_the_bit(tmp_path, rule):
     whole = training(tmp_path / "whole", 4, twinning=referee(rule=rule))
     whole.train()
@@ -107,11 +109,10 @@ def test_the_live_controller_is_distilled_and_never_a_clone_itself(tmp_path):
     algorithm.episode()
     algorithm.referee.live = "model_based"
     judged = algorithm.virtual.draw(2)
-    costs = algorithm.virtual_costs(judged)
-    found = algorithm.clone(costs, judged)
+    found = algorithm.clone(judged)
     assert 0.0 < found["distillation_error"] < 0.3
     algorithm.referee.live = "model_free"
-    refused = algorithm.clone(costs, judged)
+    refused = algorithm.clone(judged)
     assert refused["event"] == "keep" and "PredictiveControl plans its actions" in refused["reason"]
     run._held.release()
 
@@ -125,8 +126,8 @@ def test_a_clone_learns_the_actions_of_record_and_flights():
     draw = lambda: Scenario(0.5 * plant.draw_initial_state(2, generator), plant.draw_exogenous(2, generator))  # noqa: E731
     record = teacher.fly(*draw())
     one = record._replace(**{name: getattr(record, name)[0] for name in ("states", "actions", "exogenous")})
-    distillation = Distillation(DigitalTwin(plant, plant.closure), DistillationConfig())
-    error = distillation.imitate(teacher, student, seen=one, draw=draw)
+    virtual = VirtualEpisodes(DigitalTwin(plant, plant.closure), None, 1, generator=generator)
+    error = Imitation(Belief({}, virtual), 2).imitate(teacher, student, seen=one, draw=draw)
     unseen = teacher.fly(*draw())
     imitated = student(plant.observe(torch.zeros(()), unseen.states[:, :-1], unseen.exogenous))
     assert error < 0.02 and ((imitated - unseen.actions) / 4.0).square().mean().sqrt() < 0.02

@@ -18,7 +18,7 @@ from rt_torchrl.steps.plan import (
     ShortHorizonConfig,
     WholeEpisodes,
 )
-from rt_torchrl.steps.switch import DecisionTree, Referee, RefereeConfig, WeightOfEvidence
+from rt_torchrl.steps.switch import DecisionTree, ExpectedCost, Referee, RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
@@ -52,7 +52,7 @@ PLANNERS = {
 }
 REFEREES = {
     "decision tree": lambda: DecisionTree(RefereeConfig(patience=0)),
-    "weight of evidence": lambda: WeightOfEvidence(RefereeConfig()),
+    "expected cost": lambda: ExpectedCost(RefereeConfig()),
     "documented": lambda: documented("referee.md", "ModelFirst")(),
 }
 
@@ -135,11 +135,11 @@ def test_a_learner_of_another_policy_is_refused():
 
 
 def test_configuration_names_the_parts():
-    parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="weight_of_evidence")}
+    parts = {"learner": LearnerConfig(algorithm="td3", **SMALL), "referee": RefereeConfig(rule="expected_cost")}
     short = PlannerConfig(iterations=1, short_horizon=ShortHorizonConfig(window=10))
     found = twinning(PLANT, **parts, planner=short)
     kinds = [type(part).__name__ for part in (found.learner, found.planner, found.referee)]
-    assert kinds == ["TD3", "ShortHorizon", "WeightOfEvidence"]
+    assert kinds == ["TD3", "ShortHorizon", "ExpectedCost"]
     report = found.episode()
     assert {"critic_loss", "value", "J_a_plan", "J_a_model_free", "event"} <= set(report.keys())
 
@@ -150,7 +150,7 @@ def test_the_state_of_another_training_is_refused_by_the_name_of_what_does_not_f
         found.load_state_dict(copy.deepcopy(other.state_dict()))
 
 
-def test_evidence_predicts_the_cost_of_the_flight_itself():
+def test_the_belief_predicts_the_cost_of_the_flight_itself():
     """A twin with the true closure flies the real episodes again at their cost: no exploration, the same inputs."""
     from rt_torchrl.systems.exploration import ExplorationConfig
 
@@ -158,6 +158,6 @@ def test_evidence_predicts_the_cost_of_the_flight_itself():
     found.interact()
     found.policies["model_free"].load_state_dict({"gain": torch.tensor([[0.9, 1.2]], dtype=torch.float64)})
     found.interact()
-    real, predicted = found.track_record.real_costs, found.track_record.predicted_costs(found.virtual)
+    real = [one.cost for one in found.belief.flown]
     assert len(real) == 2 and real[0] != real[1]
-    assert predicted == pytest.approx(real, rel=1e-12)
+    assert found.belief.differences() == pytest.approx([0.0, 0.0], abs=1e-12)

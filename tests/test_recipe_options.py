@@ -86,7 +86,7 @@ def test_the_paper_is_one_option(plant):
     assert paper.twinning == made.PAPER != of_command_line(plant, "--start", "random").twinning == made.CONVERGED
     usual = of_command_line(plant).twinning
     quiet = dataclasses.replace(made.CONVERGED.exploration, spread=0.02)
-    assert usual == dataclasses.replace(made.CONVERGED, exploration=quiet, judged_updates=True) != made.CONVERGED
+    assert usual == dataclasses.replace(made.CONVERGED, exploration=quiet) != made.CONVERGED
     spelled = of_command_line(plant, "--policy", "paper", "--observe", "paper", *PLANTS[plant])
     assert dataclasses.replace(spelled, paper=True, observe=(), twinning=made.PAPER) == paper
     assert paper.plant().observations == spelled.plant().observations and paper.plant().cost == spelled.plant().cost

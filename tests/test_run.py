@@ -185,14 +185,12 @@ def assert_same(whole, parts):
 
 PARTS = dataclasses.replace(
     SMALL,
-    corrected_plans=True,
-    judged_updates=True,
     exploration=ExplorationConfig(spread=0.005),
     hypotheses=HypothesesConfig(),
     assimilation=AssimilationConfig(iterations=3, method="levenberg_marquardt", inputs="record"),
     planner=PlannerConfig(iterations=2),
     learner=dataclasses.replace(SMALL.learner, algorithm="td3"),
-    referee=RefereeConfig(rule="weight_of_evidence", patience=0, clone_patience=0),
+    referee=RefereeConfig(clone_patience=0),
 )
 """All parts of the method that the paper does not have."""
 DEARER = 1.25
@@ -221,7 +219,7 @@ def test_an_interrupt_and_a_resumption_leave_no_trace_in_all_parts(tmp_path, mon
     resumed = with_all_parts(tmp_path / "parts", 3, resume=True)
     assimilation, twin = resumed.algorithm.assimilation, resumed.algorithm.twin
     assert assimilation.called and twin.weights == {"lags": 1.0} and assimilation.fits["late"].turns.pause > 1
-    assert resumed.algorithm.examination.correction(resumed.algorithm.short_term[-1]) is not None
+    assert resumed.algorithm.belief.contradicted
     assert_same(found, resumed.train())
     learned = whole.algorithm.policies["model_free"].parameters()
     assert not any(torch.equal(*pair) for pair in zip(started, learned, strict=True))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 
 import pytest
 import torch
@@ -22,9 +21,8 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.imitation import DistillationConfig, clones
+from rt_torchrl.steps.imitation import clones
 from rt_torchrl.steps.plan import PlannerConfig
-from rt_torchrl.steps.switch import ROLES
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length
@@ -41,7 +39,6 @@ GAINS = (0.6, 0.5)
 TWINNING = dataclasses.replace(
     SMALL,
     assimilation=AssimilationConfig(iterations=20, inputs="record", descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
-    distillation=DistillationConfig(iterations=50),
     planner=PlannerConfig(receding_horizon=PredictiveConfig(horizon=1.0, virtual_episodes=2)),
 )
 
@@ -117,19 +114,6 @@ def test_a_twin_that_diverges_falls_back_to_the_closure_that_the_training_starte
     record = found.flights.fly_first(found.policies["model_based"]).record
     assert found.assimilation.update([record], (), 1, torch.Generator()).start == torch.inf
     assert torch.equal(closure.matrix, first)
-
-
-def test_a_policy_that_ended_on_trial_does_not_act_first(earlier, tmp_path):
-    """The one that is expected to cost less does, and is imitated, although it was idle."""
-    copied = shutil.copytree(earlier, tmp_path / "earlier")
-    metrics = json.loads((copied / "metrics.json").read_text())
-    other = next(role for role in ROLES if role != metrics["summary"]["live"])
-    metrics["summary"]["preferred"] = other
-    (copied / "metrics.json").write_text(json.dumps(metrics))
-    run = training(tmp_path / "next", start=str(copied), model_free_policy="mlp", hidden=(6,))
-    run.algorithm.start()
-    assert run.algorithm.referee.live == run.algorithm.first.live == other
-    assert clones(run.algorithm.first.teacher, load_run(copied).policy(other))
 
 
 def test_another_kind_of_policy_imitates_the_one_that_was_live(earlier, tmp_path):

@@ -22,15 +22,6 @@ def test_an_arm_is_judged_by_the_policy_that_acts(tmp_path):
     assert low < entry.mean < high
 
 
-def test_a_policy_on_trial_at_the_end_does_not_count(tmp_path):
-    found = finished(tmp_path, 0, 0.0)
-    metrics = found.metrics()
-    live = arm_entry("twinning", [found]).mean
-    metrics["summary"]["preferred"] = "model_free"
-    (found.folder / "metrics.json").write_text(json.dumps(metrics))
-    assert arm_entry("twinning", [found]).mean == pytest.approx(2.0 * live)
-
-
 def test_an_unseen_episode_that_diverges_costs_infinitely(tmp_path):
     """``metrics.json`` holds null there; the study must not fail, and the mean must not pass it over."""
     found = [finished(tmp_path, seed, 0.1 * seed) for seed in range(2)]

@@ -68,7 +68,7 @@ def test_a_part_is_worth_what_its_absence_costs():
     assert verdict([(1.3, 1.0), (1.0, 1.0)]).startswith("in 1 of 2 rows")
     assert verdict([(1.01, 0.99)]) == "worth nothing in any of 1 rows"
     known = [system([arm("twinning"), arm("without hypotheses", 1.0)])]
-    page = ablation_section(known, {"without hypotheses": "hypotheses", "without the referee": "the referee"})
+    page = ablation_section(known, {"without hypotheses": "hypotheses", "without the belief": "the belief"})
     assert "| hypotheses | wind turbine, pitch | 2." in page and "the referee" not in page
     assert ablation_section([system([arm("model-free")])], {"without hypotheses": "hypotheses"}) == ""
 
@@ -106,7 +106,7 @@ def test_every_arm_is_a_training_that_its_recipe_can_make(tmp_path):
     config = worth.Config(systems=("nothing", "pitch", "delay", "bias_5"), seeds=1, folder=tmp_path)
     planned = {row: config.trainings(*row) for row in config.rows()}
     folders = {training.folder for groups in planned.values() for (training,) in groups.values()}
-    assert len(folders) == 2 * 11 + 3 * 2 * 10  # predictive control on the turbine alone
+    assert len(folders) == 2 * 10 + 3 * 2 * 9  # predictive control on the turbine alone
     read = [("wind_turbine", "pitch", name) for name in worth.ARMS]
     read += [(case, system, "twinning") for case, system in (("hop", "delay"), ("cryogenic_tank", "bias_5"))]
     for case, system_name, name in read:
@@ -115,7 +115,7 @@ def test_every_arm_is_a_training_that_its_recipe_can_make(tmp_path):
         assert made.unknown == (system_name,)
         assert made.twinning.arm == ("model_free" if "free" in name else training.arm)
         if name == "twinning":
-            assert made.twinning.corrected_plans and made.twinning.hypotheses.which == "automatic"
+            assert made.twinning.referee.rule == "expected_cost" and made.twinning.hypotheses.which == "automatic"
 
 
 def test_the_page_is_written_from_what_is_kept(tmp_path):

@@ -45,7 +45,7 @@ OBSERVATIONS = 64
 COMMON = 0.04
 """Share c of the error's variance that all policies have in common."""
 LENGTH = 0.1
-"""Distance ℓ of policies at which they are neighbours, as an RMS difference of their actions in shares of the ranges."""
+"""Distance ℓ of neighbours, as an RMS difference of their actions in shares of half the ranges."""
 AMPLITUDE = (0.1, 2.0)
 """Least and greatest σ."""
 NOISE = 0.05
@@ -240,7 +240,7 @@ class Belief:
 
     @property
     def contradicted(self) -> bool:
-        """Whether one of the real episodes cost more than the twin says, beyond chance and what exploration explains."""
+        """Whether a real episode cost more than the twin says, beyond chance and what exploration explains."""
         pairs = zip(self.differences(), self.flown, strict=True)
         return any(d - 2.0 * EXPLORED * one.exploration > ALARM for d, one in pairs)
 

@@ -5,8 +5,8 @@ and from the twin:
 
 .. math:: \min_w \mathbb E_e\,\Big\|\frac{\pi(e; w) - \pi_{live}(e)}{a_{hi} - a_{lo}}\Big\|^2
 
-A second round adds observations of virtual episodes that the pupil itself flies, so that it also learns what to do where
-its own errors lead (DAgger, Ross et al. 2011).
+A second round adds observations of virtual episodes that the pupil itself flies, so that it also learns what to do
+where its own errors lead (DAgger, Ross et al. 2011).
 """
 
 import copy

@@ -400,7 +400,9 @@ class VirtualEpisodes:
         return (1.0 - RARE) * price + RARE * self.price(policy, self._extreme(episodes)), price
 
     def with_extremes(self, episodes: Scenario) -> Scenario:
-        """Some episodes, and the extreme ones under their inputs."""
+        """Some episodes, and the extreme ones under their inputs, if there are some."""
+        if not len(self.extremes):
+            return episodes
         return Scenario(*(torch.cat(pair) for pair in zip(episodes, self._extreme(episodes), strict=True)))
 
     def _extreme(self, episodes: Scenario) -> Scenario:

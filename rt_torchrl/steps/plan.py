@@ -356,8 +356,8 @@ class MultiStart:
         self.alike = same_architecture(drawn, planner.policy)
         if make_policy is not None and not self.alike:
             raise ValueError(
-                f"make_policy draws a {type(drawn).__name__}, and model_based is another {type(planner.policy).__name__}"
-                "; let it draw a random policy like model_based, or use planner.starts=0."
+                f"make_policy draws a {type(drawn).__name__}, and model_based is another "
+                f"{type(planner.policy).__name__}; let it draw random policies like that one, or use starts=0."
             )
 
     def remember(self) -> None:
@@ -422,7 +422,7 @@ class MultiStart:
                 return Plan(present, stays, findings("no plan: the twin diverges", plan_accepted=0.0))
             report = found
             cost = self.belief.judge(policy, judged_on)
-            if cost <= stays:
+            if cost <= stays and math.isfinite(cost.price):
                 return Plan(copy.deepcopy(policy.state_dict()), cost, report)
             policy.load_state_dict(present)
             self.planner.refuse()

@@ -96,7 +96,8 @@ class ReinforcementTwinning:
             extremes=0 if self.fed_back else config.planner.extremes,
             generator=generator,
         )
-        self.belief = Belief(self.policies, self.virtual, corrects=config.referee.rule == "expected_cost")
+        corrects = config.referee.rule == "expected_cost" and config.arm != "model_free"
+        self.belief = Belief(self.policies, self.virtual, corrects=corrects)
         self.clearance = Clearance(system_of(env), self.policies, self.virtual, config.limits)
         self.learning = Learning(self.learner, self.virtual)
         self.planning = MultiStart(self.planner, self.belief, config.planner, make_policy)

@@ -18,14 +18,13 @@ class EarlierPolicies:
     """Policies and twin of an earlier training begin a new one; see :class:`Start` for the members.
 
     The weights of a policy of the same architecture are taken as they are: those of its own role, or else those of the
-    policy that the referee preferred. Where a policy has another architecture, the preferred one flies one episode, and
+    policy that was live. Where a policy has another architecture, the live one flies one episode, and
     the other architecture imitates it.
 
     Args:
-        policies: policies that were trained, by role; the preferred one is among them.
+        policies: policies that were trained, by role; the live one is among them.
         closure: trained closure of the twin.
-        live: role that was expected to cost less at the end of that training. It begins live, even if it was idle then,
-            because the live policy was on trial.
+        live: role that was live at the end of that training, and begins live.
         hypotheses: closures and weights of the hypotheses, as :meth:`TwinEnsemble.load_hypotheses` takes them.
     """
 
@@ -49,7 +48,7 @@ class EarlierPolicies:
 
     @property
     def teacher(self) -> nn.Module:
-        """The policy that was expected to cost less."""
+        """The policy that was live."""
         return self.policies[self.live]
 
     def take(self, policies: Mapping[Role, nn.Module], closure: nn.Module) -> list[Role]:

@@ -1,0 +1,359 @@
+"""The belief about what policies cost on the real system, the alarm, and what is judged by both."""
+
+import copy
+import math
+import random
+
+import numpy as np
+import pytest
+import torch
+from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
+from test_algorithm import twinning
+
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.steps.belief import COMMON, HISTORY, LENGTH, NOISE, Belief, alarm, difference
+from rt_torchrl.steps.imitation import Imitation
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.switch import Evidence, ExpectedCost, RefereeConfig
+from rt_torchrl.systems.exploration import ExplorationConfig
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
+from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
+from rt_torchrl.trajectories.twin import DigitalTwin
+from rt_torchrl.twinning.learning import Learning
+
+EPISODES = Scenario(torch.zeros(1, 2).double(), torch.zeros(1, 20, 1).double())
+QUIET = ExplorationConfig(spread=0.0)
+
+
+class ByGain(VirtualEpisodes):
+    """Virtual episodes on which a policy costs its gain; ``flights`` counts them."""
+
+    def __init__(self):
+        plant = LinearQuadratic(horizon=2.0)
+        self.twin, self.constraints, self.extremes = DigitalTwin(plant, LinearClosure(plant.true_closure)), None, ()
+        self.flights = 0
+
+    def cost(self, policy, episodes):
+        self.flights += 1
+        return policy.gain.detach().sum().item()
+
+
+def gains(first):
+    return {"gain": torch.tensor([[first, 0.0]], dtype=torch.float64)}
+
+
+def said(policy):
+    """What the twin says of a policy."""
+    return policy.gain[0, 0].item()
+
+
+def record():
+    plant = LinearQuadratic(horizon=2.0)
+    generator = torch.Generator().manual_seed(0)
+    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
+    with torch.no_grad():
+        flown = Rollout(plant, plant.closure, LinearGain([[1.0, 1.0]]))(state, exogenous)
+    return Trajectory(flown.states[0], flown.actions[0], exogenous[0])
+
+
+RECORD = record()
+
+
+def belief_of(*flights, corrects=True, exploration=0.0):
+    """The belief after flights of gains, by the twin's and the real cost, as pairs of gain and d."""
+    found = Belief({"model_based": LinearGain([[0.0, 0.0]])}, ByGain(), corrects=corrects)
+    for gain, d in flights:
+        found.append(RECORD, "model_based", gain * math.exp(d), exploration, gains(gain))
+    return found
+
+
+REFUTED = ((2.0, 2.0), (3.0, 0.0))
+"""The twin says 2 of weights that cost 2e², and 3 of weights that cost 3."""
+
+
+def gaussian_process(distances, d, amplitude, noise):
+    """Mean and variance of d at the first policy, by the textbook; distances among it and those that flew."""
+    k = amplitude**2 * (COMMON + (1.0 - COMMON) * np.exp(-0.5 * (distances / LENGTH) ** 2))
+    solved = np.linalg.solve(k[1:, 1:] + noise**2 * np.eye(len(d)), np.stack([d, k[0, 1:]], 1))
+    return k[0, 1:] @ solved[:, 0], k[0, 0] - k[0, 1:] @ solved[:, 1]
+
+
+def test_the_expected_cost_is_that_of_a_gaussian_process():
+    found, policy = belief_of((2.0, 0.9), (2.03, 0.8), (5.0, 0.0)), LinearGain([[2.01, 0.0]])
+    expected = found.expected(policy, 2.01)
+    positions = torch.stack([RECORD.states[:-1, 0]] * 1).square().mean().sqrt().item()  # of actions on a unit gain
+    at = np.array([2.01, 2.0, 2.03, 5.0])
+    distances = np.abs(at[:, None] - at[None]) * positions / 2.0  # in shares of half the range, ±2
+    likelihoods = []
+    for amplitude in np.linspace(0.1, 2.0, 400):
+        k = amplitude**2 * (COMMON + (1.0 - COMMON) * np.exp(-0.5 * (distances[1:, 1:] / LENGTH) ** 2))
+        k += NOISE**2 * np.eye(3)
+        d = np.array([0.9, 0.8, 0.0])
+        likelihoods.append((d @ np.linalg.solve(k, d) + np.linalg.slogdet(k)[1], amplitude))
+    mean, variance = gaussian_process(distances, np.array([0.9, 0.8, 0.0]), min(likelihoods)[1], NOISE)
+    assert expected == pytest.approx(2.01 * math.exp(mean + 0.5 * variance), rel=0.01)
+
+
+def test_a_policy_that_flew_is_known_and_a_twin_that_has_been_right_keeps_the_word():
+    found = belief_of((4.0, 1.0), (4.0, 1.0))
+    assert found.expected(LinearGain([[4.0, 0.0]]), 4.0) == pytest.approx(4.0 * math.e, rel=0.03)
+    assert found.expected(LinearGain([[4.0, 0.0]]), -4.0) == -4.0
+    assert found.expected(LinearGain([[4.0, 0.0]]), math.inf) == math.inf
+    right = belief_of((4.0, 0.01), (3.0, -0.02))
+    assert right.expected(LinearGain([[1.0, 0.0]]), 1.0) == pytest.approx(1.0, rel=0.01)
+    assert belief_of().expected(LinearGain([[1.0, 0.0]]), 1.0) == 1.0
+
+
+def test_what_is_known_of_one_exploring_episode_is_less():
+    known = [belief_of((4.0, 1.0), exploration=x).expected(LinearGain([[4.0, 0.0]]), 4.0) for x in (0.0, 0.1, 0.5)]
+    assert known[0] > known[1] > known[2] > 4.0
+
+
+def test_a_twin_that_blew_up_makes_no_neighbour_much_cheaper():
+    """The twin says 40 of a flight that cost 0.54; d counts as −1."""
+    found = belief_of((40.0, -4.3), (40.0, -4.3))
+    assert found.expected(LinearGain([[40.0, 0.0]]), 40.0) == pytest.approx(40.0 / math.e, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("real", "predicted", "d"),
+    [(2.0, 1.0, math.log(2.0)), (1.0, math.inf, 5.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (1e9, 1.0, 5.0)],
+)
+def test_paired_differences(real, predicted, d):
+    assert difference(real, predicted) == d
+
+
+def test_episodes_fly_again_where_the_twin_or_they_are_new():
+    found = belief_of((2.0, 0.5), (3.0, 0.7))
+    assert found.differences() == pytest.approx([0.5, 0.7]) and found.virtual.flights == 2
+    found.differences()
+    assert found.virtual.flights == 2
+    with torch.no_grad():
+        found.virtual.twin.closure.matrix[0, 0] += 1e-12
+    assert found.differences() == pytest.approx([0.5, 0.7]) and found.virtual.flights == 4
+
+
+def test_the_latest_episodes_are_kept_and_a_saved_belief_goes_on_alike():
+    found = belief_of(*[(2.0 + 0.1 * k, 0.5) for k in range(HISTORY + 3)])
+    assert said(found.policy_of(found.flown[0])) == pytest.approx(2.3)
+    again = Belief({"model_based": LinearGain([[0.0, 0.0]])}, ByGain())
+    again.load_state_dict(copy.deepcopy(found.state_dict()))
+    policy = LinearGain([[2.5, 0.0]])
+    assert again.expected(policy, 2.5) == found.expected(policy, 2.5) > 3.0
+
+
+class Profit(LinearQuadratic):
+    def running_cost(self, t, state, applied, exogenous):
+        return super().running_cost(t, state, applied, exogenous) - 100.0
+
+
+@pytest.mark.parametrize("arm", ["twinning", "model_based"])
+def test_a_real_episode_of_negative_cost_is_refused_where_a_twin_says_what_it_costs(arm):
+    with pytest.raises(
+        ValueError, match=r"J_a=-\d+.* of a real episode of plant 'linear_quadratic' is negative.* add a constant"
+    ):
+        twinning(Profit(horizon=2.0), arm=arm).episode()
+
+
+@pytest.mark.parametrize("options", [{"arm": "model_free"}, {"referee": RefereeConfig(rule="decision_tree")}])
+def test_without_a_belief_costs_may_be_negative(options):
+    assert twinning(Profit(horizon=2.0), **options).episode()["real_cost"] < 0.0
+
+
+@pytest.mark.parametrize(
+    ("differences", "wrong"),
+    [
+        ((), False),
+        ((0.05, -0.05, 0.1), False),
+        ((0.2,), False),
+        ((0.31,), True),
+        ((0.16, 0.16), True),
+        ((-0.16, -0.2), True),
+        ((0.16, -0.16), False),
+        ((1.0, 1.0, 0.1), False),
+    ],
+)
+def test_the_alarm(differences, wrong):
+    assert (alarm(differences) is not None) == wrong
+
+
+def test_the_alarm_says_how_wrong_the_twin_is():
+    assert "the last 2 episodes cost 5.75 times as much as the twin says" in alarm((1.7, 1.8))
+    assert "cost 1/2.01 of what the twin says" in alarm((-0.69, -0.71))
+    assert "the last episode cost 2.72 times as much as the twin says of it" in alarm((0.0, 0.0, 1.0))
+
+
+def test_false_alarms_of_a_sound_twin_are_rare():
+    draws, alarms = random.Random(1), 0
+    for _ in range(2000):
+        alarms += alarm([draws.gauss(0.0, 0.05) for _ in range(5)]) is not None
+    assert alarms / 2000 < 0.01
+
+
+def report_costs(found, factor):
+    """Let the real system report its costs multiplied by a factor."""
+    fly = found.flights.fly
+
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
+        flight.transitions["next", "reward"] *= factor
+        return flight
+
+    found.flights.fly = flown
+
+
+@pytest.mark.parametrize(("spread", "raised"), [(0.02, [1.0, 1.0]), (0.2, [0.0, 0.0])])
+def test_episodes_that_explore_raise_no_alarm(spread, raised):
+    """The twin is the real system, whose costs are doubled; chance explains that where actions scatter by a fifth."""
+    plant = LinearQuadratic(horizon=2.0)
+    loud = ExplorationConfig(spread=spread, episodes=10**6)
+    found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=loud)
+    report_costs(found, 2.0)
+    reports = []
+    for _ in range(2):
+        found.interact()
+        reports.append(found.belief.examine())
+    assert [report["alarm"].item() for report in reports] == raised
+    assert not raised[1] or "times as much as the twin says of them" in reports[1]["warning"]
+    expected = abs(reports[1]["paired_difference"].item()) - (0.0 if raised[1] else 4.0 * spread)
+    assert found.belief.unexplained == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("factor", "spread", "contradicted"),
+    [(1.0, 0.0, False), (1.1, 0.0, False), (1.3, 0.0, True), (1.3, 0.2, False), (0.5, 0.0, False)],
+)
+def test_what_contradicts_the_twin(factor, spread, contradicted):
+    plant = LinearQuadratic(horizon=2.0)
+    exploration = ExplorationConfig(spread=spread, episodes=10**6)
+    found = twinning(plant, closure=copy.deepcopy(plant.closure), arm="model_based", exploration=exploration)
+    report_costs(found, factor)
+    found.interact()
+    assert found.belief.contradicted == contradicted
+
+
+def test_a_plan_that_a_real_episode_refuted_does_not_come_back():
+    """The twin is exact in all but the cost of its own plans, which is ten times as high."""
+    plant = LinearQuadratic(horizon=2.0)
+    found = twinning(
+        plant,
+        closure=LinearClosure(plant.true_closure),
+        arm="model_based",
+        planner=PlannerConfig(iterations=10, descent=DescentConfig(optimiser="lbfgs", rate=1.0)),
+        exploration=QUIET,
+    )
+    first, fly, flights = found.policies["model_based"].gain.detach().clone(), found.flights.fly, []
+
+    def flown(policy, *, strength, whole):
+        flight = fly(policy, strength=strength, whole=whole)
+        dear = (policy.gain - first).abs().max().item() > 0.05
+        flight.transitions["next", "reward"] *= 10.0 if dear else 1.0
+        flights.append(dear)
+        return flight
+
+    found.flights.fly = flown
+    reports = [found.episode() for _ in range(13)]
+    assert flights[:2] == [False, True] and sum(flights) <= 3
+    assert reports[1]["alarm"].item() == 1.0 and not any(flights[-5:])
+
+
+def test_two_identical_policies_never_change_roles():
+    found = twinning(exploration=QUIET)
+    found.learner.update = dict
+    found.planning.plan = lambda *arguments: {}
+    live, idle = found.referee.live, found.referee.idle
+    found.policies[idle].load_state_dict(found.policies[live].state_dict())
+    report_costs(found, 2.0)
+    found.interact()
+    found.update_model_free = None
+    found._earlier_weights = {role: torch.ones(2).double() for role in found.policies}
+    found.fit_exogenous()
+    found.learning._before = found.learner.policy.state_dict()
+    for _ in range(4):
+        assert found.switch_policies()["event"] != "swap" and found.referee.live == live
+
+
+def test_the_cheaper_policy_acts():
+    referee = ExpectedCost(RefereeConfig(clone_patience=0), "model_free")
+
+    def decided(live, idle, change=1.0):
+        return referee.decide(Evidence(live_cost=live, idle_cost=idle, idle_weight_change=change)), referee.live
+
+    assert decided(1.0, 1.0) == ("keep", "model_free")
+    assert decided(1.0, 0.999) == ("swap", "model_based")
+    assert decided(1.0, math.inf, change=0.0) == ("clone", "model_based")
+    assert decided(math.inf, math.inf) == ("keep", "model_based")
+
+
+class Content:
+    """A learner or planner that leaves its policy as it is."""
+
+    def __init__(self, policy):
+        self.policy = policy
+
+    def nothing(self, *arguments):
+        pass
+
+    restart = refuse = load_state_dict = store = observations = nothing
+
+    def state_dict(self):
+        return {}
+
+
+class Hasty(Content):
+    """A learner whose update gives its policy the refuted weights."""
+
+    def update(self):
+        self.policy.load_state_dict(gains(2.0))
+
+
+@pytest.mark.parametrize(("corrects", "kept"), [(False, 2.0), (True, 3.0)])
+def test_an_update_that_flights_refute_is_taken_back(corrects, kept):
+    belief, learner = belief_of(*REFUTED, corrects=corrects), Hasty(LinearGain([[3.0, 0.0]]))
+    learning = Learning(learner, belief.virtual)
+    learning.update()
+    report = learning.judge(EPISODES, belief)
+    assert said(learner.policy) == kept and report["update_accepted"] == float(not corrects)
+
+
+def test_an_update_that_was_taken_back_is_judged_again_where_the_step_is_repeated():
+    """With another closure, of which the flights may say something else."""
+    learner = Hasty(LinearGain([[3.0, 0.0]]))
+    learning = Learning(learner, ByGain())
+    learning.update()
+    assert learning.judge(EPISODES, belief_of(*REFUTED))["update_accepted"] == 0.0
+    assert learning.judge(EPISODES, belief_of())["update_accepted"] == 1.0 and said(learner.policy) == 2.0
+
+
+@pytest.mark.parametrize("sound", [False, True])
+def test_an_unsound_twin_leaves_the_update_to_another_closure(sound, monkeypatch):
+    """Nothing flies on the twin. If what has flown does not, either, the step is repeated, with the update."""
+    belief, learner = belief_of((1.0, 0.0)), Hasty(LinearGain([[3.0, 0.0]]))
+    monkeypatch.setattr(belief.virtual, "cost", lambda policy, _: 1.0 if sound and said(policy) == 1.0 else math.inf)
+    learning = Learning(learner, belief.virtual)
+    learning.update()
+    if sound:
+        assert learning.judge(EPISODES, belief)["update_accepted"] and said(learner.policy) == 2.0
+    else:
+        with pytest.raises(DivergenceError):
+            learning.judge(EPISODES, belief)
+        assert said(learner.policy) == 2.0
+
+
+class Other(LinearGain):
+    """The same law in another architecture."""
+
+
+@pytest.mark.parametrize(("corrects", "kept"), [(False, 2.0), (True, 3.0)])
+def test_a_clone_replaces_weights_that_flights_refute(corrects, kept):
+    live, idle = LinearGain([[3.0, 0.0]]), Other([[2.0, 0.0]])
+    imitation = Imitation(belief_of(*REFUTED, corrects=corrects), 1)
+
+    def exactly(teacher, pupil, **others):
+        pupil.load_state_dict(teacher.state_dict())
+        return 0.0
+
+    imitation.imitate = exactly
+    report = imitation.clone(live, idle, seen=lambda: torch.zeros(1, 2), record=RECORD, judged_on=EPISODES)
+    assert said(idle) == kept and ("reason" in report) == (not corrects)
