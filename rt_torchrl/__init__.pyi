@@ -59,7 +59,7 @@ from .twinning.assimilation import AssimilationConfig
 from .twinning.hypotheses.config import HypothesesConfig
 from .twinning.hypotheses.ensemble import TwinEnsemble
 from .twinning.config import TwinningConfig
-from .steps.inputs import ExogenousConfig
+from .steps.config import ExogenousConfig
 from .twinning.learners import (
     DDPG,
     TD3,
@@ -69,16 +69,11 @@ from .twinning.learners import (
     LongTermMemoryConfig,
     TD3Config,
 )
-from .steps.plan import (
-    ConstraintsConfig,
-    Planner,
-    PlannerConfig,
-    RecedingHorizonPlanner,
-    ShortHorizon,
-    ShortHorizonConfig,
-    WholeEpisodes,
-)
-from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee, RefereeConfig
+from .steps.config import ConstraintsConfig, PlannerConfig, ShortHorizonConfig
+from .steps.plan import Planner, RecedingHorizonPlanner, WholeEpisodes
+from .steps.short_horizon import ShortHorizon
+from .steps.config import RefereeConfig
+from .steps.switch import DecisionTree, Evidence, ExpectedCost, Referee
 from .twinning.starts import EarlierPolicies, FirstController, RecordedFlights, Start
 
 # Trainings from the command line, and their results

@@ -4,7 +4,7 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.twinning.config import TwinningConfig
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig

@@ -10,8 +10,7 @@ from linear_quadratic import LinearClosure, LinearQuadratic, optimal_gain
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.plan import PlannerConfig
-from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -12,10 +12,10 @@ from test_algorithm import twinning
 
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import COMMON, HISTORY, LENGTH, NOISE, Belief, alarm, difference
+from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.plan import PlannerConfig
-from rt_torchrl.steps.switch import Evidence, ExpectedCost, RefereeConfig
+from rt_torchrl.steps.switch import Evidence, ExpectedCost
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory

@@ -14,8 +14,9 @@ from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.belief import Belief, Judged
-from rt_torchrl.steps.inputs import ExogenousConfig, VirtualEpisodes
-from rt_torchrl.steps.plan import Constraints, ConstraintsConfig, MultiStart, WholeEpisodes
+from rt_torchrl.steps.config import ConstraintsConfig, ExogenousConfig
+from rt_torchrl.steps.inputs import VirtualEpisodes
+from rt_torchrl.steps.plan import Constraints, MultiStart, WholeEpisodes
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 
 POSITION = {"position": (-1.0, 3.0)}

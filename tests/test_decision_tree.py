@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from rt_torchrl.steps.switch import DecisionTree, Evidence, RefereeConfig
+from rt_torchrl.steps.config import RefereeConfig
+from rt_torchrl.steps.switch import DecisionTree, Evidence
 
 WORSE, BETTER, EQUAL = (2.0, 1.0), (1.0, 2.0), (1.0, 1.0)
 MOVING, STALLED = 0.9, 0.1

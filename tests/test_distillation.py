@@ -8,9 +8,9 @@ from test_algorithm import STEPS, twinning, weights
 
 from rt_torchrl.plants.policies import SaturatedAffine, SaturatedMLP
 from rt_torchrl.steps.belief import Belief, Judged
+from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.steps.imitation import Imitation, ShareOfRange, match_actions
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.switch import RefereeConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -145,7 +145,7 @@ def test_a_refused_clone_is_no_event_and_says_why():
     for step in STEPS[:-1]:
         getattr(found, step)()
     before = {role: weights(policy) for role, policy in found.policies.items()}
-    costs = iter([2e-9, 1e-9, 2e-9, 1.0])  # of both policies, of that which is replaced, of its clone
+    costs = iter([1e-9, 2e-9, 2e-9, 1.0])  # of both policies, of that which is replaced, of its clone
     found.learning.judge = lambda *arguments: findings()
     found.belief.judge = lambda policy, episodes: Judged(cost := next(costs), cost)
     report = found.switch_policies()

@@ -10,7 +10,7 @@ from test_algorithm import twinning, weights
 
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.steps.belief import Judged
-from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.steps.config import RefereeConfig
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.twinning.assimilation import AssimilationConfig
 from rt_torchrl.twinning.findings import EpisodeReport

@@ -10,7 +10,7 @@ from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -113,24 +113,6 @@ def test_a_harmful_controller_is_not_imitated():
     before = found.policies["model_based"].gain.detach().clone()
     assert "does not imitate the controller" in found.start()["reason"]
     assert torch.equal(before, found.policies["model_based"].gain)
-
-
-def test_the_next_plan_is_the_best_of_both_starts():
-    """From the controller no iteration is allowed to help; the other start is the optimum already."""
-    found = twinning()
-    found.start()
-    (other,) = found.planning.others
-    best = {"gain": torch.tensor([[0.9, 1.1]], dtype=torch.float64)}
-    worst = {"gain": torch.tensor([[-0.5, -0.5]], dtype=torch.float64)}
-    judged_on, costs = found.virtual.draw(50), []
-    for weights, kept in ((worst, False), (best, True)):
-        found.planning.others = [weights]
-        before = found.policies["model_based"].gain.detach().clone()
-        found.plan()
-        now = found.policies["model_based"].gain.detach()
-        assert torch.equal(now, weights["gain"] if kept else before) and not found.planning.others
-        costs.append(found.virtual.cost(found.policies["model_based"], judged_on).item())
-    assert set(other) == {"gain"} and costs[1] < costs[0]
 
 
 def run(folder, **options):

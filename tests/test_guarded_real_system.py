@@ -7,7 +7,7 @@ from torchrl.envs import GymWrapper
 
 from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.pendulum.real import angle_and_speed
-from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.reading import Actuation, Reading
 from rt_torchrl.systems.real_system import RealSystem

@@ -17,7 +17,7 @@ from rt_torchrl.runs.results_table import SCREEN, next_steps, results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import settings_of
-from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.twinning.config import TwinningConfig
 
 TURBINE = config_class_of(RECIPES / "wind_turbine.py")

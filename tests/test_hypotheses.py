@@ -15,7 +15,8 @@ from rt_torchrl.runs.results import hypotheses_of, twin_entries
 from rt_torchrl.runs.results_table import hypothesis_lines, progress
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.plan import PlannerConfig, make_planner
+from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.plan import make_planner
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of
 from rt_torchrl.trajectories.twin import DigitalTwin

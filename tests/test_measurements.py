@@ -12,7 +12,8 @@ from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import rosco_turbine
 from rt_torchrl.plants.signal import Measurement, Named, Preview
-from rt_torchrl.steps.inputs import ExogenousConfig, VirtualEpisodes
+from rt_torchrl.steps.config import ExogenousConfig
+from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -10,7 +10,7 @@ from linear_quadratic import LinearQuadratic
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.optimisers.descent import DescentConfig
-from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operation.acting import Crew

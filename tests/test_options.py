@@ -12,9 +12,7 @@ import pytest
 from rt_torchrl.fit.least_squares import EstimationConfig
 from rt_torchrl.optimisers.descent import DescentConfig
 from rt_torchrl.options import check_options, choices, require_widths
-from rt_torchrl.steps.inputs import ExogenousConfig
-from rt_torchrl.steps.plan import PlannerConfig, ShortHorizonConfig
-from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.steps.config import ExogenousConfig, PlannerConfig, RefereeConfig, ShortHorizonConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.safety import SafetyConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig

@@ -110,21 +110,21 @@ def test_a_plant_without_a_paper_has_no_words_of_it():
 
 
 @pytest.mark.parametrize(
-    ("words", "spread", "judged"),
+    ("words", "spread", "starts"),
     [
-        ([], 0.02, True),
-        (["--start", "random"], 0.2, False),
-        (["--paper"], 0.2, False),
-        (["--starts", "random", "--episodes", "0"], 0.02, True),  # what cannot be carried out
+        ([], 0.02, 32),
+        (["--start", "random"], 0.2, 32),
+        (["--paper"], 0.2, 0),
+        (["--starts", "random", "--episodes", "0"], 0.02, 32),  # what cannot be carried out
     ],
 )
-def test_the_help_shows_the_defaults_that_hold(words, spread, judged, capsys):
+def test_the_help_shows_the_defaults_that_hold(words, spread, starts, capsys):
     config = config_class_of(RECIPES / "wind_turbine.py")
     with pytest.raises(SystemExit) as ended:
         from_command_line(config, [*words, "--help"])
     printed = capsys.readouterr()
     assert ended.value.code == 0 and not printed.err
     said = " ".join(printed.out.replace("│", " ").split())
-    for option, value in (("exploration.spread FLOAT", spread), ("no-judged-updates", judged)):
+    for option, value in (("exploration.spread FLOAT", spread), ("planner.starts INT", starts)):
         described = said.split(f"--twinning.{option}")[1].split(" --")[0]
         assert f"(default: {value})" in described

@@ -18,8 +18,7 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, mean_with_confidence
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.plan import PlannerConfig
-from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.steps.config import PlannerConfig, RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.trajectory import identification_cost

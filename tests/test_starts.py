@@ -21,8 +21,8 @@ from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.loaded_run import load_run
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.steps.imitation import clones
-from rt_torchrl.steps.plan import PlannerConfig
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory, pieces_of_equal_length

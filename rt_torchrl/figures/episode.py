@@ -21,7 +21,7 @@ from rt_torchrl.figures.style import (
     twin_label,
     with_unit,
 )
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 
 
 def states(snapshot: Snapshot) -> Figure:

@@ -25,7 +25,7 @@ from rt_torchrl.figures.style import (
     role_name,
 )
 from rt_torchrl.plants.closures import described_weights, named_weights
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 
 CONTROL: dict[str, dict[str, Any]] = {
     "real_cost": {"color": REAL, "marker": "o", "label": "real system, live"},

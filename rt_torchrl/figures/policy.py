@@ -15,7 +15,7 @@ from torch import Tensor
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.figures.style import ROLES, array, caption, last_episode, legend_below, limits, panels, role_name
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 
 RESOLUTION = 81

@@ -22,7 +22,7 @@ from rt_torchrl.atomic_file import write_atomically
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 
 REAL, TWIN, REFERENCE, LARGE_SCALE = "#222222", "#D55E00", "#009E73", "#D55E00"
 FILTERED, SAMPLES, LIMITS = "#56B4E9", "#56B4E9", "0.55"

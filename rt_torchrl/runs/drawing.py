@@ -11,7 +11,7 @@ from rt_torchrl import figures
 from rt_torchrl.evaluation.baseline import Baseline
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # only its type: runs load Matplotlib when they draw

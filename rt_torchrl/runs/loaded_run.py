@@ -18,7 +18,7 @@ from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.runs.settings import BESIDE, class_of, config_of, read_settings, require_config
 from rt_torchrl.runs.tensor_file import load_tensors
 from rt_torchrl.runs.user_code import named
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.hypotheses.choice import make_twin

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.run_config import RunConfig
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.systems.operation.acting import Crew
 from rt_torchrl.systems.operation.cores import chosen_core
 from rt_torchrl.systems.operation.event_log import EventLog

@@ -14,8 +14,8 @@ from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
 from rt_torchrl.evaluation.unseen import Judged, mean_with_confidence
 from rt_torchrl.runs.run_config import RunConfig
+from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import clones
-from rt_torchrl.steps.switch import Role
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory

@@ -14,8 +14,8 @@ from rt_torchrl.evaluation.closure_error import rms_error, visited_features
 from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
+from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import of_each_role
-from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin

@@ -38,8 +38,8 @@ from rt_torchrl.runs.run_folder import RunFolder
 from rt_torchrl.runs.run_settings import as_written, flat
 from rt_torchrl.runs.run_start import start_of, twin_of
 from rt_torchrl.runs.tensor_file import save_tensors
+from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import of_each_role
-from rt_torchrl.steps.switch import Role
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning

@@ -18,7 +18,7 @@ from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.policies import SaturatedMLP
 from rt_torchrl.runs.callbacks import EarlyStopping
 from rt_torchrl.runs.loggers import LoggerName, require_loggers
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.systems.operation.config import OperationConfig
 from rt_torchrl.trajectories.rollout import Engine
 from rt_torchrl.twinning.config import TwinningConfig

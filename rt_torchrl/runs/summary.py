@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rt_torchrl.steps.switch import Role
+    from rt_torchrl.steps.config import Role
 
 
 def on_the_twin(unseen: Mapping[str, Any]) -> bool:

@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten
 
 from rt_torchrl.plants.signal import bounds
+from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.switch import Role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, batch_of, control_cost

@@ -12,49 +12,17 @@ intervals. Until then it is the same for a plan and for the policy that the plan
 bound have a price, too, so that plans keep some distance from it. J_0 is the cost of the first policy that is priced.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
+from rt_torchrl.steps.config import ConstraintsConfig
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory
 from rt_torchrl.trajectories.twin import DigitalTwin
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConstraintsConfig:
-    r"""Bounds on states that plans shall keep.
-
-    They price what the twin predicts; a safety layer holds ``limits`` on the real system.
-
-    Args:
-        states: least and greatest value of states, by name, in their units; inf or -inf for no bound.
-        method: augmented_lagrangian for a price whose multipliers grow with every episode after whose plans the policy
-            leaves the bounds, until plans keep them; penalty for a fixed price of the squared excess, which bends plans
-            back but leaves some.
-        weight: weight of the price, in units of J_a of the first policy that is planned.
-
-    Raises:
-        ValueError: if a number is out of its range.
-    """
-
-    states: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    method: Literal["augmented_lagrangian", "penalty"] = "augmented_lagrangian"
-    weight: float = 100.0
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for name, (low, high) in self.states.items():
-            if not low < high:
-                raise ValueError(f"constraints.states {name}={low} to {high} must have its least value first.")
-        if not self.weight > 0.0:
-            raise ValueError(f"constraints.weight={self.weight} must be positive.")
 
 
 class Constraints:

@@ -26,7 +26,7 @@ from rt_torchrl.optimisers.descent import Descent, DescentConfig
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.steps.belief import Belief
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback, commands_along
 from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, control_cost

@@ -7,18 +7,17 @@ the processes of the latest real episodes, and policies are compared in them.
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import Signal, bounds
+from rt_torchrl.steps.config import ExogenousConfig, LargeScale
 from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.trajectories.rollout import DivergenceError
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -26,40 +25,8 @@ from rt_torchrl.trajectories.trajectory import Scenario, Trajectory, continued, 
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.flight import Flight
 
-LargeScale = Literal["met", "mixed"]
 ENOUGH = 3
 """Number of episodes from which on their large scales say how much others may differ."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExogenousConfig:
-    """Parameters of step 3.
-
-    Args:
-        knots: number of points of the decimated record in the regression, whose cost grows with its square.
-        kernel_width: standard deviation of the Gaussian kernel κ, in knot spacings; wider changes of the input count as
-            large scale.
-        penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
-        tube: half-width ε of the regression's tube, in standard deviations of the record.
-        large_scale: large scale of the inputs that steps 5 and 6 draw: met for those of the real episodes, as in the
-            paper, or mixed for new ones that differ from the mean of those met as these do, see :func:`mixed`. A policy
-            with hundreds of weights fits itself to a few winds that were met, and few winds do not hold the rare ones
-            that cost most.
-    """
-
-    knots: int = 300
-    kernel_width: float = 2.0
-    penalty: float = 10.0
-    tube: float = 0.05
-    large_scale: LargeScale = "met"
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.knots < 8:
-            raise ValueError(f"knots={self.knots} must be at least 8 for a regression of the large scale.")
-        for argument in ("kernel_width", "penalty", "tube"):
-            if not getattr(self, argument) > 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
 
 
 class ExogenousProcess:

@@ -4,19 +4,18 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig, stuck
+from rt_torchrl.control.predictive_control import PredictiveControl
+from rt_torchrl.optimisers.descent import Descended, Descent, stuck
 from rt_torchrl.optimisers.limited_mean import limited_mean
-from rt_torchrl.options import check_options, require_widths
 from rt_torchrl.steps.belief import Belief, Judged
-from rt_torchrl.steps.constraints import Constraints, ConstraintsConfig
+from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.steps.constraints import Constraints
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Scenario
 from rt_torchrl.trajectories.twin import DigitalTwin
@@ -61,117 +60,6 @@ class Planner(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from the :meth:`state_dict` of a planner with the same configuration."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShortHorizonConfig:
-    """Parameters of the planning over short windows.
-
-    Args:
-        window: number of control intervals in a window; 0 plans over whole episodes instead, as in the paper.
-        discount: discount factor γ per control interval.
-        mixing: weight λ of the rest of the window in the critic's targets; the critic itself has the weight 1 − λ.
-        critic_iterations: gradients of the critic for each window.
-        critic_hidden: widths of the critic's hidden layers.
-        target_rate: share of the distance to the critic that the target critic moves after each window.
-        policy_rate: learning rate of the policy (Adam).
-        critic_rate: learning rate of the critic (Adam).
-    """
-
-    window: int = 0
-    discount: float = 0.98
-    mixing: float = 0.95
-    critic_iterations: int = 8
-    critic_hidden: tuple[int, ...] = (64, 64)
-    target_rate: float = 0.2
-    policy_rate: float = 5e-3
-    critic_rate: float = 2e-3
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        require_widths("critic_hidden", self.critic_hidden)
-        for argument, least in (("window", 0), ("critic_iterations", 1)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")
-        if not 0.0 <= self.discount < 1.0:
-            raise ValueError(f"discount={self.discount} of the short horizon must lie in [0, 1).")
-        for argument in ("mixing", "target_rate"):
-            if not 0.0 < getattr(self, argument) <= 1.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must lie in (0, 1].")
-        for argument in ("policy_rate", "critic_rate"):
-            if not getattr(self, argument) > 0.0:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be positive.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlannerConfig:
-    """Parameters of step 5.
-
-    Args:
-        method: method of the model-based policy: whole_episodes descends the cost of whole virtual episodes,
-            short_horizon that of short windows plus a learned tail cost, and receding_horizon is model predictive
-            control, which has no weights of its own and plans while it acts. By default short_horizon if its window is
-            positive, and else whole_episodes.
-        iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
-            episodes.
-        realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
-            algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
-            plan made on one of them says little about the others.
-        starts: number of random policies, the best of which is a start of plans over whole episodes
-            (:class:`MultiStart`); 0 plans from the present weights alone, as in the paper.
-        episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
-            descent over whole episodes where the first one gains nothing beside a mean gradient that is longer;
-            infinite for none, as in the paper.
-        experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
-        extremes: number of random initial states among which the extremes of each state are found, from which a plan
-            and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one
-            of hundreds.
-        constraints: bounds on states that plans over whole episodes keep.
-        descent: parameters of the policy's descent over whole episodes.
-        short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
-            use.
-        receding_horizon: parameters of model predictive control.
-    """
-
-    method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
-    iterations: int = 10
-    realisations: int | None = None
-    starts: int = 32
-    episode_gradient_limit: float = 10.0
-    experience: int = 100
-    extremes: int = 1000
-    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
-    descent: DescentConfig = field(default_factory=DescentConfig)
-    short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
-    receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
-
-    @property
-    def whole(self) -> bool:
-        """Whether plans descend over whole episodes."""
-        return not self.short_horizon.window and self.method != "receding_horizon"
-
-    def __post_init__(self) -> None:
-        check_options(self, infinite=("episode_gradient_limit",))
-        if self.method is not None and (self.method == "short_horizon") != (self.short_horizon.window > 0):
-            raise ValueError(
-                f"method={self.method!r} of the planning does not go with short_horizon.window="
-                f"{self.short_horizon.window}; a positive window belongs to short_horizon alone."
-            )
-        if self.constraints.states and not self.whole:
-            raise ValueError(
-                f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
-                "planner.method and short_horizon.window as they are, or leave the constraints out."
-            )
-        for argument, least in (("iterations", 0), ("starts", 0), ("extremes", 0), ("experience", 1)):
-            if getattr(self, argument) < least:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the planning must be at least {least}.")
-        if self.realisations is not None and self.realisations < 1:
-            raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
-        if not self.episode_gradient_limit >= 1.0:
-            raise ValueError(
-                f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
-                "no limit."
-            )
 
 
 class WholeEpisodes:
@@ -378,7 +266,8 @@ class MultiStart:
         """
         policy = self.planner.policy
         if isinstance(policy, StateFeedback):
-            return self._descended(planned_on) or findings(plan_accepted=0.0)
+            found = self._descended(planned_on)
+            return findings("no plan: the twin diverges", plan_accepted=0.0) if found is None else found
         present = copy.deepcopy(policy.state_dict())
         stays = self.belief.judge(policy, judged_on)
         if not math.isfinite(stays.price):

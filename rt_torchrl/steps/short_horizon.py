@@ -27,7 +27,7 @@ from rt_torchrl.interruption import safe_point
 from rt_torchrl.optimisers.descent import Descended
 from rt_torchrl.plants.plant import cost_rate
 from rt_torchrl.plants.policies import mlp
-from rt_torchrl.steps.plan import PlannerConfig
+from rt_torchrl.steps.config import PlannerConfig
 from rt_torchrl.trajectories.trajectory import Scenario, control_cost
 from rt_torchrl.trajectories.twin import DigitalTwin
 

@@ -4,45 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from rt_torchrl.options import check_options
+from rt_torchrl.steps.config import RefereeConfig, Role
 
-Role = Literal["model_free", "model_based"]
 Event = Literal["keep", "swap", "clone"]
-RefereeName = Literal["decision_tree", "expected_cost"]
-ROLES: tuple[Role, Role] = ("model_based", "model_free")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefereeConfig:
-    """Parameters of step 6.
-
-    Args:
-        rule: rule of the referee: ``decision_tree``, as in the paper, or ``expected_cost``, which lets the policy act
-            that is expected to cost less on the real system. With this rule plans, updates and clones are judged by
-            what they are expected to cost there, too (:class:`~rt_torchrl.steps.belief.Belief`); with the paper's,
-            plans and distilled clones are judged by the twin alone, and updates by nothing.
-        patience: number P_π of episodes in a row that a reason to swap must outlast, in the decision tree.
-        clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
-            a clone.
-        tolerance: ratio T_J of the live policy's mean cost to the idle policy's above which the live policy is worse,
-            in the decision tree.
-        stall: relative weight change T_w below which the idle policy has stalled.
-    """
-
-    rule: RefereeName = "expected_cost"
-    patience: int = 2
-    clone_patience: int = 3
-    tolerance: float = 1.0
-    stall: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        for argument in ("patience", "clone_patience"):
-            if getattr(self, argument) < 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
-        for argument in ("tolerance", "stall"):
-            if not getattr(self, argument) > 0:
-                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,10 +17,11 @@ from torchrl.envs import EnvBase
 from rt_torchrl.control.predictive_control import PredictiveControl
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.imitation import Imitation
 from rt_torchrl.steps.inputs import VirtualEpisodes
 from rt_torchrl.steps.plan import MultiStart, Planner, make_planner
-from rt_torchrl.steps.switch import ROLES, Evidence, Referee, Role, make_referee
+from rt_torchrl.steps.switch import Evidence, Referee, make_referee
 from rt_torchrl.systems.collectors import collector_of
 from rt_torchrl.systems.exploration import LivePolicy
 from rt_torchrl.systems.operation.operation import Operation, system_of

@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from rt_torchrl.steps.config import ROLES, Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.switch import ROLES, Role
 from rt_torchrl.systems.operating_limits import OperatingLimits, require_layer
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.trajectories.rollout import DivergenceError

@@ -4,9 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rt_torchrl.options import check_options
-from rt_torchrl.steps.inputs import ExogenousConfig
-from rt_torchrl.steps.plan import PlannerConfig
-from rt_torchrl.steps.switch import RefereeConfig
+from rt_torchrl.steps.config import ExogenousConfig, PlannerConfig, RefereeConfig
 from rt_torchrl.systems.exploration import ExplorationConfig
 from rt_torchrl.systems.operating_limits_config import OperatingLimitsConfig
 from rt_torchrl.twinning.assimilation import AssimilationConfig

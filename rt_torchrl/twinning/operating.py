@@ -7,8 +7,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from rt_torchrl.steps.belief import Belief
+from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.inputs import VirtualEpisodes
-from rt_torchrl.steps.switch import Role
 from rt_torchrl.systems.operation.operation import Operation
 from rt_torchrl.systems.operation.order import FIRST, Order
 from rt_torchrl.twinning.clearance import Clearance

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from torch import nn
 
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.twinning.flight import Flight
 from rt_torchrl.twinning.starts.start import Fly
 

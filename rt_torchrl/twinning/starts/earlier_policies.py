@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import nn
 
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.architecture import same_architecture

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
-from rt_torchrl.steps.switch import Role
+from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.twinning.flight import Flight
 from rt_torchrl.twinning.starts.start import Fly

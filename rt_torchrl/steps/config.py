@@ -1,0 +1,219 @@
+"""Hyper-parameters of the six steps."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from rt_torchrl.control.predictive_control import PredictiveConfig
+from rt_torchrl.optimisers.descent import DescentConfig
+from rt_torchrl.options import check_options, require_widths
+
+Role = Literal["model_free", "model_based"]
+ROLES: tuple[Role, Role] = ("model_based", "model_free")
+RefereeName = Literal["decision_tree", "expected_cost"]
+LargeScale = Literal["met", "mixed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExogenousConfig:
+    """Parameters of step 3.
+
+    Args:
+        knots: number of points of the decimated record in the regression, whose cost grows with its square.
+        kernel_width: standard deviation of the Gaussian kernel κ, in knot spacings; wider changes of the input count as
+            large scale.
+        penalty: penalty C of the support vector regression, for a record scaled to unit standard deviation.
+        tube: half-width ε of the regression's tube, in standard deviations of the record.
+        large_scale: large scale of the inputs that steps 5 and 6 draw: met for those of the real episodes, as in the
+            paper, or mixed for new ones that differ from the mean of those met as these do, see :func:`mixed`. A policy
+            with hundreds of weights fits itself to a few winds that were met, and few winds do not hold the rare ones
+            that cost most.
+    """
+
+    knots: int = 300
+    kernel_width: float = 2.0
+    penalty: float = 10.0
+    tube: float = 0.05
+    large_scale: LargeScale = "met"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.knots < 8:
+            raise ValueError(f"knots={self.knots} must be at least 8 for a regression of the large scale.")
+        for argument in ("kernel_width", "penalty", "tube"):
+            if not getattr(self, argument) > 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConstraintsConfig:
+    r"""Bounds on states that plans shall keep.
+
+    They price what the twin predicts; a safety layer holds ``limits`` on the real system.
+
+    Args:
+        states: least and greatest value of states, by name, in their units; inf or -inf for no bound.
+        method: augmented_lagrangian for a price whose multipliers grow with every episode after whose plans the policy
+            leaves the bounds, until plans keep them; penalty for a fixed price of the squared excess, which bends plans
+            back but leaves some.
+        weight: weight of the price, in units of J_a of the first policy that is planned.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    states: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    method: Literal["augmented_lagrangian", "penalty"] = "augmented_lagrangian"
+    weight: float = 100.0
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for name, (low, high) in self.states.items():
+            if not low < high:
+                raise ValueError(f"constraints.states {name}={low} to {high} must have its least value first.")
+        if not self.weight > 0.0:
+            raise ValueError(f"constraints.weight={self.weight} must be positive.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShortHorizonConfig:
+    """Parameters of the planning over short windows.
+
+    Args:
+        window: number of control intervals in a window; 0 plans over whole episodes instead, as in the paper.
+        discount: discount factor γ per control interval.
+        mixing: weight λ of the rest of the window in the critic's targets; the critic itself has the weight 1 − λ.
+        critic_iterations: gradients of the critic for each window.
+        critic_hidden: widths of the critic's hidden layers.
+        target_rate: share of the distance to the critic that the target critic moves after each window.
+        policy_rate: learning rate of the policy (Adam).
+        critic_rate: learning rate of the critic (Adam).
+    """
+
+    window: int = 0
+    discount: float = 0.98
+    mixing: float = 0.95
+    critic_iterations: int = 8
+    critic_hidden: tuple[int, ...] = (64, 64)
+    target_rate: float = 0.2
+    policy_rate: float = 5e-3
+    critic_rate: float = 2e-3
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        require_widths("critic_hidden", self.critic_hidden)
+        for argument, least in (("window", 0), ("critic_iterations", 1)):
+            if getattr(self, argument) < least:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be at least {least}.")
+        if not 0.0 <= self.discount < 1.0:
+            raise ValueError(f"discount={self.discount} of the short horizon must lie in [0, 1).")
+        for argument in ("mixing", "target_rate"):
+            if not 0.0 < getattr(self, argument) <= 1.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must lie in (0, 1].")
+        for argument in ("policy_rate", "critic_rate"):
+            if not getattr(self, argument) > 0.0:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the short horizon must be positive.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """Parameters of step 5.
+
+    Args:
+        method: method of the model-based policy: whole_episodes descends the cost of whole virtual episodes,
+            short_horizon that of short windows plus a learned tail cost, and receding_horizon is model predictive
+            control, which has no weights of its own and plans while it acts. By default short_horizon if its window is
+            positive, and else whole_episodes.
+        iterations: number n_mb of gradients per episode or, with a short horizon, of sweeps through the virtual
+            episodes.
+        realisations: number N_z of virtual episodes that a plan is made on; None takes ``realisations`` of the
+            algorithm. Twenty virtual episodes take about as long as one, and where the initial states differ much, a
+            plan made on one of them says little about the others.
+        starts: number of random policies, the best of which is a start of plans over whole episodes
+            (:class:`MultiStart`); 0 plans from the present weights alone, as in the paper.
+        episode_gradient_limit: limit κ of the gradient of each virtual episode, see :func:`limited_mean`, in a second
+            descent over whole episodes where the first one gains nothing beside a mean gradient that is longer;
+            infinite for none, as in the paper.
+        experience: number of latest real episodes whose exogenous inputs steps 5 and 6 draw from; 1 as in the paper.
+        extremes: number of random initial states among which the extremes of each state are found, from which a plan
+            and an imitation must not fail; 0 for none. Twenty virtual episodes do not show what a policy does in one
+            of hundreds.
+        constraints: bounds on states that plans over whole episodes keep.
+        descent: parameters of the policy's descent over whole episodes.
+        short_horizon: parameters of planning over short windows, for tasks where gradients of whole episodes are of no
+            use.
+        receding_horizon: parameters of model predictive control.
+    """
+
+    method: Literal["whole_episodes", "short_horizon", "receding_horizon"] | None = None
+    iterations: int = 10
+    realisations: int | None = None
+    starts: int = 32
+    episode_gradient_limit: float = 10.0
+    experience: int = 100
+    extremes: int = 1000
+    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
+    descent: DescentConfig = field(default_factory=DescentConfig)
+    short_horizon: ShortHorizonConfig = field(default_factory=ShortHorizonConfig)
+    receding_horizon: PredictiveConfig = field(default_factory=PredictiveConfig)
+
+    @property
+    def whole(self) -> bool:
+        """Whether plans descend over whole episodes."""
+        return not self.short_horizon.window and self.method != "receding_horizon"
+
+    def __post_init__(self) -> None:
+        check_options(self, infinite=("episode_gradient_limit",))
+        if self.method is not None and (self.method == "short_horizon") != (self.short_horizon.window > 0):
+            raise ValueError(
+                f"method={self.method!r} of the planning does not go with short_horizon.window="
+                f"{self.short_horizon.window}; a positive window belongs to short_horizon alone."
+            )
+        if self.constraints.states and not self.whole:
+            raise ValueError(
+                f"constraints.states of {', '.join(self.constraints.states)} need plans over whole episodes: leave "
+                "planner.method and short_horizon.window as they are, or leave the constraints out."
+            )
+        for argument, least in (("iterations", 0), ("starts", 0), ("extremes", 0), ("experience", 1)):
+            if getattr(self, argument) < least:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the planning must be at least {least}.")
+        if self.realisations is not None and self.realisations < 1:
+            raise ValueError(f"realisations={self.realisations} of the planning (N_z) must be at least 1.")
+        if not self.episode_gradient_limit >= 1.0:
+            raise ValueError(
+                f"episode_gradient_limit={self.episode_gradient_limit} of the planning must be at least 1; infinite is "
+                "no limit."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefereeConfig:
+    """Parameters of step 6.
+
+    Args:
+        rule: rule of the referee: ``decision_tree``, as in the paper, or ``expected_cost``, which lets the policy act
+            that is expected to cost less on the real system. With this rule plans, updates and clones are judged by
+            what they are expected to cost there, too (:class:`~rt_torchrl.steps.belief.Belief`); with the paper's,
+            plans and distilled clones are judged by the twin alone, and updates by nothing.
+        patience: number P_π of episodes in a row that a reason to swap must outlast, in the decision tree.
+        clone_patience: number P_w of episodes in a row that the idle policy may stall; if it stalls longer, it becomes
+            a clone.
+        tolerance: ratio T_J of the live policy's mean cost to the idle policy's above which the live policy is worse,
+            in the decision tree.
+        stall: relative weight change T_w below which the idle policy has stalled.
+    """
+
+    rule: RefereeName = "expected_cost"
+    patience: int = 2
+    clone_patience: int = 3
+    tolerance: float = 1.0
+    stall: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument in ("patience", "clone_patience"):
+            if getattr(self, argument) < 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must not be negative.")
+        for argument in ("tolerance", "stall"):
+            if not getattr(self, argument) > 0:
+                raise ValueError(f"{argument}={getattr(self, argument)} must be positive.")
