@@ -140,7 +140,7 @@ def keep(
         effort: how thoroughly the optima were sought.
         title: title of the figure.
     """
-    from rt_torchrl.figures.pareto import pareto  # here, because the help of a recipe need not wait for Matplotlib
+    from rt_torchrl.figures.comparison import pareto  # here, because the help of a recipe need not wait for Matplotlib
 
     front = [found._asdict() for found in points]
     classical = {name: found.merit for name, found in others.items()}
