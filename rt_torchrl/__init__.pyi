@@ -34,7 +34,7 @@ from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyLayer
 from .systems.safety_report import SafetyEvent, SafetyReport
-from .evaluation.baseline import RealController
+from .evaluation.unseen import RealController
 
 # Trajectories and the twin
 from .trajectories.rollout import DivergenceError, Engine, Rollout

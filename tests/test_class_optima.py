@@ -10,7 +10,8 @@ from rt_torchrl import SaturatedMLP
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.limits import exact_optimum
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.policies import SaturatedAffine
 
 LIMIT, LIMIT_OF_DRONE = 0.00509, 6.3582

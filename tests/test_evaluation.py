@@ -6,9 +6,9 @@ from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
 from test_classical import PD
 from test_real_system import connected
 
-from rt_torchrl.evaluation.baseline import RealController
+from rt_torchrl.evaluation.limits import exact_optimum
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
 
 
 def random_gain(generator):

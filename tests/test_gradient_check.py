@@ -6,7 +6,7 @@ from linear_quadratic import LinearQuadratic
 from small_runs import small_run
 from torch import nn
 
-from rt_torchrl.evaluation.gradient_check import engine_gap
+from rt_torchrl.evaluation.checks import engine_gap
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.dashboard import Dashboard
 from rt_torchrl.trajectories.engines.autograd import Autograd

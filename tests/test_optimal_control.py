@@ -12,7 +12,7 @@ from rt_torchrl.control.forecasts import Foreseen
 from rt_torchrl.control.receding_horizon import BoundedDescentConfig, RecedingHorizon, RecedingHorizonConfig, descend
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_starts
+from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_start
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
@@ -80,7 +80,7 @@ def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program(kind):
     plant = kind(horizon=4.0, noise=0.5)
     state, exogenous = episodes(plant, 3)
     starts = constant_starts(plant, 3, plant.n_steps)
-    starts |= random_starts(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1), count=2)
+    starts["random"] = random_start(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
     found = clairvoyant(plant, state, exogenous, starts, config=BoundedDescentConfig(tolerance=0.0))
     saturated = 0
     for episode in range(3):
@@ -299,7 +299,7 @@ def test_the_optimum_is_that_of_a_quadratic_program_in_the_rates():
     plant = RateLimited(horizon=4.0, noise=0.5)
     state, exogenous = limited_episodes(plant, 3)
     starts = {"constant": constant_starts(plant, 3, plant.n_steps)["constant 0.25"]}
-    starts |= random_starts(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
+    starts["random"] = random_start(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
     config = BoundedDescentConfig(iterations=2000, tolerance=0.0)
     found = clairvoyant(plant, state, exogenous, starts, config=config)
     limited = 0

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import BAND, GREATEST_DROP, CryogenicTank
-from rt_torchrl.evaluation.closure_error import visited_features
+from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.figures import style
 from rt_torchrl.figures.animation import Scene, Show, Trace
 from rt_torchrl.figures.snapshot import Snapshot

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
-from rt_torchrl.evaluation.closure_error import visited_features as features_of
+from rt_torchrl.evaluation.checks import visited_features as features_of
 from rt_torchrl.figures import style
 from rt_torchrl.figures.animation import Scene, Show
 from rt_torchrl.figures.policy import contours

@@ -29,7 +29,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import PENALTY, CommandCost, PenalisedInterval, TerminalCost
+from rt_torchrl.control.command_cost import CommandCost, PenalisedInterval, TerminalCost
 from rt_torchrl.control.receding_horizon import BoundedDescentConfig, descend, projected_gradient
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
@@ -183,7 +183,6 @@ def clairvoyant(
     *,
     closure: nn.Module | None = None,
     hold: int = 1,
-    penalty: float = PENALTY,
     config: BoundedDescentConfig | None = None,
 ) -> Clairvoyant:
     """Descend the costs of episodes by all their commands, from several starts.
@@ -202,10 +201,9 @@ def clairvoyant(
         plant: the plant.
         initial_state: initial states of the episodes.
         exogenous: exogenous inputs of the episodes, all known.
-        starts: commands from which a descent starts, by name; see :func:`constant_starts` and :func:`random_starts`.
+        starts: commands from which a descent starts, by name; see :func:`constant_starts` and :func:`random_start`.
         closure: closure of the system; None for the plant's own.
         hold: number of control intervals for which a command is held.
-        penalty: weight of (command − applied)² over the squared range, in units of L_a, for commands that are held.
         config: parameters of the descents; the twenty that follow each other share the iterations.
 
     Raises:
@@ -215,7 +213,7 @@ def clairvoyant(
     if not starts:
         raise ValueError("starts is empty; name at least one, such as the commands of a classical controller.")
     closure, config = constant(plant.closure if closure is None else closure), config or BoundedDescentConfig()
-    cost = CommandCost(plant, closure, hold=hold, penalty=penalty, terminal=plant.terminal_cost)
+    cost = CommandCost(plant, closure, hold=hold, terminal=plant.terminal_cost)
     cost.begin(initial_state, exogenous)
     episodes = Scenario(initial_state, exogenous)
     descent: _Descent = partial(_ended, cost, episodes)
@@ -245,13 +243,10 @@ def constant_starts(plant: Plant, batch: int, n: int) -> dict[str, Float[Tensor,
     return {f"constant {share:g}": (low + share * (high - low)).expand(batch, n, -1) for share in (0.25, 0.5, 0.75)}
 
 
-def random_starts(
-    plant: Plant, batch: int, n: int, *, generator: torch.Generator, count: int = 1
-) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:
+def random_start(plant: Plant, batch: int, n: int, *, generator: torch.Generator) -> Float[Tensor, "{batch} {n} n_a"]:
     """Commands that are uniform on the ranges, drawn for every interval."""
     low, high = bounds(plant.actions)
-    draws = (torch.rand(batch, n, len(plant.actions), generator=generator, dtype=torch.float64) for _ in range(count))
-    return {f"random {k}": low + (high - low) * draw for k, draw in enumerate(draws)}
+    return low + (high - low) * torch.rand(batch, n, len(plant.actions), generator=generator, dtype=torch.float64)
 
 
 def _together(cost: CommandCost, point: np.ndarray) -> tuple[float, np.ndarray]:

@@ -6,8 +6,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from rt_torchrl.evaluation.baseline import Baseline, RealController
-from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, Baseline, RealController, UnseenEpisodes
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.state_feedback import StateFeedback
