@@ -42,9 +42,8 @@ from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
 from .evaluation.clairvoyant import Clairvoyant, clairvoyant
-from .control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
-from .control.predictive_control import PredictiveConfig, PredictiveControl
-from .control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from .control.forecasts import Decaying, Forecast, Held, Foreseen, Scattered
+from .control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from .evaluation.limits import LimitConfig
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
 from .fit.log import LogConfig, read_log
@@ -142,7 +141,6 @@ __all__ = [
     "FirstController",
     "Forecast",
     "Foreseen",
-    "Futures",
     "Held",
     "HypothesesConfig",
     "Injection",
@@ -178,7 +176,6 @@ __all__ = [
     "RealController",
     "RealSystem",
     "RecedingHorizon",
-    "RecedingHorizonConfig",
     "RecedingHorizonPlanner",
     "RecordedFlights",
     "Referee",

@@ -6,8 +6,7 @@ import torch
 from linear_quadratic import LinearQuadratic
 from scipy.optimize import lsq_linear
 
-from rt_torchrl.control.command_cost import CommandCost
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig, descend, projected_gradient
+from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, descend, projected_gradient
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.trajectories.rollout import Rollout

@@ -9,9 +9,8 @@ from linear_quadratic import LinearQuadratic
 from scipy.optimize import lsq_linear
 from test_optimal_control import matrices
 
-from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Futures, Held, Scattered
-from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
+from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 
 NOW = torch.tensor([[3.0, -1.0], [5.0, 2.0]], dtype=torch.float64)
 
@@ -28,12 +27,12 @@ def first_order(time, dt, *, episodes=40, n=4000):
 
 def test_a_held_forecast_is_what_is_measured():
     assert isinstance(Held(), Forecast)
-    torch.testing.assert_close(Held()(7.0, NOW, 3), torch.stack([NOW] * 3, 1), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(Held()(7.0, NOW, 3)[:, 0], torch.stack([NOW] * 3, 1), rtol=0.0, atol=0.0)
 
 
 def test_a_decaying_forecast_goes_to_the_mean():
     mean, time = torch.tensor([1.0, 1.0], dtype=torch.float64), torch.tensor([2.0, 0.5], dtype=torch.float64)
-    found = Decaying(mean, time, dt=0.5)(0.0, NOW, 40)
+    found = Decaying(mean, time, dt=0.5)(0.0, NOW, 40)[:, 0]
     torch.testing.assert_close(found[:, 0], NOW, rtol=0.0, atol=0.0)
     torch.testing.assert_close(found[0, 4], torch.tensor([1.0 + 2.0 / math.e, 1.0 - 2.0 * math.exp(-4.0)]).double())
     torch.testing.assert_close(found[:, -1], mean.expand(2, 2), rtol=1e-3, atol=1e-3)
@@ -53,27 +52,23 @@ def test_the_fitted_decay_has_the_least_error_of_all_on_the_records():
     def error(time):
         forecast = Decaying(fitted.mean, torch.tensor([time]).double(), dt=0.5)
         starts = range(0, records.shape[1] - lags, 3)
-        return sum(((forecast(0.0, records[:, k], lags + 1) - records[:, k : k + lags + 1]) ** 2).sum() for k in starts)
+        return sum(
+            ((forecast(0.0, records[:, k], lags + 1)[:, 0] - records[:, k : k + lags + 1]) ** 2).sum() for k in starts
+        )
 
     assert error(float(fitted.time)) < 1.01 * min(error(time) for time in (2.0, 4.0, 6.0, 8.0, 12.0, 40.0))
     assert error(float(fitted.time)) < 0.9 * error(1e6)
 
 
-def test_a_preview_knows_the_record_as_far_as_it_reaches():
+def test_a_preview_knows_the_record_and_holds_its_end():
     record = torch.arange(20.0).double().reshape(1, 20, 1)
-    every, near = Foreseen(record, dt=0.5), Foreseen(record, dt=0.5, reach=1.0)
+    every = Foreseen(record, dt=0.5)
     assert every(2.0, record[:, 4], 5).flatten().tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
     assert every(9.0, record[:, 18], 4).flatten().tolist() == [18.0, 19.0, 19.0, 19.0]
-    assert near(2.0, record[:, 4], 5).flatten().tolist() == [4.0, 5.0, 6.0, 6.0, 6.0]
-    to_zero = Decaying(torch.zeros(1).double(), torch.tensor([0.5]).double(), dt=0.5)
-    beyond = Foreseen(record, dt=0.5, reach=0.5, beyond=to_zero)(2.0, record[:, 4], 4)
-    torch.testing.assert_close(beyond.flatten(), torch.tensor([4.0, 5.0, 5.0 / math.e, 5.0 / math.e**2]).double())
 
 
 def test_impossible_forecasts_are_refused():
     record = torch.zeros(1, 20, 1).double()
-    with pytest.raises(ValueError, match="reach=-1"):
-        Foreseen(record, dt=0.5, reach=-1.0)
     with pytest.raises(ValueError, match="must be positive"):
         Decaying(torch.zeros(1).double(), torch.zeros(1).double(), dt=0.5)
     with pytest.raises(ValueError, match="horizon=10"):
@@ -94,7 +89,7 @@ def scattered(size, pairs=2):
 
 
 def controller(forecast, **options):
-    config = RecedingHorizonConfig(horizon=N * PLANT.dt, tolerance=0.0, iterations=500, **options)
+    config = PredictiveConfig(horizon=N * PLANT.dt, tolerance=0.0, iterations=500, **options)
     return RecedingHorizon(PLANT, PLANT.closure, config, forecast=forecast)
 
 
@@ -122,7 +117,7 @@ def test_plans_are_those_of_a_quadratic_program(shared):
     found = controller(forecast, period=shared * PLANT.dt).plan(0.0, state, now)
     bounded = 0
     for episode in range(2):
-        futures = forecast.futures(0.0, now, N)[episode, :, :, 0].numpy()
+        futures = forecast(0.0, now, N)[episode, :, :, 0].numpy()
         wanted = program(state[episode].numpy(), futures, shared)
         np.testing.assert_allclose(found[episode, :shared, 0].numpy(), wanted[:shared], atol=2e-4)
         later = wanted[shared:].reshape(len(futures), -1)
@@ -143,7 +138,7 @@ def test_without_bounds_the_first_command_is_that_of_the_forecast_alone():
 
 def test_the_rest_of_the_last_plans_goes_on_when_a_solve_is_late():
     state, exogenous = torch.tensor([[1.0, 0.0]]).double(), torch.zeros(1, 1).double()
-    config = RecedingHorizonConfig(horizon=N * PLANT.dt, period=2 * PLANT.dt, deadline=1e-9)
+    config = PredictiveConfig(horizon=N * PLANT.dt, period=2 * PLANT.dt, deadline=1e-9)
     late = RecedingHorizon(PLANT, PLANT.closure, config, forecast=scattered(1.0))
     first, second = (late.plan(t, state, exogenous) for t in (0.0, 2 * PLANT.dt))
     assert [solve.late for solve in late.solves] == [False, True]
@@ -155,17 +150,16 @@ def test_futures_have_the_moments_of_the_errors():
     records = PLANT.draw_exogenous(4, torch.Generator().manual_seed(0)).cumsum(1)
     decaying = Decaying.fitted(records, dt=PLANT.dt, horizon=0.5)
     found = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=5)
-    assert isinstance(found, Futures) and not isinstance(decaying, Futures)
-    middle = decaying(0.0, records[:, 3], 6)
-    errors = torch.cat([records[:, k : k + 6] - decaying(0.0, records[:, k], 6) for k in range(records.shape[1] - 5)])
+    middle = decaying(0.0, records[:, 3], 6)[:, 0]
+    starts = range(records.shape[1] - 5)
+    errors = torch.cat([records[:, k : k + 6] - decaying(0.0, records[:, k], 6)[:, 0] for k in starts])
     moments = (errors[..., 0].T @ errors[..., 0] / len(errors)).numpy()
     spread = torch.cat([found.deviations, -found.deviations])[..., 0]
     np.testing.assert_allclose((spread.T @ spread / len(spread)).numpy(), moments, atol=1e-12)
     found.low, found.high = (torch.full((1,), end).double() for end in (-1e3, 1e3))
-    futures = found.futures(0.0, records[:, 3], 6)
+    futures = found(0.0, records[:, 3], 6)
     assert futures.shape == (4, 10, 6, 1)
     torch.testing.assert_close(futures.mean(1), middle)
-    torch.testing.assert_close(found(0.0, records[:, 3], 6), middle)
     torch.testing.assert_close(futures[:, :5] - middle.unsqueeze(1), spread[:5, :, None].expand(4, -1, -1, -1))
     one = Scattered.fitted(decaying, records, dt=PLANT.dt, horizon=0.5, pairs=1).deviations[0, :, 0].numpy()
     assert one @ moments @ one / (one @ one) == pytest.approx(np.linalg.eigvalsh(moments)[-1])
@@ -174,7 +168,7 @@ def test_futures_have_the_moments_of_the_errors():
 def test_futures_stay_in_the_range_of_the_records_and_begin_with_what_is_measured():
     records = PLANT.draw_exogenous(3, torch.Generator().manual_seed(0)).cumsum(1)
     found = Scattered.fitted(Held(), records, dt=PLANT.dt, horizon=1.0, pairs=2)
-    futures = found.futures(0.0, records.amax().reshape(1, 1), 30)
+    futures = found(0.0, records.amax().reshape(1, 1), 30)
     assert futures.amax() == records.amax() and futures.amin() >= records.amin()
     assert (futures[:, :, 0] == records.amax()).all() and (futures[:, :, 11:] == futures[:, :, 10:11]).all()
 
@@ -189,12 +183,13 @@ def test_it_acts_as_a_policy_whose_scatter_is_learned_and_kept():
     torch.testing.assert_close(policy.fly(state, exogenous).actions, held, rtol=1e-2, atol=1e-2)  # nothing is met yet
     records = PLANT.draw_exogenous(9, generator).cumsum(1)
     policy.learn(records[:, :6])  # shorter than the window
-    assert policy.deviations.shape == (2, 10, 1) and (policy.deviations[:, 5:] == policy.deviations[:, 5:6]).all()
+    found = policy.forecast
+    assert found.deviations.shape == (2, 10, 1) and (found.deviations[:, 5:] == found.deviations[:, 5:6]).all()
     policy.learn(records)
     fitted = Decaying.fitted(records, dt=PLANT.dt, horizon=1.0)
     scatter = Scattered.fitted(fitted, records, dt=PLANT.dt, horizon=1.0, pairs=2)
-    assert torch.equal(policy.deviations, scatter.deviations[:, :10])
-    assert torch.equal(policy.low, records.amin((0, 1))) and torch.equal(policy.high, records.amax((0, 1)))
+    assert torch.equal(found.deviations, scatter.deviations[:, :10])
+    assert torch.equal(found.low, records.amin((0, 1))) and torch.equal(found.high, records.amax((0, 1)))
     again.load_state_dict(policy.state_dict())
     assert torch.equal(again.fly(state, exogenous).actions, policy.fly(state, exogenous).actions)
 

@@ -13,8 +13,8 @@ from printed_commands import blocks
 from test_export_recipe import leave_run, recipe
 
 from rt_torchrl import load_run
+from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve
 from rt_torchrl.evaluation.limits import resting_at_the_end
 from rt_torchrl.evaluation.unseen import UnseenEpisodes

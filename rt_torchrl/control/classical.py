@@ -4,7 +4,7 @@ Learned policies are compared with them, and they act on a real system before an
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -146,8 +146,7 @@ class ClassicalController(nn.Module, ABC):
         return Trajectory(states, plant.actuate(states[:, :-1], command), exogenous)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tuned:
+class Tuned(NamedTuple):
     """Mean J_a at the first gains and at the gains that the search found, and the number of its evaluations."""
 
     start: float
@@ -161,17 +160,17 @@ def tune(
     exogenous: Float[Tensor, "batch n n_z"],
     *,
     evaluations: int = 80,
-    spread: float = 2.0,
     plant: Plant | None = None,
 ) -> Tuned:
     """Minimise the mean J_a of the episodes over the logarithms of the gains by Nelder and Mead's simplex.
+
+    Between corners of the first simplex one gain doubles.
 
     Args:
         controller: the controller; the search starts from its present gains and leaves the best ones in it.
         initial_state: initial states of the episodes.
         exogenous: exogenous inputs of the episodes.
         evaluations: greatest number of evaluations; each flies all episodes.
-        spread: factor on one gain between corners of the first simplex, more than 1.
         plant: physics of the system that is flown; None for the controller's own plant.
 
     Raises:
@@ -181,8 +180,8 @@ def tune(
 
     if not len(controller.log_gains):
         raise ValueError(f"controller {type(controller).__name__} has no gains to tune.")
-    if evaluations < 1 or not spread > 1.0:
-        raise ValueError(f"evaluations={evaluations} must be at least 1 and spread={spread} more than 1.")
+    if evaluations < 1:
+        raise ValueError(f"evaluations={evaluations} must be at least 1.")
 
     system = controller.plant if plant is None else plant
 
@@ -196,7 +195,7 @@ def tune(
         return value if np.isfinite(value) else np.inf
 
     first = controller.log_gains.detach().cpu().numpy().copy()
-    simplex = np.vstack([first, first + np.log(spread) * np.eye(len(first))])
+    simplex = np.vstack([first, first + np.log(2.0) * np.eye(len(first))])
     options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-2, "fatol": 1e-4}
     start = cost(first)
     found = minimize(cost, first, method="Nelder-Mead", options=options)

@@ -29,8 +29,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import CommandCost, PenalisedInterval, TerminalCost
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig, descend, projected_gradient
+from rt_torchrl.control.command_cost import (
+    BoundedDescentConfig,
+    CommandCost,
+    PenalisedInterval,
+    TerminalCost,
+    descend,
+    projected_gradient,
+)
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.interval import Drive

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
-from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig, RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
 from rt_torchrl.evaluation.clairvoyant import clairvoyant, constant_starts, random_start
 from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
@@ -190,7 +190,7 @@ def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
 
 
 def receding(
-    episodes: UnseenEpisodes, model: Plant, closure: nn.Module, config: RecedingHorizonConfig, forecast: Forecast
+    episodes: UnseenEpisodes, model: Plant, closure: nn.Module, config: PredictiveConfig, forecast: Forecast
 ) -> Contender:
     """Model predictive control on a model with a closure, such as those of the system, or those of a twin."""
     exact = episodes.known_closure()
