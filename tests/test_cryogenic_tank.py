@@ -215,7 +215,6 @@ def test_costs(plant):
         ({"wall_heat_capacity": math.nan}, "wall_heat_capacity"),
         ({"command": "flow"}, "command"),
         ({"observe": ("level",)}, "level"),
-        ({"error_sizes": (0.05, 0.0, 1e3)}, "error_sizes"),
         ({"dt": 400.0, "horizon": 4e5}, "unstable"),
         ({"dt": 31.0}, "horizon"),
     ],

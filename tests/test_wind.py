@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from scipy import integrate, signal
+from scipy import signal
 from seeds_and_numbers import seeded
 
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
@@ -29,14 +29,6 @@ def periodogram(wind, dt):
     if n % 2 == 0:
         power[..., -1] /= 2.0
     return np.fft.rfftfreq(n, dt)[1:], power[..., 1:]
-
-
-def test_spectrum_is_the_formula_and_integrates_to_the_variance():
-    f = np.geomspace(1e-7, 1e5, 20001)
-    S = KaimalWind().spectrum(torch.from_numpy(f)).numpy()
-    np.testing.assert_allclose(S, kaimal(f), rtol=1e-13)
-    # Left out below 1e-7 Hz and above 1e5 Hz: 1e-5 of the variance each; trapezium rule: 1e-6.
-    assert integrate.trapezoid(S, f) == pytest.approx(SIGMA**2, rel=1e-4)
 
 
 @pytest.mark.parametrize("n", [N, N - 1])
@@ -174,13 +166,17 @@ T5 = 0.5 * np.arange(5)
         ([], [], "r.hh: holds 0 wind samples"),
         ([0.0], [8.0], "r.hh: holds 1 wind samples"),
         (T5, np.ones(4), r"r.hh: time has shape \(5,\) and speed \(4,\)"),
-        (T5, [8, 8, math.nan, 8, 8], "r.hh: wind speed at t = 1 s is nan .* interpolation"),
-        ([0, 0.5, math.nan, 1.5, 2], np.ones(5), "r.hh: time of sample 2 is nan"),
-        (T5, [8, -0.5, 8, 8, 8], "r.hh: wind speed at t = 0.5 s is -0.5 m/s; it must not be negative"),
-        (T5, [8, 1e42, 8, 8, 8], r"r.hh: wind speed at t = 0.5 s is 1e\+42 m/s; it must not exceed 200 m/s"),
+        (
+            T5,
+            [8, 8, math.nan, 8, 8],
+            "r.hh: wind speed at t = 1 s is nan m/s; it must be from 0 to 200 m/s.*fill the gap",
+        ),
+        ([0, 0.5, math.nan, 1.5, 2], np.ones(5), "r.hh: time goes from 0.5 s to nan s; it must increase"),
+        (T5, [8, -0.5, 8, 8, 8], "r.hh: wind speed at t = 0.5 s is -0.5 m/s; it must be from 0"),
+        (T5, [8, 1e42, 8, 8, 8], r"r.hh: wind speed at t = 0.5 s is 1e\+42 m/s; it must be from 0 to 200 m/s"),
         ([0, 0.5, 0.5, 1.0, 1.5], np.ones(5), "r.hh: time goes from 0.5 s to 0.5 s; it must increase"),
-        ([0, 0.5, 1.0, 2.5, 3.0], np.ones(5), "r.hh: gap after t = 1 s, 1.5 s instead of 0.5 s: 2 samples are missing"),
-        ([0, 0.5, 1.0, 1.6, 2.1], np.ones(5), "r.hh: unequal time step after t = 1 s, 0.6 s instead of 0.5 s"),
+        ([0, 0.5, 1.0, 2.5, 3.0], np.ones(5), "r.hh: the step after t = 1 s is 1.5 s instead of 0.5 s. Fill the gap"),
+        ([0, 0.5, 1.0, 1.6, 2.1], np.ones(5), "r.hh: the step after t = 1 s is 0.6 s instead of 0.5 s.*resample"),
     ],
 )
 def test_faulty_records_are_refused(time, speed, message):
@@ -238,7 +234,7 @@ def test_a_comment_behind_numbers_drops_no_row(tmp_path):
 @pytest.mark.parametrize(
     "spoil, message",
     [
-        (lambda lines: [*lines[:3], *lines[5:]], r"wind\.hh: gap after t = 1 s, .*: 2 samples are missing"),
+        (lambda lines: [*lines[:3], *lines[5:]], r"wind\.hh: the step after t = 1 s is 1.5 s"),
         (lambda lines: [lines[0].replace("8.00", " NaN"), *lines[1:]], r"wind\.hh, line 4: value 'NaN' is not finite"),
         (lambda lines: [*lines[:4], "********" + lines[4][8:]], r"wind\.hh, line 8: could not convert"),
         (lambda lines: [*lines[:9], lines[9][:20]], r"wind\.hh, line 13: 3 columns, but 8 are needed"),
