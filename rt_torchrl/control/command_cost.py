@@ -23,14 +23,17 @@ from torch import Tensor, nn
 
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Inputs, Starts
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.engines.code import Group, Inputs, IntervalCode, code_of, signals_of
+from rt_torchrl.trajectories.engines.code import Group, IntervalCode, code_of, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.rollout import require_double
 
 TerminalCost = Callable[[Tensor], Tensor]
 """Function from the end states, ``batch n_s``, to the cost V after the window, ``batch``, in units of L_a·s."""
+Plans = Float[np.ndarray, "batch m n_a"]
+"""Held commands in [0, 1] of each realisation of a window."""
 PENALTY = 1.0
 """Weight w of the penalty, in units of L_a."""
 DIVERGED = 1e6
@@ -130,40 +133,31 @@ class CommandCost:
         """Number of commands of a window of n control intervals; the last may be held for less time."""
         return -(-n // self.hold)
 
-    def commands(self, unit: Float[np.ndarray, "batch m n_a"], n: int) -> Float[Tensor, "batch n n_a"]:
+    def commands(self, unit: Plans, n: int) -> Actions:
         """The commands of all n intervals."""
         return torch.from_numpy(np.repeat(self._low + self._span * unit, self.hold, 1)[:, :n].copy())
 
-    def units(self, commands: Float[Tensor, "batch n n_a"]) -> Float[np.ndarray, "batch m n_a"]:
+    def units(self, commands: Actions) -> Plans:
         """The held commands in [0, 1] that are nearest to commands of all intervals: the means over the blocks."""
         first = np.arange(0, commands.shape[1], self.hold)
         counts = np.diff(np.append(first, commands.shape[1]))[:, None]
         held = np.add.reduceat(commands.detach().numpy(), first, 1) / counts
         return np.clip((held - self._low) / self._span, 0.0, 1.0)
 
-    def begin(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        *,
-        start: float = 0.0,
-    ) -> None:
+    def begin(self, initial_state: Starts, exogenous: Inputs, *, start: float = 0.0) -> None:
         """Set the window: its initial states, exogenous inputs and the time of its start [s]."""
         n = exogenous.shape[1]
         t = start + self.plant.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1)
         state = torch.nn.functional.pad(initial_state, (0, 1))
         command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
         self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
-        found, self._code = self._traced(), None
+        with torch.enable_grad():
+            found = code_of(self.interval, state, self._drive._replace(command=command.clone().requires_grad_()))
+        self._code = None
         if found is not None:  # kept code, unless the plant or the closure is another one by now
             self._code, inputs = found
             self._weights = inputs.row()
             self._place(self._code)
-
-    def _traced(self) -> tuple[IntervalCode, Inputs] | None:
-        with torch.enable_grad():
-            drive = self._drive._replace(command=self._drive.command.clone().requires_grad_())
-            return code_of(self.interval, self._state, drive)
 
     def _place(self, code: IntervalCode) -> None:
         """Lay out the arrays of the window, one set for each group of lanes."""
@@ -191,9 +185,7 @@ class CommandCost:
             self._x[k, :, 1:first] = group.gather(exogenous)
             self._states[k, 0] = group.gather(state)[0]
 
-    def __call__(
-        self, unit: Float[np.ndarray, "batch m n_a"]
-    ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, "batch m n_a"]]:
+    def __call__(self, unit: Plans) -> tuple[Float[np.ndarray, " batch"], Plans]:
         """J and its gradient by the commands u in [0, 1] of each realisation of the window."""
         if self._code is None:
             return self._by_torch(unit)
@@ -204,14 +196,7 @@ class CommandCost:
         gradient /= self.n
         return costs, gradient
 
-    def _sweep(
-        self,
-        k: int,
-        group: Group,
-        unit: np.ndarray,
-        costs: np.ndarray,
-        gradient: np.ndarray,
-    ) -> None:
+    def _sweep(self, k: int, group: Group, unit: np.ndarray, costs: np.ndarray, gradient: np.ndarray) -> None:
         x, states, n, n_a = self._x[k], self._states[k], self.n, unit.shape[-1]
         lanes = group.gather(unit.transpose(1, 0, 2))
         x[:, -n_a:] = lanes if self.hold == 1 else np.repeat(lanes, self.hold, 0)[:n]

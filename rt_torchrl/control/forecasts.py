@@ -7,6 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.plants.shapes import Input, Inputs
+
+Futures = Float[Tensor, "batch n_futures {n} n_z"]
+"""Exogenous inputs of n control intervals in each future."""
 WINDOWS = 100
 """Number of windows of a record in which the errors of a forecast are taken; neighbours say nearly the same."""
 
@@ -15,16 +19,14 @@ WINDOWS = 100
 class Forecast(Protocol):
     """Anything that forecasts the exogenous inputs: one future, or several that are equally likely."""
 
-    def __call__(
-        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
-    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
+    def __call__(self, t: float, exogenous: Input, n: int) -> Futures:
         """The inputs of the n control intervals from t [s] on in each future, of which the first are measured."""
 
 
 class Held:
     """The measured input, held."""
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch 1 {n} n_z"]:
+    def __call__(self, t: float, exogenous: Input, n: int) -> Futures:
         return exogenous[:, None, None].expand(-1, -1, n, -1)
 
 
@@ -52,7 +54,7 @@ class Decaying(nn.Module):
         self.dt = dt
 
     @classmethod
-    def fitted(cls, records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float) -> "Decaying":
+    def fitted(cls, records: Inputs, *, dt: float, horizon: float) -> "Decaying":
         r"""The decay times of the least mean squared error of the forecast over the horizon.
 
         .. math::
@@ -76,7 +78,7 @@ class Decaying(nn.Module):
         times = [_decay_time(column, dt, records.shape[1] * dt) for column in covariance.T]
         return cls(mean, torch.tensor(times, dtype=torch.float64), dt=dt)
 
-    def forward(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch 1 {n} n_z"]:
+    def forward(self, t: float, exogenous: Input, n: int) -> Futures:
         share = torch.exp(-self.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1) / self.time)
         return self.mean + (exogenous - self.mean)[:, None, None] * share
 
@@ -89,10 +91,10 @@ class Foreseen:
         dt: control interval [s].
     """
 
-    def __init__(self, record: Float[Tensor, "batch n n_z"], *, dt: float):
+    def __init__(self, record: Inputs, *, dt: float):
         self.record, self.dt = record, dt
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch 1 {n} n_z"]:
+    def __call__(self, t: float, exogenous: Input, n: int) -> Futures:
         last = self.record.shape[1] - 1
         return self.record[:, None, (round(t / self.dt) + torch.arange(n)).clamp(max=last)]
 
@@ -131,9 +133,7 @@ class Scattered(nn.Module):
             self.register_buffer(name, value)
 
     @classmethod
-    def fitted(
-        cls, forecast: Forecast, records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float, pairs: int = 4
-    ) -> "Scattered":
+    def fitted(cls, forecast: Forecast, records: Inputs, *, dt: float, horizon: float, pairs: int = 4) -> "Scattered":
         """The scatter of a forecast's errors on records.
 
         Args:
@@ -164,9 +164,7 @@ class Scattered(nn.Module):
         deviations = (pairs**0.5 * sizes[:pairs, None] * directions[:pairs]).reshape(pairs, lags + 1, n_z) * scale
         return cls(forecast, deviations, records.amin((0, 1)), records.amax((0, 1)))
 
-    def forward(
-        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
-    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
+    def forward(self, t: float, exogenous: Input, n: int) -> Futures:
         """The futures, those with added deviations first."""
         change = self.reaching(n)
         found = self.forecast(t, exogenous, n) + torch.cat([change, -change])
@@ -179,7 +177,7 @@ class Scattered(nn.Module):
         return self.deviations[:, torch.arange(n).clamp(max=self.deviations.shape[1] - 1)]
 
 
-def lags_within(records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float) -> int:
+def lags_within(records: Inputs, *, dt: float, horizon: float) -> int:
     """The number of control intervals of a horizon [s].
 
     Raises:

@@ -16,15 +16,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, descend
+from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, Plans, descend
 from rt_torchrl.control.forecasts import Decaying, Forecast, Held, Scattered
 from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Starts, State
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
 from rt_torchrl.trajectories.twin import constant
 
+Variables = Float[np.ndarray, "variables n_a"]
+"""Held commands in [0, 1] that several futures share, and below them those of each."""
 PAIRS = 10
 """Number of pairs that approximate the curvature in a solve."""
 Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -101,19 +104,17 @@ class SharedCommands:
     def __init__(self, cost: CommandCost, shared: int):
         self.cost, self.shared = cost, shared
 
-    def point(self, plans: Float[np.ndarray, "n_futures m n_a"]) -> Float[np.ndarray, "variables n_a"]:
+    def point(self, plans: Plans) -> Variables:
         """The variables of a plan for each future; where they must share commands, the means."""
         return self._joined(plans[:, : self.shared].mean(0), plans)
 
-    def plans(self, point: Float[np.ndarray, "variables n_a"], count: int) -> Float[np.ndarray, "{count} m n_a"]:
+    def plans(self, point: Variables, count: int) -> Plans:
         """The plan of each of ``count`` futures; p is less where the window is shorter."""
         shared, n_a = min(len(point), self.shared), point.shape[-1]
         first = np.broadcast_to(point[:shared], (count, shared, n_a))
         return np.concatenate([first, point[shared:].reshape(count, -1, n_a)], 1)
 
-    def __call__(
-        self, point: Float[np.ndarray, "variables n_a"], count: int
-    ) -> tuple[float, Float[np.ndarray, "variables n_a"]]:
+    def __call__(self, point: Variables, count: int) -> tuple[float, Variables]:
         """J and its gradient by the variables of ``count`` futures."""
         costs, slopes = self.cost(self.plans(point, count))
         return float(costs.mean()), self._joined(slopes[:, : self.shared].sum(0), slopes) / count
@@ -143,7 +144,7 @@ class _LateError(Exception):
     """The deadline of a solve has passed."""
 
 
-def _after(tail: Tail, t: float, exogenous: Float[Tensor, " n_z"], state: Float[Tensor, "batch n_s"]) -> Tensor:
+def _after(tail: Tail, t: float, exogenous: Float[Tensor, " n_z"], state: State) -> Tensor:
     """A tail as a function of the end states alone."""
     return tail(state.new_full((len(state),), t), state, exogenous.expand(len(state), -1))
 
@@ -229,9 +230,7 @@ class RecedingHorizon:
         self._prepared = self._plans[0]
         self.begin()
 
-    def plan(
-        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
-    ) -> Float[Tensor, "batch n n_a"]:
+    def plan(self, t: float, state: State, exogenous: Input) -> Actions:
         """Plan anew and return the commands of the whole window.
 
         Args:
@@ -303,9 +302,7 @@ class RecedingHorizon:
         costs = [self._shared(self._shared.point(plan), len(plan))[0] for plan in plans]
         return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
-    def act(
-        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
-    ) -> Float[Tensor, "batch n_a"]:
+    def act(self, t: float, state: State, exogenous: Input) -> Action:
         """The command of the control interval at t [s], which follow each other; every period it plans."""
         k = round(t / self.plant.dt) % self.period
         if k == 0 or self._commands is None:
@@ -314,12 +311,7 @@ class RecedingHorizon:
 
     @torch.no_grad()
     def fly(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        closure: nn.Module | None = None,
-        *,
-        plant: Plant | None = None,
+        self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
     ) -> Trajectory:
         """Episodes of a system, side by side.
 
@@ -410,7 +402,7 @@ class PredictiveControl(nn.Module):
         plant = self._plant[0]
         return plant.dt * self.value(plant.observe(t, state, exogenous))
 
-    def learn(self, records: Float[Tensor, "episodes n n_z"]) -> None:
+    def learn(self, records: Inputs) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
 
         Args:
@@ -436,19 +428,12 @@ class PredictiveControl(nn.Module):
         self._acting.solves.clear()
 
     @torch.no_grad()
-    def act(
-        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
-    ) -> Float[Tensor, "batch n_a"]:
+    def act(self, t: float, state: State, exogenous: Input) -> Action:
         return self._acting.act(t, state, exogenous)
 
     @torch.no_grad()
     def fly(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        closure: nn.Module | None = None,
-        *,
-        plant: Plant | None = None,
+        self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
     ) -> Trajectory:
         self._virtual.prepare(*self._typical)
         flown = self._virtual.fly(initial_state, exogenous, closure, plant=plant)

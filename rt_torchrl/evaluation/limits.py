@@ -21,6 +21,7 @@ from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Inputs
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -96,11 +97,7 @@ def judged(
 
 
 def limit(
-    episodes: UnseenEpisodes,
-    starts: Mapping[str, Float[Tensor, "batch n n_a"]],
-    *,
-    hold: int,
-    config: BoundedDescentConfig,
+    episodes: UnseenEpisodes, starts: Mapping[str, Actions], *, hold: int, config: BoundedDescentConfig
 ) -> Contender:
     """The clairvoyant optimum from commands by name, see :func:`clairvoyant`, with what says that it is an optimum."""
     plant, state, exogenous = episodes.plant, episodes.initial_state, episodes.exogenous
@@ -115,7 +112,7 @@ def limit(
     return judged(episodes, found.flown, None, **evidence)
 
 
-def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Float[Tensor, "batch n n_a"]]:
+def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Actions]:
     """The commands of the controllers, some of which rest at the end."""
     starts = {}
     for name, kind in config.starts.items():
@@ -127,22 +124,20 @@ def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Flo
     return starts
 
 
-def few_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Float[Tensor, "batch n n_a"]]:
+def few_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Actions]:
     """The commands of the controllers, and the middle of all ranges, where a descent knows nothing of them."""
     middle = constant_starts(episodes.plant, len(episodes.initial_state), episodes.plant.n_steps)["constant 0.5"]
     return flown_starts(episodes, config) | {"constant 0.5": middle}
 
 
-def general_starts(episodes: UnseenEpisodes, *, seed: int) -> dict[str, Float[Tensor, "batch n n_a"]]:
+def general_starts(episodes: UnseenEpisodes, *, seed: int) -> dict[str, Actions]:
     """Constant commands, and random ones of a seed."""
     plant, generator = episodes.plant, torch.Generator().manual_seed(seed)
     shape = len(episodes.initial_state), plant.n_steps
     return constant_starts(plant, *shape) | {"random 0": random_start(plant, *shape, generator=generator)}
 
 
-def resting_at_the_end(
-    episodes: UnseenEpisodes, commands: Float[Tensor, "batch n n_a"]
-) -> Float[Tensor, "batch n n_a"]:
+def resting_at_the_end(episodes: UnseenEpisodes, commands: Actions) -> Actions:
     """The commands, but the least ones for the last part of each episode, which is as long as costs least.
 
     Nobody pays for the state at the end of an episode, so that an optimum may rest there; a descent from commands that
@@ -209,7 +204,7 @@ def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
     return receding(episodes, episodes.plant, episodes.known_closure(), window, known[window.forecast])
 
 
-def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], window: PredictiveConfig) -> dict[str, Forecast]:
+def forecasts(plant: Plant, exogenous: Inputs, window: PredictiveConfig) -> dict[str, Forecast]:
     """The forecasts that are compared: held, decaying to the mean as other episodes do, with its scatter, and known."""
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
     over = {"dt": plant.dt, "horizon": min(window.horizon, 0.5 * plant.horizon)}
@@ -236,10 +231,7 @@ def in_milliseconds(seconds: list[float]) -> dict[str, float]:
 
 @torch.no_grad()
 def untrained_costs(
-    unseen: UnseenEpisodes,
-    make_policy: Callable[[torch.Generator], nn.Module],
-    *,
-    starts: int,
+    unseen: UnseenEpisodes, make_policy: Callable[[torch.Generator], nn.Module], *, starts: int
 ) -> Float[Tensor, " {starts}"]:
     """Mean J_a of random initial policies; a training's cost over it does not depend on the training's own start.
 

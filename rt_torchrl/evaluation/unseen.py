@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
 from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, control_cost, identification_cost
@@ -136,7 +137,7 @@ class UnseenEpisodes:
         return law.fly(self.initial_state, self.exogenous, self.closure, plant=self.plant)
 
     @torch.no_grad()
-    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+    def control_costs(self, policy: nn.Module) -> Costs:
         """J_a of each episode."""
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.fly(policy))
@@ -164,7 +165,7 @@ class UnseenEpisodes:
         return self.plant.categories(self.exogenous)
 
     @torch.no_grad()
-    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
         The twin begins with what sensors read, and is compared with it. J_p is infinite where the twin diverges.
@@ -232,13 +233,13 @@ class TwinEpisodes(UnseenEpisodes):
         return flown(self.flying.at_rest(self.initial_state), self.exogenous)
 
     @torch.no_grad()
-    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+    def control_costs(self, policy: nn.Module) -> Costs:
         return control_cost(self.flying, self.fly(policy))
 
     def validation(self) -> None:
         """No validation episodes, because the referee has compared the policies on the twin already."""
 
-    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
         """Not a number: the real system has not flown these episodes, so that no twin can be compared with it."""
         return torch.full((len(flown.states),), torch.nan, dtype=torch.float64, device=flown.states.device)
 
@@ -246,8 +247,8 @@ class TwinEpisodes(UnseenEpisodes):
 class Judged(NamedTuple):
     """J_a and the plant's own quantities of each unseen episode under one controller."""
 
-    control_costs: Float[Tensor, " count"]
-    merit: dict[str, Float[Tensor, " count"]]
+    control_costs: Costs
+    merit: dict[str, Costs]
 
     def means(self) -> dict[str, float]:
         """Mean of each of the plant's own quantities."""
