@@ -25,7 +25,7 @@ from rt_torchrl import (
     load_run,
     main_of,
 )
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig
+from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.envs.cryogenic_tank.controllers import OnOffValve, PIValve, RestingOnOff
 from rt_torchrl.envs.flapping_wing.controllers import TrimmedPD
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController

@@ -34,7 +34,7 @@ from .systems.reading import Actuation, Reading
 from .systems.real_system import RealSystem
 from .systems.safety import SafetyConfig, SafetyLayer
 from .systems.safety_report import SafetyEvent, SafetyReport
-from .evaluation.baseline import RealController
+from .evaluation.unseen import RealController
 
 # Trajectories and the twin
 from .trajectories.rollout import DivergenceError, Engine, Rollout
@@ -42,9 +42,8 @@ from .trajectories.state_feedback import StateFeedback
 from .trajectories.trajectory import Scenario, Trajectory, control_cost, identification_cost
 from .trajectories.twin import DigitalTwin
 from .evaluation.clairvoyant import Clairvoyant, clairvoyant
-from .control.forecasts import Decaying, Forecast, Held, Foreseen, Futures, Scattered
-from .control.predictive_control import PredictiveConfig, PredictiveControl
-from .control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from .control.forecasts import Decaying, Forecast, Held, Foreseen, Scattered
+from .control.predictive_control import PredictiveConfig, PredictiveControl, RecedingHorizon
 from .evaluation.limits import LimitConfig
 from .fit.least_squares import Estimate, Estimation, EstimationConfig
 from .fit.log import LogConfig, read_log
@@ -136,7 +135,6 @@ __all__ = [
     "FirstController",
     "Forecast",
     "Foreseen",
-    "Futures",
     "Held",
     "HypothesesConfig",
     "Injection",
@@ -172,7 +170,6 @@ __all__ = [
     "RealController",
     "RealSystem",
     "RecedingHorizon",
-    "RecedingHorizonConfig",
     "RecedingHorizonPlanner",
     "RecordedFlights",
     "Referee",

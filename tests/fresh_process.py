@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 CONTEXT = multiprocessing.get_context(METHOD)
 if METHOD == "forkserver":
-    CONTEXT.set_forkserver_preload(["rt_torchrl.runs.run", "rt_torchrl.figures.overview"])
+    CONTEXT.set_forkserver_preload(["rt_torchrl.runs.run", "rt_torchrl.figures.training"])
 
 
 def run(source: str | Path, *arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess:

@@ -29,7 +29,7 @@ from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.closure_error import visited_features
+from rt_torchrl.evaluation.checks import visited_features
 from rt_torchrl.fit.uncertainty import band, named_values
 from rt_torchrl.plants.signal import bounds
 

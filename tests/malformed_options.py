@@ -16,8 +16,8 @@ from rt_torchrl import (
     Actuation,
     LimitConfig,
     PlantEnv,
+    PredictiveConfig,
     Reading,
-    RecedingHorizonConfig,
     SafetyConfig,
     SafetyLayer,
     Signal,
@@ -84,7 +84,7 @@ def configurations():
 GOOD = {
     SafetyConfig: {"interval": 0.1},
     LimitConfig: {"starts": {}},
-    RecedingHorizonConfig: {"horizon": 2.0},
+    PredictiveConfig: {"horizon": 2.0},
     RunConfig: {},
     Injection: {"kind": "nan"},
     Column: {"header": "a", "signal": "b"},

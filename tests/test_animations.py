@@ -14,7 +14,7 @@ from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.wind_turbine import figures as turbine
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.figures.animation import RATE, Trace, save_scene, shown_samples
+from rt_torchrl.figures.animation import RATE, Trace, shown_samples
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +39,18 @@ def test_it_has_a_frame_for_each_interval(scene, snapshot, tmp_path, request):
 
 
 def test_the_rotor_shows_wind_and_pitch_and_turns_with_its_speed(blowing):
-    scene, record = turbine.TurbineScene(blowing), blowing.record
+    scene, record = turbine.scene(blowing), blowing.record
+    *blades, _, _, note = scene.moving[:6]
     angles = []
     for k in (7, 8):
         scene.show(k)
-        tip = scene.blades[0].get_xy()[2:4].mean(0) - [0.0, turbine.HUB]
+        tip = blades[0].get_xy()[2:4].mean(0) - [0.0, turbine.HUB]
         assert math.hypot(*tip) == pytest.approx(turbine.TIP)
         angles.append(math.atan2(*tip))
     speed = record.states[8, 0].item() / WindTurbine.rated_rotor_speed
     assert abs(angles[1] - angles[0]) == pytest.approx(math.radians(turbine.TURN * speed))
-    assert scene.note.get_text() == f"wind {record.exogenous[8, 0]:.1f} m/s"
-    line, end = scene.traces[1].moving
+    assert note.get_text() == f"wind {record.exogenous[8, 0]:.1f} m/s"
+    line, end = scene.traces[1][0]
     assert np.array_equal(line.get_ydata(), 97.0 * record.states[:9, 0].numpy())
     assert end.get_xdata().tolist() == [4.0]
 
@@ -57,11 +58,11 @@ def test_the_rotor_shows_wind_and_pitch_and_turns_with_its_speed(blowing):
 def test_the_level_is_that_of_a_sphere(boiling):
     for height in (-1.0, -0.3, 0.0, 0.5, 1.0):
         assert tank.level(0.25 * (1.0 + height) ** 2 * (2.0 - height)) == pytest.approx(height, abs=1e-4)
-    scene = tank._Scene(boiling)
+    scene = tank.scene(boiling)
     scene.show(5)
-    surface = scene.liquid.get_xy()[:, 1].max()
+    surface = scene.moving[0].get_xy()[:, 1].max()
     assert surface == pytest.approx(tank.level(boiling.record.states[5, 1].item() / 60.0), abs=1e-9)
-    assert f"load {boiling.record.exogenous[5, 0]:.0f} W" in scene.note.get_text()
+    assert f"load {boiling.record.exogenous[5, 0]:.0f} W" in scene.moving[5].get_text()
 
 
 def test_frames_are_spread_over_the_samples():
@@ -72,9 +73,9 @@ def test_frames_are_spread_over_the_samples():
 
 def test_a_trace_keeps_its_axes_and_another_format_is_refused(blowing, tmp_path):
     ax = Figure().subplots()
-    trace = Trace(ax, np.arange(4.0), np.array([0.0, 9.0, 1.0, 2.0]), "x [m]")
+    (line, _), show = Trace("x [m]", np.array([0.0, 9.0, 1.0, 2.0])).draw(ax, np.arange(4.0))
     limits = ax.get_ylim()
-    trace.show(0)
-    assert ax.get_ylim() == limits and trace.moving[0].get_ydata().tolist() == [0.0]
+    show(0)
+    assert ax.get_ylim() == limits and line.get_ydata().tolist() == [0.0]
     with pytest.raises(ValueError, match=r"must end in '\.gif'"):
-        save_scene(turbine.TurbineScene(blowing), 20, tmp_path / "last.mp4")
+        turbine.save_animation(blowing, tmp_path / "last.mp4")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig
+from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.closures import SaintDrenan
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 
@@ -124,7 +124,7 @@ def flown(plant, state, exogenous, act):
 def planned(mpc, state, wind):
     """J of do-mpc's last plan in the library's model, and of the library's plan after as many gradients as it needs."""
     plant = WindTurbine(closure=SaintDrenan.from_set("Dai2016"))
-    config = RecedingHorizonConfig(horizon=HORIZON, iterations=2000, tolerance=1e-12)
+    config = PredictiveConfig(horizon=HORIZON, iterations=2000, tolerance=1e-12)
     own = RecedingHorizon(plant, plant.closure, config)
     n = own.horizon
     theirs = torch.tensor([np.array(mpc.opt_x_num_unscaled["_u", k, 0]).ravel().tolist() for k in range(n)])
@@ -148,7 +148,7 @@ def main():
             plans.append(planned(mpc, s, wind))
         return command
 
-    own = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=HORIZON, tolerance=TOLERANCE))
+    own = RecedingHorizon(plant, plant.closure, PredictiveConfig(horizon=HORIZON, tolerance=TOLERANCE))
     for _ in range(EPISODES):
         state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)
         mpc.reset_history()

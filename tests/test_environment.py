@@ -165,13 +165,6 @@ def test_turbine_actuators_are_rate_limited():
     assert (limited > 20).all() and (free > 20).all()
 
 
-def test_ideal_actuators_apply_the_command():
-    env = PlantEnv(WindTurbine(horizon=20.0, rate_limits=None), batch_size=4)
-    action = uniform_actions(env, 0)
-    # last + (command − last): one rounding.
-    torch.testing.assert_close(act(env, env.reset(), action)["next", "applied"], action, rtol=1e-14, atol=1e-10)
-
-
 class Explosive(LinearClosure):
     def forward(self, features):
         return 1e3 * features**3

@@ -1,14 +1,25 @@
-"""The reference optimum, on the plant where the best gain is known, and what cannot be flown."""
+"""The reference optimum of classes of policies, the gradient check of a run's start, and what cannot be flown."""
 
 import pytest
 import torch
 from linear_quadratic import LinearGain, LinearQuadratic, optimal_gain
+from small_runs import small_run
 from test_classical import PD
 from test_real_system import connected
+from torch import nn
 
-from rt_torchrl.evaluation.baseline import RealController
+from rt_torchrl import SaturatedMLP
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
+from rt_torchrl.envs.wind_turbine.plant import EngineeringCost, WindTurbine
+from rt_torchrl.evaluation.checks import engine_gap
+from rt_torchrl.evaluation.limits import exact_optimum
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.unseen import RealController, UnseenEpisodes
+from rt_torchrl.plants.policies import SaturatedAffine
+from rt_torchrl.runs.dashboard import Dashboard
+from rt_torchrl.trajectories.engines.autograd import Autograd
+from rt_torchrl.trajectories.rollout import ENGINES
 
 
 def random_gain(generator):
@@ -45,3 +56,136 @@ def test_without_a_true_closure_nothing_is_flown_in_simulation():
     unseen.closure = None
     with pytest.raises(ValueError, match="the true closure of plant 'linear_quadratic' is not known"):
         unseen.fly(LinearGain(optimal_gain(1.0)))
+
+
+LIMIT, LIMIT_OF_DRONE = 0.00509, 6.3582
+EPISODES, SEED = 8, 12345
+
+
+def perceptron(plant):
+    return lambda generator: SaturatedMLP(len(plant.observations), plant.actions, hidden=(16, 16), generator=generator)
+
+
+def optimum(plant, make_policy, *, starts=1, approach=600, iterations=500):
+    episodes = UnseenEpisodes(plant, EPISODES, seed=SEED)
+    return exact_optimum(
+        episodes, make_policy, starts=starts, approach=approach, iterations=iterations, few=EPISODES, polish=100, seed=1
+    )
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("observe", "greatest"), [("preview", 1.08), ("measured+wind", 1.95)])
+def test_a_small_perceptron_comes_near_the_limit(observe, greatest):
+    plant = WindTurbine(observe=(observe,))
+    assert LIMIT < optimum(plant, perceptron(plant)).cost <= greatest * LIMIT
+
+
+@pytest.mark.nightly
+def test_a_small_perceptron_of_wind_and_phase_flies_the_drone_at_the_limit():
+    plant = FlappingWing(observe=("measured+wind",))
+    assert optimum(plant, perceptron(plant), approach=240, iterations=120).cost <= 1.003 * LIMIT_OF_DRONE
+
+
+@pytest.mark.nightly
+def test_an_affine_law_of_the_measured_states():
+    plant = WindTurbine(observe=("measured",))
+
+    def affine(generator):
+        return SaturatedAffine(len(plant.observations), plant.actions, generator=generator)
+
+    assert optimum(plant, affine, approach=0, iterations=400).cost <= 2.7 * LIMIT
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(5))
+def test_the_engineering_task_beats_jonkman_in_all_his_merits(seed):
+    """On unseen episodes: his energy, at most 1.5 times his pitch travel, and a fifth less speed above rated."""
+    plant = WindTurbine(cost=EngineeringCost(), observe=("measured+wind",))
+    episodes = UnseenEpisodes(plant, EPISODES, seed=SEED)
+    found = exact_optimum(
+        episodes, perceptron(plant), starts=1, approach=300, iterations=200, few=EPISODES, polish=0, seed=seed
+    )
+    unseen = UnseenEpisodes(plant, 16, seed=999)
+    with torch.no_grad():
+        ours = unseen.judge(unseen.fly(found.policy)).merit
+        his = unseen.judge(unseen.fly_baseline(JonkmanController(plant))).merit
+    power, travel, over = (
+        ours[name].mean().item() / his[name].mean().item()
+        for name in ("mean power [MW]", "pitch travel [deg/s]", "speed above rated [rad/s]")
+    )
+    assert power >= 1.0 and travel <= 1.5 and over <= 0.8
+
+
+class TwoParts(nn.Module):
+    """A closure with a part that can be frozen."""
+
+    def __init__(self, plant):
+        super().__init__()
+        self.held, self.trained = plant.make_closure(torch.Generator()), plant.make_closure(torch.Generator())
+
+    def forward(self, features):
+        return 0.5 * (self.held(features) + self.trained(features))
+
+
+@pytest.mark.parametrize("held", ["held", "held and trained"])
+def test_weights_that_are_frozen_are_left_out(held):
+    plant = LinearQuadratic()
+    closure, policy = TwoParts(plant), plant.make_policy(torch.Generator().manual_seed(0))
+    for part in held.split(" and "):
+        getattr(closure, part).requires_grad_(False)
+    unseen = UnseenEpisodes(plant, 2)
+    # Rounding of forty intervals.
+    assert engine_gap(plant, closure, policy, unseen) < 1e-13
+    # The continuous adjoint differs by the order of its step: 1e-4 for 0.1 s times the 1/120 of the local error.
+    assert 0.0 < engine_gap(plant, closure, policy, unseen, "odeint_adjoint") < 1e-5
+    policy.requires_grad_(False)
+    closure.requires_grad_(False)
+    with pytest.raises(ValueError, match="closure TwoParts and policy LinearGain have no weight that is trained"):
+        engine_gap(plant, closure, policy, UnseenEpisodes(plant, 2))
+
+
+class Half(Autograd):
+    """An engine whose states are right, and whose gradient is wrong by the half."""
+
+    def end_states(self, *arguments):
+        states = super().end_states(*arguments)
+        return 0.5 * (states + states.detach())
+
+    def costs(self, *arguments):
+        return None
+
+
+@pytest.mark.parametrize("engine", ["native", "parallel"])
+def test_an_engine_whose_gradient_is_another_one_trains_nothing(engine, tmp_path, monkeypatch):
+    run = small_run(tmp_path, episodes=1, engine=engine)
+    monkeypatch.setitem(ENGINES, engine, Half)
+    said = (
+        rf"engine='{engine}' gives another gradient of plant 'linear_quadratic' than 'autograd': .* by \d.*e-01 of its"
+    )
+    with pytest.raises(ValueError, match=said):
+        run.train()
+    assert not run.episodes
+
+
+@pytest.mark.parametrize("engine, most", [("native", 1e-13), ("parallel", 1e-13), ("odeint_adjoint", 1e-4)])
+def test_the_gap_of_the_engine_that_trains_has_its_name(engine, most, tmp_path, monkeypatch):
+    seen, scalar = {}, Dashboard.scalar
+    monkeypatch.setattr(
+        Dashboard, "scalar", lambda self, tag, value: seen.update({tag: value}) or scalar(self, tag, value)
+    )
+    run = small_run(tmp_path, episodes=1, engine=engine)
+    gap = run.train()["summary"]["engine_gap"]
+    assert seen == {f"gradient/relative gap of {engine} to autograd, short horizon": gap} and gap < most
+
+
+class Frozen(LinearQuadratic):
+    """Nothing depends on weights: the cost is of the time alone."""
+
+    def running_cost(self, t, state, applied, exogenous):
+        return t + 0.0 * state.sum(-1)
+
+
+def test_a_gradient_of_zero_is_the_same_for_all_engines():
+    plant = Frozen()
+    policy = plant.make_policy(torch.Generator().manual_seed(0))
+    assert engine_gap(plant, plant.make_closure(torch.Generator()), policy, UnseenEpisodes(plant, 2)) == 0.0

@@ -1,9 +1,10 @@
-"""Figures against the numbers they are drawn from, on snapshots of short trainings."""
+"""Figures against the numbers they are drawn from, on snapshots of short trainings and on flights."""
 
 import copy
 import sys
 from dataclasses import replace
 
+import matplotlib.colors
 import numpy as np
 import pytest
 import torch
@@ -12,14 +13,25 @@ from linear_quadratic import LinearClosure, LinearGain, LinearQuadratic
 from matplotlib.axes import Axes
 
 from rt_torchrl import figures
+from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
+from rt_torchrl.envs.pendulum.plant import Pendulum
 from rt_torchrl.envs.wind_turbine import figures as turbine_figures
+from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
+from rt_torchrl.envs.wind_turbine.unknown import unknown
+from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
+from rt_torchrl.figures import flights
 from rt_torchrl.figures.policy import RESOLUTION, visited_observations
 from rt_torchrl.figures.snapshot import Snapshot
+from rt_torchrl.figures.style import ROLES
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.runs.results import episode_record
 from rt_torchrl.steps.config import PlannerConfig
+from rt_torchrl.runs.results import episode_record, results
+from rt_torchrl.runs.results_table import merit_lines
 from rt_torchrl.systems.environment import PlantEnv
+from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 from rt_torchrl.twinning.algorithm import ReinforcementTwinning
 from rt_torchrl.twinning.assimilation import AssimilationConfig
@@ -279,3 +291,121 @@ def test_a_perfect_twin_has_no_residual(oscillator):
     replay = twin.replay(record.states[:1], record.exogenous[None], record.actions[None]).states[0].detach()
     figure = figures.states(replace(oscillator, closure=closure, replay=replay))
     assert [ax.get_title(loc="right") for ax in figure.axes] == ["RMS 0 m", "RMS 0 m/s"]
+
+
+def flown(plant, count=1, n=40):
+    generator = torch.Generator().manual_seed(3)
+    policy = plant.make_policy(generator)
+    start = plant.draw_initial_state(count, generator)
+    with torch.no_grad():
+        return Rollout(plant, plant.closure, policy)(start, plant.draw_exogenous(count, generator)[:, :n])
+
+
+def held(plant, one):
+    return plant.setpoints(one.states[:, :-1], one.actions, one.exogenous)
+
+
+def test_the_turbine_follows_what_its_cost_follows():
+    plant = WindTurbine(horizon=20.0)
+    one = flown(plant, 3)
+    found = held(plant, one)
+    speed, wanted = found["generator speed [rad/s]"]
+    torch.testing.assert_close(speed, 97.0 * one.states[:, :-1, 0])
+    # Of the reference speeds, the greatest is the rated one: 1173.7 rpm.
+    assert wanted.max() <= 122.91 + 0.01 and (wanted <= 122.91 + 0.01).all()
+    power, reference = found["power [MW]"]
+    assert reference.max() <= 5.3 and power.shape == reference.shape == (3, 40)
+
+
+def test_the_tank_holds_500_kPa_and_the_drone_its_target():
+    tank = CryogenicTank(horizon=3000.0)
+    pressure, wanted = held(tank, flown(tank))["pressure [kPa]"]
+    assert (wanted == 500.0).all()
+    torch.testing.assert_close(pressure, 1e-3 * flown(tank).states[:, :-1, 2])
+    drone = FlappingWing(horizon=0.05, target=(2.0, 3.0))
+    found = held(drone, flown(drone))
+    assert [found[name][1].unique().item() for name in ("x [m]", "z [m]")] == [2.0, 3.0]
+    assert held(Pendulum(), flown(Pendulum())) == {}
+
+
+def test_an_extended_plant_has_the_setpoints_of_its_base():
+    base = WindTurbine(horizon=20.0)
+    real = unknown(base, ("pitch",))
+    found = held(real, flown(real))
+    assert list(found) == list(held(base, flown(base)))
+
+
+def test_every_controller_is_drawn_and_the_setpoint_once():
+    plant = WindTurbine(horizon=20.0)
+    one = flown(plant)
+    other = JonkmanController(plant).fly(one.states[:, 0], one.exogenous)
+    figure = flights(plant, {"model_based": one.each()[0], "Jonkman": other.each()[0]})
+    assert len(figure.axes) == 2 + len(plant.actions)
+    labels = [line.get_label() for line in figure.axes[0].lines]
+    assert labels == ["model-based", "setpoint", "Jonkman"]
+    speed = figure.axes[0].lines[2]
+    assert speed.get_ydata() == pytest.approx(97.0 * other.states[0, :-1, 0].numpy())
+    assert matplotlib.colors.same_color(figure.axes[0].lines[0].get_color(), ROLES["model_based"])
+    assert figure.axes[2].lines[0].get_ydata() == pytest.approx(one.actions[0, :, 0].numpy())
+
+
+def test_a_plant_without_setpoints_shows_its_states():
+    plant = Pendulum(horizon=1.0)
+    one = flown(plant, n=plant.n_steps).each()[0]
+    figure = flights(plant, {"model_free": one})
+    assert len(figure.axes) == len(plant.states) + len(plant.actions)
+    assert figure.axes[0].lines[0].get_ydata() == pytest.approx(one.states[:-1, 0].numpy())
+
+
+COUNT = 12
+
+
+def judged(*names):
+    generator = torch.Generator().manual_seed(0)
+    values = {name: torch.rand(2, COUNT, generator=generator, dtype=torch.float64) + 0.1 for name in names}
+    return {name: Judged(costs, {"final distance [m]": 100.0 * merit}) for name, (costs, merit) in values.items()}
+
+
+def test_every_episode_is_a_point_and_every_mean_a_bar():
+    found, strong = judged("model_based", "model_free", "PD"), torch.arange(COUNT) < 3
+    figure = figures.unseen(found, {"weak": ~strong, "strong": strong})
+    draw(figure)
+    assert len(figure.axes) == 2
+    for ax, pick in zip(figure.axes, ("costs", "merit"), strict=True):
+        shown = [line for line in ax.lines if line.get_marker() in ("o", "^") and len(line.get_ydata())]
+        bars = [line for line in ax.lines if line.get_marker() == "None"]
+        for column, (who, values) in enumerate(found.items()):
+            expected = values.control_costs if pick == "costs" else values.merit["final distance [m]"]
+            weak, hard = shown[2 * column : 2 * column + 2]
+            assert np.array_equal(weak.get_ydata(), expected[3:]) and np.array_equal(hard.get_ydata(), expected[:3])
+            assert np.allclose(bars[column].get_ydata(), expected.mean().item()), who
+            assert (np.abs(weak.get_xdata() - column) < 0.3).all()
+    assert {text.get_text() for text in figure.legends[0].get_texts()} == {"weak", "strong"}
+
+
+def test_names_of_four_controllers_do_not_meet():
+    figure = figures.unseen(judged("model_based", "model_free", "on-off", "Jonkman"), {})
+    draw(figure)
+    assert not collisions(figure)
+
+
+def test_kinds_of_episodes_are_counted_and_averaged_apart():
+    plant = FlappingWing(horizon=2.0)
+    unseen = UnseenEpisodes(plant, COUNT)
+    unseen.exogenous = torch.full_like(unseen.exogenous, 1.0)
+    # Too strong in the last second of three episodes; strong, but early enough, in a fourth.
+    unseen.exogenous[:3, -10:] = plant.strongest_wind + 0.01
+    unseen.exogenous[3, :100] = 9.0
+    found = judged("model_based", "model_free")
+    apart = results(unseen, found)["categories"]
+    assert {kind: part["episodes"] for kind, part in apart.items()} == {
+        "gust can be held": 9,
+        "gust too strong to hold": 3,
+    }
+    strong = apart["gust too strong to hold"]["model_free"]
+    assert np.isclose(strong["J_a"]["mean"], found["model_free"].control_costs[:3].mean().item())
+    median = found["model_free"].merit["final distance [m]"][:3].median().item()
+    assert strong["merit"]["final distance [m]"]["median"] == median
+    lines = merit_lines({"episodes": COUNT, **results(unseen, found)})
+    assert any("gust too strong to hold, 3 of 12 episodes" in line for line in lines)
+    assert sum("final distance" in line for line in lines) == 3

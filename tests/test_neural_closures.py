@@ -16,7 +16,7 @@ from torch.nn.utils import parameters_to_vector
 from rt_torchrl.envs.cryogenic_tank.plant import CryogenicTank
 from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.closure_error import rms_error, visited_features
+from rt_torchrl.evaluation.checks import rms_error, visited_features
 from rt_torchrl.plants.closures import BoundedPerceptron
 from rt_torchrl.runs.command_line import main_of
 from rt_torchrl.trajectories.engines.interval import Interval

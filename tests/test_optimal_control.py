@@ -1,4 +1,4 @@
-"""Optimal commands, behind rate limits as well: quadratic programs, Riccati's equation and central differences."""
+"""Optimal commands, behind rate limits as well, and their cost: quadratic programs, Riccati, rollouts, differences."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,13 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, descend, projected_gradient
 from rt_torchrl.control.forecasts import Foreseen
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig, RecedingHorizon, RecedingHorizonConfig, descend
+from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
 from rt_torchrl.envs.wind_turbine.controllers import JonkmanController
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_starts
-from rt_torchrl.plants.signal import Signal
+from rt_torchrl.evaluation.clairvoyant import RelaxedCost, clairvoyant, constant_starts, held_back, random_start
+from rt_torchrl.plants.signal import Signal, bounds
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.systems.safety import SafetyConfig, SafetyLayer
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -80,7 +81,7 @@ def test_the_clairvoyant_optimum_is_that_of_a_quadratic_program(kind):
     plant = kind(horizon=4.0, noise=0.5)
     state, exogenous = episodes(plant, 3)
     starts = constant_starts(plant, 3, plant.n_steps)
-    starts |= random_starts(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1), count=2)
+    starts["random"] = random_start(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
     found = clairvoyant(plant, state, exogenous, starts, config=BoundedDescentConfig(tolerance=0.0))
     saturated = 0
     for episode in range(3):
@@ -165,9 +166,9 @@ def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
     P = solve_discrete_are(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     value = torch.from_numpy(P * plant.dt)
-    config = RecedingHorizonConfig(horizon=0.3, tolerance=0.0, iterations=200)
-    terminal = lambda end: ((end @ value) * end).sum(-1)  # noqa: E731
-    controller = RecedingHorizon(plant, plant.closure, config, terminal=terminal)
+    config = PredictiveConfig(horizon=0.3, tolerance=0.0, iterations=200)
+    tail = lambda t, end, exogenous: ((end @ value) * end).sum(-1)  # noqa: E731
+    controller = RecedingHorizon(plant, plant.closure, config, tail=tail)
     state = torch.tensor([[0.5, -0.3], [-0.2, 0.6]], dtype=torch.float64)
     flown = controller.fly(state, torch.zeros(2, plant.n_steps, 1, dtype=torch.float64))
     s = state.numpy().T
@@ -180,7 +181,7 @@ def test_a_horizon_with_riccatis_cost_is_the_linear_quadratic_regulator():
 def test_a_preview_until_the_end_is_the_clairvoyant_optimum():
     plant = LinearQuadratic(horizon=3.0, noise=0.5)
     state, exogenous = episodes(plant, 2)
-    config = RecedingHorizonConfig(horizon=3.0, period=0.5, ends=True, tolerance=0.0, iterations=300)
+    config = PredictiveConfig(horizon=3.0, period=0.5, ends=True, tolerance=0.0, iterations=300)
     controller = RecedingHorizon(plant, plant.closure, config, forecast=Foreseen(exogenous, dt=plant.dt))
     costs = control_cost(plant, controller.fly(state, exogenous))
     for episode, cost in enumerate(costs.tolist()):
@@ -191,7 +192,7 @@ def test_a_preview_until_the_end_is_the_clairvoyant_optimum():
 def test_acting_interval_by_interval_is_flying():
     plant = LinearQuadratic(horizon=2.0, noise=0.5)
     state, exogenous = episodes(plant, 2)
-    controller = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=1.0, period=0.4, hold=0.2))
+    controller = RecedingHorizon(plant, plant.closure, PredictiveConfig(horizon=1.0, period=0.4, hold=0.2))
     flown = controller.fly(state, exogenous)
     controller.begin()
     for k in range(plant.n_steps):
@@ -202,7 +203,7 @@ def test_acting_interval_by_interval_is_flying():
 def test_late_solves_leave_the_last_plan():
     plant = LinearQuadratic(horizon=2.0, noise=0.5)
     state, exogenous = episodes(plant, 1)
-    config = RecedingHorizonConfig(horizon=1.0, period=0.2, deadline=1e-9)
+    config = PredictiveConfig(horizon=1.0, period=0.2, deadline=1e-9)
     late = RecedingHorizon(plant, plant.closure, config)
     first = late.plan(0.0, state, exogenous[:, 0])
     second = late.plan(0.2, state, exogenous[:, 2])
@@ -218,7 +219,7 @@ def test_it_acts_on_a_real_system_behind_a_safety_layer_in_time():
     plant = LinearQuadratic(horizon=3.0, noise=0.5)
     config = SafetyConfig(interval=plant.dt, deadline=5.0, rates=(100.0,))
     system = SafetyLayer(PlantEnv(plant, seed=4), config, fallback=(0.0,))
-    controller = RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(horizon=1.0, deadline=5.0))
+    controller = RecedingHorizon(plant, plant.closure, PredictiveConfig(horizon=1.0, deadline=5.0))
     entries = system.reset()
     start, states, inputs, applied = entries["state"], [], [], []
     for k in range(plant.n_steps):
@@ -241,14 +242,13 @@ def test_it_acts_on_a_real_system_behind_a_safety_layer_in_time():
         ({"horizon": 1.0, "hold": 0.2, "period": 0.3}, "period=0.3 s must be a whole multiple of 0.2 s"),
         ({"horizon": 1.0, "period": 2.0}, "period=2.0 s must not be longer than horizon=1.0 s"),
         ({"horizon": -1.0}, "horizon=-1.0 s of the receding horizon must be positive"),
-        ({"horizon": 1.0, "penalty": -1.0}, "penalty=-1.0"),
         ({"horizon": 1.0, "iterations": 0}, "iterations=0"),
     ],
 )
 def test_impossible_horizons_are_refused(options, message):
     plant = LinearQuadratic()
     with pytest.raises(ValueError, match=message):
-        RecedingHorizon(plant, plant.closure, RecedingHorizonConfig(**options))
+        RecedingHorizon(plant, plant.closure, PredictiveConfig(**options))
 
 
 class RateLimited(LinearQuadratic):
@@ -299,7 +299,7 @@ def test_the_optimum_is_that_of_a_quadratic_program_in_the_rates():
     plant = RateLimited(horizon=4.0, noise=0.5)
     state, exogenous = limited_episodes(plant, 3)
     starts = {"constant": constant_starts(plant, 3, plant.n_steps)["constant 0.25"]}
-    starts |= random_starts(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
+    starts["random"] = random_start(plant, 3, plant.n_steps, generator=torch.Generator().manual_seed(1))
     config = BoundedDescentConfig(iterations=2000, tolerance=0.0)
     found = clairvoyant(plant, state, exogenous, starts, config=config)
     limited = 0
@@ -348,3 +348,113 @@ def test_the_gradient_is_that_of_central_differences_before_and_after_a_charge()
 def test_only_actuators_with_limits_hold_commands_back():
     for plant, limited in ((LinearQuadratic(), False), (RateLimited(), True)):
         assert held_back(plant, plant.draw_initial_state(2, torch.Generator().manual_seed(0))) == limited
+
+
+class Untraceable(LinearQuadratic):
+    """A plant whose running cost leaves torch."""
+
+    def running_cost(self, t, state, applied, exogenous):
+        assert state.isfinite().all().item()
+        return super().running_cost(t, state, applied, exogenous)
+
+
+def by_rollout(plant, unit, state, exogenous, *, hold, penalty, start=0.0, terminal=None):
+    """J and its gradient by autograd through every step."""
+    low, high = bounds(plant.actions)
+    u = torch.from_numpy(unit).clone().requires_grad_()
+    command = (low + (high - low) * u).repeat_interleave(hold, 1)[:, : exogenous.shape[1]]
+    flown = Rollout(plant, constant(plant.closure), engine="autograd")(state, exogenous, command, start=start)
+    t = start + plant.dt * torch.arange(exogenous.shape[1], dtype=torch.float64)
+    cost = plant.running_cost(t, flown.states[:, :-1], flown.actions, exogenous).mean(-1)
+    cost = cost + penalty * ((command - flown.actions) / (high - low)).square().sum(-1).mean(-1)
+    if terminal is not None:
+        cost = cost + terminal(flown.states[:, -1]) / (exogenous.shape[1] * plant.dt)
+    return cost.detach().numpy(), torch.autograd.grad(cost.sum(), u)[0].numpy()
+
+
+@pytest.mark.parametrize("hold, n, batch, terminal", [(1, 12, 1, False), (5, 12, 11, False), (4, 9, 3, True)])
+@pytest.mark.parametrize("kind", [WindTurbine, LinearQuadratic, Untraceable])
+def test_cost_and_gradient_are_those_of_a_rollout(kind, hold, n, batch, terminal):
+    plant, generator = kind(), torch.Generator().manual_seed(3)
+    state, exogenous = plant.draw_initial_state(batch, generator), plant.draw_exogenous(batch, generator)[:, :n]
+    value = (lambda end: 0.3 * end[:, 0] ** 2 + end[:, 1]) if terminal else None
+    cost = CommandCost(plant, constant(plant.closure), hold=hold, penalty=0.7, terminal=value)
+    unit = np.random.default_rng(0).random((batch, cost.blocks(n), len(plant.actions)))
+    for start in (0.0, 40.0):  # a second window uses the arrays of the first
+        cost.begin(state, exogenous, start=start)
+        found = cost(unit)
+        wanted = by_rollout(plant, unit, state, exogenous, hold=hold, penalty=0.7, start=start, terminal=value)
+        for one, other in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
+
+
+def test_commands_beyond_a_rate_limit_have_a_gradient():
+    plant, generator = WindTurbine(), torch.Generator().manual_seed(0)
+    state, exogenous = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, :2]
+    unit = np.full((1, 2, 2), 1.0)  # both actuators start far below, at their last actions
+    gradients = {}
+    for penalty in (0.0, 1.0):
+        cost = CommandCost(plant, constant(plant.closure), penalty=penalty)
+        cost.begin(state, exogenous)
+        gradients[penalty] = cost(unit)[1]
+    # The torque of the second interval is within its limit; all others are beyond.
+    assert (gradients[0.0][0][0] == 0.0).all() and gradients[0.0][0][1, 1] == 0.0
+    assert (gradients[1.0][0] > 0.0).all()
+
+
+def test_commands_and_units_are_each_others_inverse():
+    plant = WindTurbine()
+    cost = CommandCost(plant, constant(plant.closure), hold=3)
+    unit = np.random.default_rng(1).random((2, 4, 2))
+    commands = cost.commands(unit, 11)
+    assert commands.shape == (2, 11, 2)
+    np.testing.assert_allclose(commands[:, 2, 0].numpy(), 43_093.55 * unit[:, 0, 0], rtol=1e-14)
+    np.testing.assert_allclose(cost.units(commands), unit, atol=1e-15)
+
+
+def test_a_cost_without_finite_ranges_is_refused():
+    plant = LinearQuadratic()
+    plant.actions = (Signal(symbol="a", name="force", unit="N"),)
+    with pytest.raises(ValueError, match="force of plant 'linear_quadratic' have no finite range"):
+        CommandCost(plant, plant.closure)
+    for argument, value in (("hold", 0), ("penalty", -1.0)):
+        with pytest.raises(ValueError, match=f"{argument}={value}"):
+            CommandCost(LinearQuadratic(), plant.closure, **{argument: value})
+
+
+def test_the_descent_solves_a_bounded_least_squares_problem():
+    rng = np.random.default_rng(0)
+    matrix, target = rng.normal(size=(30, 12)), 3.0 * rng.normal(size=30)
+    wanted = lsq_linear(matrix, target, bounds=(0.0, 1.0), tol=1e-14)
+    assert (wanted.active_mask != 0).any() and (wanted.active_mask == 0).any()
+
+    def evaluate(point):
+        rest = matrix @ point[0] - target
+        return 0.5 * float(rest @ rest), (matrix.T @ rest)[None]
+
+    found = descend(evaluate, np.full((1, 12), 0.5), BoundedDescentConfig(tolerance=0.0))
+    np.testing.assert_allclose(found.point[0], wanted.x, atol=1e-6)
+    np.testing.assert_allclose(found.cost, wanted.cost, rtol=1e-10)
+    assert projected_gradient(found.point, found.gradient)[0] < 1e-5 < np.linalg.norm(found.gradient)
+
+
+def test_a_descent_goes_round_points_where_the_cost_is_not_finite():
+    def evaluate(point):
+        x = float(point[0])
+        with np.errstate(invalid="ignore"):
+            return float((x - 0.7) ** 2 - 0.01 * np.sqrt(0.8 - x)), np.array(
+                [2.0 * (x - 0.7) + 0.005 / np.sqrt(0.8 - x)]
+            )
+
+    found = descend(evaluate, np.array([0.1]), BoundedDescentConfig())
+    x = np.linspace(0.0, 0.8, 80_001)
+    np.testing.assert_allclose(found.point, x[np.argmin((x - 0.7) ** 2 - 0.01 * np.sqrt(0.8 - x))], atol=1e-4)
+    with pytest.raises(FloatingPointError, match="at the start"):
+        descend(evaluate, np.array([0.9]), BoundedDescentConfig())
+
+
+@pytest.mark.parametrize("option", [{"iterations": 0}, {"memory": 0}, {"tolerance": -1.0}, {"gradient": -1.0}])
+def test_impossible_descents_are_refused(option):
+    ((name, value),) = option.items()
+    with pytest.raises(ValueError, match=f"{name}={value}"):
+        BoundedDescentConfig(**option)

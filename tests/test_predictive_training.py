@@ -85,7 +85,7 @@ def test_what_it_plans_on_is_the_twins_closure():
     before = algorithm.twin.closure.matrix.detach().clone()
     algorithm.episode()
     assert controller.closure is algorithm.twin.closure and not torch.equal(before, controller.closure.matrix)
-    assert controller.time.isfinite().all()
+    assert controller.forecast.time.isfinite().all()
     assert torch.equal(run.initial_policies["model_based"].closure.matrix, before)
     run._held.release()
 

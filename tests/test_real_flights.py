@@ -15,9 +15,8 @@ from test_classical import PD
 from test_real_system import Rig, connected
 from torch.nn.utils import parameters_to_vector
 
-from rt_torchrl.evaluation.baseline import RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
+from rt_torchrl.evaluation.unseen import RealController, TwinEpisodes
 from rt_torchrl.plants.actuators import LaggedActuator
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig

@@ -11,8 +11,8 @@ from small_runs import SMALL
 from test_optimal_control import quadratic_program
 
 from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.evaluation.limits import LimitConfig, fitting, flown_starts, resting_at_the_end
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.limits import LimitConfig, exact_optimum, fitting, flown_starts, resting_at_the_end
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.results_table import results_table
 from rt_torchrl.runs.run import Run
 from rt_torchrl.runs.run_config import RunConfig

@@ -169,13 +169,13 @@ def test_single_precision_module(table):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"tip_speed_ratio": LAM[::-1]}, r"tip_speed_ratio goes from 8.0 to 7.5.*increase"),
+        ({"tip_speed_ratio": LAM[::-1]}, r"tip_speed_ratio=\[8.0, 7.5,.*increase strictly"),
         ({"tip_speed_ratio": LAM - 2.0}, r"tip_speed_ratio starts at 0.0.*positive"),
-        ({"tip_speed_ratio": LAM[:3]}, r"tip_speed_ratio has shape \(3,\).*at least 4"),
-        ({"pitch": [-2.0, 0.0, np.nan, 4.0, 9.0]}, r"pitch\[2\]=nan deg must be finite"),
-        ({"pitch": [-2.0, 0.0, 0.0, 4.0, 9.0]}, r"pitch goes from 0.0 to 0.0 deg.*duplicates"),
+        ({"tip_speed_ratio": LAM[:3]}, r"tip_speed_ratio=\[.*must be at least 4"),
+        ({"pitch": [-2.0, 0.0, np.nan, 4.0, 9.0]}, r"pitch=\[-2.0, 0.0, nan, 4.0, 9.0\] must be at least 4 finite"),
+        ({"pitch": [-2.0, 0.0, 0.0, 4.0, 9.0]}, r"pitch=\[-2.0, 0.0, 0.0,.*duplicates"),
         ({"values": np.zeros((5, 6))}, r"values has shape \(5, 6\).*\(6, 5\).*transpose"),
-        ({"values": np.full((6, 5), np.inf)}, r"values\[0, 0\]=inf must be finite"),
+        ({"values": np.full((6, 5), np.inf)}, r"values reaches inf, but C_p must be finite"),
         ({"values": np.full((6, 5), 46.6)}, r"values reaches 46.6.*16/27.*per cent"),
     ],
 )
@@ -189,8 +189,8 @@ def test_refuses_bad_tables(change, message):
     "text, message",
     [
         ("# nothing\n", "holds 0 rows"),
-        ("x,0,1,2,3\n2,0,0,0,0\n3,0,0,0\n", r"rows of \[4, 5\] entries under a header of 5"),
-        ("x,0,1,2,3\n2,0,0,zero,0\n", "'zero'.*must hold numbers"),
+        ("x,0,1,2,3\n2,0,0,0,0\n3,0,0,0\n", r"table.csv.*under a header of 5 entries"),
+        ("x,0,1,2,3\n2,0,0,zero,0\n", "'zero'.*under a header of 5 entries every row must hold as many numbers"),
     ],
 )
 def test_refuses_bad_files(tmp_path, text, message):

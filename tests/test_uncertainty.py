@@ -142,9 +142,6 @@ def test_the_band_of_a_line_is_that_of_regression():
     deviation = np.sqrt(np.einsum("pi,ij,pj->p", features, exact_covariance(), features))
     np.testing.assert_allclose(0.5 * (drawn.high - drawn.low).numpy(), 1.959964 * deviation, rtol=1e-5)
     assert drawn.covers(drawn.middle) == 1.0 and drawn.covers(drawn.high + 1.0) == 0.0
-    figure = charts.curve(drawn, xlabel="wind", ylabel="slope", data=np.array([1.0, -2.0]), true=drawn.middle.numpy())
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["95 % interval", "twin", "true", "data"]
 
 
 class Curve(nn.Module):
@@ -181,17 +178,14 @@ def test_the_band_of_a_perceptron_widens_where_no_data_was():
     assert 1e-6 < found.stiffness < 1e8 and found.stiffness != 1.0
 
 
-def test_figures_of_regions_show_every_pair():
+def test_the_figure_of_correlations_names_every_weight():
     plant, sensors, records = room_records(lengths=(150,))
     closure = Envelope(Envelope.true().coefficients)
     found = Estimation(DigitalTwin(plant, closure), sensors).run(records).uncertainty
     shown = charts.correlations(found).axes[0]
     assert [label.get_text() for label in shown.get_xticklabels()] == list(Envelope.names)
-    figure = charts.ellipses(found)
-    drawn = [ax for ax in figure.axes if ax.lines]
-    assert len(drawn) == 3 and drawn[0].lines[1].get_xdata()[0] == pytest.approx(found.values[0].item())
-    (without,) = charts.ellipses(line_estimate(winds=(0.0,)).uncertainty).axes
-    assert len(without.lines) == 1  # the estimate, as one of the two values has no end
+    R = found.correlations()
+    assert [text.get_text() for text in shown.texts] == [f"{value:.2f}" for value in R.flatten().tolist()]
 
 
 def test_what_makes_no_region_is_refused():

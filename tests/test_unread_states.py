@@ -11,7 +11,8 @@ from test_classical import PD
 
 from rt_torchrl import export_c, load_run
 from rt_torchrl.control.predictive_control import PredictiveConfig, PredictiveControl
-from rt_torchrl.evaluation.unseen import UnseenEpisodes, exact_optimum, mean_with_confidence
+from rt_torchrl.evaluation.limits import exact_optimum
+from rt_torchrl.evaluation.unseen import UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.actuators import ResonantActuator
 from rt_torchrl.plants.sensors import BiasedSensor
 from rt_torchrl.runs.run import Run

@@ -18,6 +18,8 @@ STATES = (
 )
 PUMP = Signal(symbol="u", name="pump_voltage", unit="V", low=0.0, high=7.0)
 WANTED = Signal(symbol="r", name="set_point", unit="V", low=0.0, high=10.0)
+PUMP_WEIGHT = 0.01
+"""Weight in J_a of the squared voltage from 3 V."""
 GREATEST_READING = 10.0
 """Reading of the level sensor at its end [V]."""
 
@@ -61,11 +63,10 @@ class CascadedTanks(Plant):
         horizon: length of an episode T_o [s].
         closure: closure of the real tanks, from (h_1, h_2, u) to the rates of the levels; None for hydraulics as they
             were identified from the benchmark.
-        pump_weight: weight of the squared voltage from 3 V in J_a.
         observe: names of measurements and observation sets.
 
     Raises:
-        ValueError: if the weight is negative, or there is no such measurement.
+        ValueError: if there is no such measurement.
 
     Source: Schoukens and Noël, Three benchmarks addressing open challenges in nonlinear system identification, IFAC
     2017.
@@ -93,14 +94,10 @@ class CascadedTanks(Plant):
         dt: float = 4.0,
         horizon: float = 2048.0,
         closure: nn.Module | None = None,
-        pump_weight: float = 0.01,
         observe: Sequence[str] = (),
     ):
         law = Hydraulics.true() if closure is None else closure
         super().__init__(dt=dt, horizon=horizon, closure=law, observe=observe)
-        if not pump_weight >= 0.0:
-            raise ValueError(f"pump_weight={pump_weight} of plant {self.name!r} must not be negative.")
-        self.pump_weight = float(pump_weight)
 
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """Rates of the levels.
@@ -119,7 +116,7 @@ class CascadedTanks(Plant):
     def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         """The squared error of the lower level [V²], and a little of the squared voltage."""
         error = state[..., 1] - exogenous[..., 0]
-        return error**2 + self.pump_weight * (applied[..., 0] - 3.0) ** 2
+        return error**2 + PUMP_WEIGHT * (applied[..., 0] - 3.0) ** 2
 
     discrepancy_scales = (math.inf, 1.0)
     """L_p is half the squared error of the lower level [V²]."""

@@ -6,38 +6,19 @@ from typing import Any, cast
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients
 from rt_torchrl.envs.cryogenic_tank.plant import BAND, GREATEST_DROP, CryogenicTank
-from rt_torchrl.evaluation.closure_error import visited_features
-from rt_torchrl.figures.animation import Trace, TracedScene, save_scene
-from rt_torchrl.figures.learning import closure_weights, tracked_weights
+from rt_torchrl.evaluation.checks import visited_features
+from rt_torchrl.figures import style
+from rt_torchrl.figures.animation import Scene, Show, Trace
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import (
-    FILTERED,
-    LARGE_SCALE,
-    LIMIT_LINE,
-    REAL,
-    REFERENCE,
-    REFERENCE_LINE,
-    SAMPLES,
-    TWIN,
-    array,
-    caption,
-    closure_look,
-    closures,
-    draw_groups,
-    last_episode,
-    legend_above,
-    legend_below,
-    means_of_groups,
-    panels,
-    time_axis,
-    twin_label,
-    veil,
-)
+from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
+from rt_torchrl.figures.training import closure_weights, tracked_weights
 
 POINTS = 720
 """Greatest number of groups of samples in a drawn record: in five days, ten minutes each, a ninth of an orbit."""
@@ -74,33 +55,31 @@ def tank(snapshot: Snapshot) -> Figure:
     plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
     real = _quantities(plant, record.states, record.actions, plant.closure)
     twin = _quantities(plant, snapshot.replay, record.actions, snapshot.closure)
-    time, label = time_axis(plant, len(record.actions))
-    group = -(-len(time) // POINTS)
+    group = -(-len(record.actions) // POINTS)
     note = f"\nmean and range of every {group * plant.dt / 60.0:g} min" if group > 1 else ""
-    title = f"Tank, episode {last_episode(snapshot)}{note}"
-    figure, axes = panels(len(real) + 1, title=title, size=(9.5, 12.0), sharex=True)
+    title = f"Tank, episode {style.last_episode(snapshot)}{note}"
+    figure, axes, time = style.timeline(plant, len(record.actions), len(real) + 1, title=title, size=(9.5, 12.0))
+    time, (*of_tank, load) = time[:-1], axes
     target, half = 1e-3 * plant.set_point, 1e-3 * BAND
-    band = {"color": REFERENCE, "alpha": 0.13, "linewidth": 0, "label": rf"$\pm${half:g} kPa"}
-    axes[0, 0].axhspan(target - half, target + half, **band)
-    axes[0, 0].axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
-    for ax, (name, values) in zip(axes.flat, real.items(), strict=False):
-        draw_groups(ax, time, array(values), group, linewidth=1.5, label="_range")
+    band = {"color": style.REFERENCE, "alpha": 0.13, "linewidth": 0, "label": rf"$\pm${half:g} kPa"}
+    axes[0].axhspan(target - half, target + half, **band)
+    axes[0].axhline(target, label=r"set point $\tilde p$", **REFERENCE_LINE)
+    for ax, (name, values) in zip(of_tank, real.items(), strict=True):
+        style.draw_groups(ax, time, array(values), group, linewidth=1.5, label="_range")
         low, high = ax.get_ylim()
-        middle, mean = means_of_groups(group, time, array(twin[name]))
-        ax.plot(middle, mean, color=TWIN, linewidth=0.9, label=twin_label(snapshot))
+        middle, mean = style.means_of_groups(group, time, array(twin[name]))
+        ax.plot(middle, mean, color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         height = high - low
         ax.set_ylim(max(min(low, mean.min()), low - height), min(max(high, mean.max()), high + height))
         caption(ax, name)
-    load = axes[-1, 0]
-    draw_groups(load, time, array(record.exogenous[:, 0]), group, linewidth=1.5, label="_range")
+    style.draw_groups(load, time, array(record.exogenous[:, 0]), group, linewidth=1.5, label="_range")
     if snapshot.large_scale is not None:
         mean = array(snapshot.large_scale[:, 0])
-        load.plot(*means_of_groups(group, time, mean), color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
-        legend_above(load)
+        look: dict[str, Any] = {"color": style.LARGE_SCALE, "linewidth": 1.0, "label": "large scale (SVR)"}
+        load.plot(*style.means_of_groups(group, time, mean), **look)
+        style.legend_above(load)
     caption(load, plant.inputs[0].label)
-    load.set_xlabel(label)
-    load.set_xlim(0.0, time[-1] + time[1])
-    legend_below(figure, [axes[0, 0]])
+    style.legend_below(figure, axes[:1])
     return figure
 
 
@@ -132,25 +111,24 @@ def heat_exchanger(snapshot: Snapshot) -> Figure:
     drop = plant.actions[0].high * torch.linspace(0.0, 1.0, 201, **like) ** 2
     state = plant.state_at(torch.full_like(drop, plant.set_point))
     title = f"Heat exchanger at the set point, {1e-3 * plant.set_point:g} kPa"
-    figure, axes = panels(3, title=title, size=(7.5, 8.0), sharex=True, height_ratios=(2.0, 2.0, 1.0))
-    heat, held, share = axes.flat
-    for name, closure in closures(snapshot).items():
-        look, action = closure_look(name), drop[:, None]
+    label, size = r"pressure drop $\Delta p_V$ [kPa]", (7.5, 8.0)
+    figure, (heat, held, share) = style.grid(3, title=title, size=size, xlabel=label, height_ratios=(2.0, 2.0, 1.0))
+    for name, closure in style.closures(snapshot).items():
+        look, action = style.closure_look(name), drop[:, None]
         heat.plot(1e-3 * array(drop), array(plant.vent(state, action, closure).heat), **look)
         held.plot(1e-3 * array(drop), array(plant.held_load(state, action, closure)), **look)
     mean = record.exogenous.mean().item()
-    held.axhline(mean, label="mean load of the last episode", **LIMIT_LINE)
+    held.axhline(mean, label="mean load of the last episode", **style.LIMIT_LINE)
     visited = 1e-3 * array(_drop(plant, record.states[:-1], record.actions))
     for ax in (heat, held):
-        veil(ax, kilopascal := 1e-3 * array(drop), (kilopascal >= visited.min()) & (kilopascal <= visited.max()))
+        style.veil(ax, kilopascal := 1e-3 * array(drop), (kilopascal >= visited.min()) & (kilopascal <= visited.max()))
     weight = np.full(len(visited), 100.0 / len(visited))
     share.hist(visited, np.linspace(0.0, 1e-3 * plant.actions[0].high, 41), weights=weight, color=SAMPLES)
     caption(heat, "heat taken by the exchanger $Q_{HX}$ [W]")
     caption(held, "load at which the pressure stands still [W]", f"mean load {mean:.3g} W")
     caption(share, "share of the last episode [%] per 5 kPa")
-    share.set_xlabel(r"pressure drop $\Delta p_V$ [kPa]")
     share.set_xlim(0.0, 1e-3 * plant.actions[0].high)
-    legend_below(figure, [held])
+    style.legend_below(figure, [held])
     return figure
 
 
@@ -174,8 +152,8 @@ def coefficients(snapshot: Snapshot) -> Figure:
         ("wall-fluid difference [mK]", 1e3 * plant.superheat_unit),
         ("valve drop [kPa]", 1e-3 * GREATEST_DROP),
     )
-    title = f"Coefficients, episode {last_episode(snapshot)}\nother features at their mean in the episode"
-    figure, axes = panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")
+    title = f"Coefficients, episode {style.last_episode(snapshot)}\nother features at their mean in the episode"
+    figure, axes = style.panels(3, 4, title=title, size=(13.0, 8.0), sharex="col", sharey="row")
     for column, (label, unit) in enumerate(axes_of):
         low, high = seen[:, column].min(), seen[:, column].max()
         reach = 0.5 * (high - low).clamp(min=1e-6)
@@ -183,15 +161,15 @@ def coefficients(snapshot: Snapshot) -> Figure:
         ends = (low - reach).item(), (high + reach).item()
         points[:, column] = torch.linspace(*ends, 121, dtype=seen.dtype, device=seen.device)
         x, inside = unit * points[:, column], (points[:, column] >= low) & (points[:, column] <= high)
-        for name, closure in closures(snapshot).items():
+        for name, closure in style.closures(snapshot).items():
             for ax, values, (_, factor) in zip(axes[:, column], closure(points).T, LABELS.values(), strict=True):
-                ax.plot(array(x), factor * array(values), **closure_look(name))
+                ax.plot(array(x), factor * array(values), **style.closure_look(name))
         for ax, (name, _) in zip(axes[:, column], LABELS.values(), strict=True):
             ax.set_yscale("log")
-            veil(ax, array(x), array(inside))
+            style.veil(ax, array(x), array(inside))
             caption(ax, name if column == 0 else "")
         axes[-1, column].set_xlabel(label)
-    legend_below(figure, [axes[0, 0]])
+    style.legend_below(figure, [axes[0, 0]])
     return figure
 
 
@@ -222,11 +200,11 @@ def vent_path(snapshot: Snapshot) -> Figure:
     # The heights end where CoolProp's saturation solver is still sure to succeed.
     heights = np.linspace(PropsSI("Ttriple", fluid), PropsSI("Tcrit", fluid) - 0.01, 300)
     left, right = (1e-3 * PropsSI("S", "T", heights, "Q", quality, fluid) for quality in (0.0, 1.0))
-    title = f"Path of the vented {fluid.lower()}, episode {last_episode(snapshot)}"
+    title = f"Path of the vented {fluid.lower()}, episode {style.last_episode(snapshot)}"
     title += rf", mean of the last {len(states) * plant.dt / 3600.0:g} h" + "\n"
     title += rf"$p$ = {1e-3 * p:.4g} kPa, $\Delta p_V$ = {1e-3 * (p - p_1):.3g} kPa, "
     title += rf"$T - T_1$ = {T_1 - T_3:.3g} K, $\Delta h_c$ = {1e-3 * (h_3 - h_1):.4g} kJ/kg"
-    figure, ((whole, near),) = panels(1, 2, title=title, size=(11.0, 5.0), width_ratios=(1.0, 1.3))
+    figure, ((whole, near),) = style.panels(1, 2, title=title, size=(11.0, 5.0), width_ratios=(1.0, 1.3))
     for ax, part in ((whole, "whole dome"), (near, "around the vent")):
         ax.plot([*left, *right[::-1]], [*heights, *heights[::-1]], color="0.55", linewidth=1.3, label="saturation")
         ax.axhline(T_1, label="liquid in the tank", **REFERENCE_LINE)
@@ -242,7 +220,7 @@ def vent_path(snapshot: Snapshot) -> Figure:
     near.ticklabel_format(axis="y", useOffset=False)
     for (name, T, offset), x in zip((("1", T_1, (8, 7)), ("2", T_3, (8, -14)), ("3", T_3, (6, -14))), s, strict=False):
         near.annotate(name, (x, T), offset, textcoords="offset points", fontsize=11)
-    legend_below(figure, [near])
+    style.legend_below(figure, [near])
     return figure
 
 
@@ -263,64 +241,53 @@ def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     Raises:
         ValueError: if the file has another suffix.
     """
-    return save_scene(_Scene(snapshot), len(snapshot.record.actions), path)
+    return scene(snapshot).save(len(snapshot.record.actions), path)
 
 
-class _Scene(TracedScene):
+@torch.no_grad()
+def scene(snapshot: Snapshot) -> Scene:
     """The picture at the start of any interval of the record."""
+    plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
+    state = record.states[:-1]
+    pressure, fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
+    flow, load = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow), array(record.exogenous[:, 0])
+    time, label = style.time_axis(plant, len(state))
+    unit = label.removeprefix("time [").removesuffix("]")
 
-    @torch.no_grad()
-    def __init__(self, snapshot: Snapshot):
-        plant, record = cast(CryogenicTank, snapshot.plant), snapshot.record
-        state, n = record.states[:-1], len(record.actions)
-        super().__init__(snapshot, 3, title="Cryogenic tank", size=(9.0, 5.2), width_ratios=(1.0, 1.5))
-        self.pressure, self.fill = 1e-3 * array(state[:, 2]), array(state[:, 1]) / plant.volume
-        self.flow = 1e3 * array(plant.vent(state, record.actions, plant.closure).flow)
-        self.load = array(record.exogenous[:, 0])
-        self._draw_tank()
-        held = np.full(n, 1e-3 * plant.set_point)
-        above, middle, below = self.beside
-        thin = {"linewidth": 0.8}
-        self.traces = [
-            Trace(above, self.time, self.pressure, "pressure $p$ [kPa]", setpoint=held),
-            Trace(middle, self.time, self.flow, r"vent flow $\dot m_c$ [g/s]", style=thin | {"color": SAMPLES}),
-            Trace(below, self.time, self.load, plant.inputs[0].label, style=thin | {"color": TWIN}),
-        ]
-
-    def _draw_tank(self) -> None:
-        ax = self.ax
+    def draw(ax: Axes) -> tuple[list[Artist], Show]:
         ax.set(xlim=(-1.9, 1.9), ylim=(-1.3, 2.3), aspect="equal")
         ax.axis("off")
-        round_ = np.linspace(0.0, 2.0 * np.pi, 181)
-        self.wall = np.stack([np.cos(round_), np.sin(round_)], -1)
-        (self.liquid,) = ax.fill([0.0], [0.0], color=FILTERED, alpha=0.8)
-        (self.shell,) = ax.plot(*self.wall.T, color=REAL, linewidth=3.0)
+        around = np.linspace(0.0, 2.0 * np.pi, 181)
+        (liquid,) = ax.fill([0.0], [0.0], color=style.FILTERED, alpha=0.8)
+        (shell,) = ax.plot(np.cos(around), np.sin(around), color=REAL, linewidth=3.0)
         ax.plot([0.0, 0.0], [1.0, 1.35], color=REAL, linewidth=3.0)
-        (self.valve,) = ax.plot([0.0], [1.35], marker="D", color=REAL, markersize=8)
-        (self.puffs,) = ax.plot([], [], "o", color="0.7", markersize=5, alpha=0.8)
-        self.arrow = ax.quiver(
-            [-1.75], [0.0], [0.0], [0.0], color=TWIN, angles="xy", scale_units="xy", scale=1.0, width=0.02
-        )
-        self.note = ax.text(-1.85, -1.25, "", fontsize=9)
-        self.own += [self.liquid, self.shell, self.valve, self.puffs, self.arrow, self.note]
+        (valve,) = ax.plot([0.0], [1.35], marker="D", color=REAL, markersize=8)
+        (puffs,) = ax.plot([], [], "o", color="0.7", markersize=5, alpha=0.8)
+        units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+        arrow = ax.quiver([-1.75], [0.0], [0.0], [0.0], color=TWIN, width=0.02, **units)
+        note = ax.text(-1.85, -1.25, "", fontsize=9)
 
-    def show(self, k: int) -> None:
-        """Move everything to sample ``k``."""
-        height = level(self.fill[k])
-        # From one edge of the surface along the wall to the other.
-        half = np.arccos(-height)
-        angle = np.linspace(-half, half, 91)
-        self.liquid.set_xy(np.stack([np.sin(angle), -np.cos(angle)], -1))
-        greatest = self.flow.max() or 1.0
-        count = round(PUFFS * self.flow[k] / greatest)
-        rise = np.arange(count) / PUFFS
-        self.puffs.set_data(0.25 * np.sin(9.0 * rise + k) * (0.3 + rise), 1.5 + 0.75 * rise)
-        self.valve.set_color(SAMPLES if count else REAL)
-        self.arrow.set_UVC([0.7 * self.load[k] / self.load.max()], [0.0])
-        self.note.set_text(f"load {self.load[k]:.0f} W, {100.0 * self.fill[k]:.1f} % liquid")
-        for trace in self.traces:
-            trace.show(k)
-        self.caption.show(f"time {self.time[k]:.1f} {self.unit}", f"{self.pressure[k]:.0f} kPa")
+        def show(k: int) -> tuple[str, str]:
+            # From one edge of the surface along the wall to the other.
+            half = np.arccos(-level(fill[k]))
+            angle = np.linspace(-half, half, 91)
+            liquid.set_xy(np.stack([np.sin(angle), -np.cos(angle)], -1))
+            count = round(PUFFS * flow[k] / (flow.max() or 1.0))
+            rise = np.arange(count) / PUFFS
+            puffs.set_data(0.25 * np.sin(9.0 * rise + k) * (0.3 + rise), 1.5 + 0.75 * rise)
+            valve.set_color(SAMPLES if count else REAL)
+            arrow.set_UVC([0.7 * load[k] / load.max()], [0.0])
+            note.set_text(f"load {load[k]:.0f} W, {100.0 * fill[k]:.1f} % liquid")
+            return f"time {time[k]:.1f} {unit}", f"{pressure[k]:.0f} kPa"
+
+        return [liquid, shell, valve, puffs, arrow, note], show
+
+    traces = [
+        Trace("pressure $p$ [kPa]", pressure, np.full_like(pressure, 1e-3 * plant.set_point)),
+        Trace(r"vent flow $\dot m_c$ [g/s]", flow, look={"linewidth": 0.8, "color": SAMPLES}),
+        Trace(plant.inputs[0].label, load, look={"linewidth": 0.8, "color": TWIN}),
+    ]
+    return Scene(snapshot, draw, title="Cryogenic tank", size=(9.0, 5.2), traces=traces, width_ratios=(1.0, 1.5))
 
 
 def level(fill: float) -> float:

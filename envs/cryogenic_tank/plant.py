@@ -13,7 +13,6 @@ from rt_torchrl.envs.cryogenic_tank import unknown
 from rt_torchrl.envs.cryogenic_tank.closures import ConstantCoefficients, CubicVentLaw, NeuralCoefficients
 from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
 from rt_torchrl.envs.cryogenic_tank.saturation import Properties, Saturation
-from rt_torchrl.options import require_range
 from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
 from rt_torchrl.plants.sampling import DisturbanceModel, require_stable_step, rk4_step
 from rt_torchrl.plants.shapes import Action, Actions, Cost, Input, Inputs, Scalar, State, States, Time
@@ -31,8 +30,8 @@ SETTLED_SHARE = 0.6
 """Share of an episode after which the pressure should be held: three of five days."""
 BAND = 5e3
 """Half width [Pa] of the band in which the pressure should be held."""
-ERROR_RANGES = ((1e-6, 20.0, "K"), (1e-6, 10.0, "m³"), (10.0, 1e6, "Pa"))
-"""Errors that a tank of 60 m³ at 80 to 900 kPa may have: least and greatest one, and unit."""
+ERROR_SIZES = (0.05, 0.05, 1e3)
+"""Errors of T_s [K], V_l [m³] and p [Pa] that weigh the same in J_p, α_3 = 0.05⁻² K⁻² and so on."""
 STATES = (
     Signal(symbol="T_s", name="wall_temperature", unit="K", low=0.0),
     Signal(symbol="V_l", name="liquid_volume", unit="m³", low=0.0, high=60.0),
@@ -175,7 +174,6 @@ class CryogenicTank(Plant):
         command: action: the drop of a valve that is held half open, or the duty cycle of a valve that is either shut or
             open. A half-open valve takes less heat per mass that it vents.
         observe: names of ``measurements`` and ``observation_sets``; by default the paper's error.
-        error_sizes: errors of T_s [K], V_l [m³] and p [Pa] that weigh the same in J_p, α_3 = 0.05⁻² K⁻² and so on.
 
     Raises:
         ValueError: for an unknown fluid or wall, a size that is not positive, or a wall that makes the step unstable.
@@ -229,7 +227,6 @@ class CryogenicTank(Plant):
         wall_heat_capacity: float = 500e3,
         cost: TankCost | None = None,
         command: Literal["drop", "duty"] = "drop",
-        error_sizes: tuple[float, float, float] = (0.05, 0.05, 1e3),
         observe: Sequence[str] = (),
     ):
         constants = ConstantCoefficients.true() if closure is None else closure
@@ -239,14 +236,11 @@ class CryogenicTank(Plant):
                 raise ValueError(f"{name}={value!r} does not exist; choose one of {', '.join(known)}.")
         if not 0.0 < wall_heat_capacity < math.inf:
             raise ValueError(f"wall_heat_capacity={wall_heat_capacity} J/K must be positive and finite.")
-        for size, (least, greatest, unit) in zip(error_sizes, ERROR_RANGES, strict=True):
-            require_range("error_sizes", size, least, greatest, unit=unit, of="the tank")
         self.load = CyclicLoad() if load is None else load
         self.wall, self.wall_heat_capacity = wall, float(wall_heat_capacity)
         self.command, self.actions = command, (COMMANDS[command],)
         self.cost = PressureCost() if cost is None else cost
         self.saturation = Saturation(fluid, low=self.back_pressure, high=self.greatest_pressure)
-        self.error_sizes = error_sizes
         if wall == "explicit":
             mode = f"the wall of heat capacity {wall_heat_capacity:.6g} J/K"
             rate = self.wall_rate(self.closure)
@@ -386,7 +380,7 @@ class CryogenicTank(Plant):
     @property
     def discrepancy_scales(self) -> tuple[float, ...]:
         r"""Scales in which J_p is the sum of the squared errors over their natural sizes, over T_o (eq. of J_p)."""
-        return tuple(math.sqrt(0.5 * self.horizon) * size for size in self.error_sizes)
+        return tuple(math.sqrt(0.5 * self.horizon) * size for size in ERROR_SIZES)
 
     def held_load(self, state: State, action: Action, closure: nn.Module) -> Scalar:
         r"""Load [W] at which the pressure stands still: Q_HX plus the heat that evaporates the refilling vapour.

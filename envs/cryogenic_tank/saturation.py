@@ -1,5 +1,6 @@
 """Saturation properties of a pure fluid as differentiable functions of pressure."""
 
+import contextlib
 import io
 import math
 import zipfile
@@ -112,19 +113,19 @@ class Saturation(nn.Module):
     def _within(self, p: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
         return (p >= self.low) & (p <= self.high)
 
-    def extra_repr(self) -> str:
-        return f"fluid={self.fluid!r}, p={self.low / 1e3:g}…{self.high / 1e3:g} kPa ({CELLS} cells)"
-
 
 @cache
 def coefficients(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:
     """Spline coefficients [cell, power, property], from memory, from the user's cache, or fitted."""
     # Another version of CoolProp may have other equations of state.
     path = cache_folder() / f"saturation-{LAYOUT}-{version('CoolProp')}-{fluid}-{low!r}-{high!r}-{CELLS}.npz"
-    table = _load(path, low, high)
+    table = _load(path)
     if table is None:
-        table = fit(fluid, low, high)
-        _save(path, table, low, high)
+        table, file = fit(fluid, low, high), io.BytesIO()
+        np.savez(file, table=table)
+        with contextlib.suppress(OSError):  # without the file the next process needs a second more
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, file.getvalue())
     table.flags.writeable = False  # every user of a fluid shares it
     return table
 
@@ -134,27 +135,15 @@ def cache_folder() -> Path:
     return user_cache_path("rt_torchrl")
 
 
-def _load(path: Path, low: float, high: float) -> Float[np.ndarray, "cells 6 5"] | None:
-    """The cached table; None if there is no table, or it cannot be read or does not agree with its name."""
+def _load(path: Path) -> Float[np.ndarray, "cells 6 5"] | None:
+    """The cached table; None if there is no table, or it cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            table, limits = file["table"], file["range"]
+            table = file["table"]
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
         return None
-    shape = (CELLS, DEGREE + 1, len(Properties._fields))
-    whole = table.shape == shape and table.dtype == np.float64 and np.isfinite(table).all()
-    return table if whole and np.array_equal(limits, [low, high]) else None
-
-
-def _save(path: Path, table: Float[np.ndarray, "cells 6 5"], low: float, high: float) -> None:
-    """Write a table so that other processes see it whole or not at all."""
-    file = io.BytesIO()
-    np.savez(file, table=table, range=np.array([low, high]))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, file.getvalue())
-    except OSError:
-        return  # Without the file the next process needs a second more; this one has its fit.
+    whole = table.shape == (CELLS, DEGREE + 1, len(Properties._fields)) and table.dtype == np.float64
+    return table if whole and np.isfinite(table).all() else None
 
 
 def fit(fluid: str, low: float, high: float) -> Float[np.ndarray, "cells 6 5"]:

@@ -10,37 +10,15 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor
 
 from rt_torchrl.envs.flapping_wing.plant import ERRORS, FlappingWing
-from rt_torchrl.evaluation.closure_error import visited_features as features_of
-from rt_torchrl.figures.animation import MovingCaption, save_scene
+from rt_torchrl.evaluation.checks import visited_features as features_of
+from rt_torchrl.figures import style
+from rt_torchrl.figures.animation import Scene, Show
 from rt_torchrl.figures.policy import contours
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import (
-    LARGE_SCALE,
-    LIMIT_LINE,
-    REAL,
-    REFERENCE,
-    REFERENCE_LINE,
-    SAMPLES,
-    TWIN,
-    array,
-    caption,
-    closure_look,
-    closures,
-    draw_groups,
-    last_episode,
-    legend_above,
-    legend_below,
-    limits,
-    means_of_groups,
-    panels,
-    time_axis,
-    twin_label,
-    veil,
-)
+from rt_torchrl.figures.style import REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
 
 SPAN_SHARE = 0.7
 """Place of the angle of attack along the wing, from root 0 to tip 1; the outer wing makes most of the force."""
@@ -60,9 +38,8 @@ def flight_path(snapshot: Snapshot) -> Figure:
 
     The axes span the real flight and the target; a twin that flies elsewhere leaves them.
     """
-    figure, axes = panels(
-        2, 2, title=f"Flight path, episode {last_episode(snapshot)}", size=(11.0, 5.8), width_ratios=(1.35, 1.0)
-    )
+    title = f"Flight path, episode {style.last_episode(snapshot)}"
+    figure, axes = style.panels(2, 2, title=title, size=(11.0, 5.8), width_ratios=(1.35, 1.0))
     (path, wind), (below, distance) = axes
     below.remove()
     path.set_subplotspec(path.get_gridspec()[:, 0])
@@ -70,7 +47,7 @@ def flight_path(snapshot: Snapshot) -> Figure:
     _draw_path(path, snapshot)
     _draw_wind(wind, snapshot)
     _draw_distance(distance, snapshot)
-    legend_below(figure, [path])
+    style.legend_below(figure, [path])
     return figure
 
 
@@ -79,14 +56,14 @@ def _draw_path(ax: Axes, snapshot: Snapshot) -> None:
     wind = array(snapshot.record.exogenous)[:, 0]
     ax.plot(*real[:, :2].T, color=REAL, linewidth=1.9, label="real")
     ax.plot(*real[0, :2], "s", color=REAL, markersize=7, label="start")
-    ax.plot(*array(plant.target), "*", color=REFERENCE, markersize=15, label="target")
+    ax.plot(*array(plant.target), "*", color=style.REFERENCE, markersize=15, label="target")
     # The line is added instead of plotted, so that the axes do not grow to hold it.
-    ax.add_artist(Line2D(*twin[:, :2].T, color=TWIN, linewidth=1.0, label=twin_label(snapshot)))
+    ax.add_artist(Line2D(*twin[:, :2].T, color=TWIN, linewidth=1.0, label=style.twin_label(snapshot)))
     ax.margins(0.09)
     second = np.arange(round(1.0 / plant.dt), len(real), round(1.0 / plant.dt))
     ax.plot(*real[second, :2].T, "o", color=REAL, markersize=4.5, label="every second")
-    style: dict[str, Any] = {"color": SAMPLES, "width": 0.005, "zorder": 3, "units": "width", "scale_units": "width"}
-    arrows = ax.quiver(*real[second, :2].T, -wind[second - 1], np.zeros(len(second)), scale=24.0, **style)
+    look: dict[str, Any] = {"color": SAMPLES, "width": 0.005, "zorder": 3, "units": "width", "scale_units": "width"}
+    arrows = ax.quiver(*real[second, :2].T, -wind[second - 1], np.zeros(len(second)), scale=24.0, **look)
     key = {"labelpos": "N", "coordinates": "axes", "angle": 180.0, "fontproperties": {"size": 9}}
     ax.quiverkey(arrows, 0.9, 0.06, 2.0, "wind 2 m/s", **key)
     _label_seconds(ax, real[second, :2])
@@ -108,18 +85,19 @@ def _label_seconds(ax: Axes, places: Float[np.ndarray, "seconds 2"]) -> None:
 def _draw_wind(ax: Axes, snapshot: Snapshot) -> None:
     plant = cast(FlappingWing, snapshot.plant)
     recorded, strongest = array(snapshot.record.exogenous)[:, 0], float(plant.strongest_wind)
-    time, _ = time_axis(plant, len(recorded))
+    time = style.time_axis(plant, len(recorded))[0][:-1]
     ax.plot(time, recorded, color=REAL, linewidth=1.9, label="recorded")
     if snapshot.large_scale is not None:
-        ax.plot(time, array(snapshot.large_scale)[:, 0], color=LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
-    ax.axhline(strongest, **LIMIT_LINE)
+        mean = array(snapshot.large_scale)[:, 0]
+        ax.plot(time, mean, color=style.LARGE_SCALE, linewidth=1.0, label="large scale (SVR)")
+    ax.axhline(strongest, **style.LIMIT_LINE)
     # The text stands on the line itself, because the legend has no room for it.
     text: dict[str, Any] = {"fontsize": 8.5, "color": "0.35", "ha": "right", "va": "center"}
     text["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
     ax.annotate("strongest that can be held", (0.99, strongest), xycoords=("axes fraction", "data"), **text)
     ax.set_ylim(min(0.0, recorded.min()) - 0.2, 1.15 * max(strongest, recorded.max()))
     caption(ax, plant.inputs[0].label)
-    legend_above(ax)
+    style.legend_above(ax)
     ax.tick_params(labelbottom=False)
 
 
@@ -129,13 +107,11 @@ def _draw_distance(ax: Axes, snapshot: Snapshot) -> None:
         np.linalg.norm(array(states[:, :2] - plant.target), axis=1)
         for states in (snapshot.record.states, snapshot.replay)
     )
-    time, label = time_axis(plant, len(real))
+    time, label = style.time_axis(plant, len(real) - 1)
     ax.plot(time, real, color=REAL, linewidth=1.9, label="real")
-    ax.plot(time, twin, color=TWIN, linewidth=1.0, label=twin_label(snapshot))
+    ax.plot(time, twin, color=TWIN, linewidth=1.0, label=style.twin_label(snapshot))
     ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    style.plain_numbers(ax)
     caption(ax, "distance to the target [m]", f"at the end {real[-1]:.2g} m, twin {twin[-1]:.2g} m")
     ax.set_xlabel(label)
     ax.set_xlim(time[0], time[-1])
@@ -149,28 +125,26 @@ def flight(snapshot: Snapshot) -> Figure:
     """
     plant, real, twin = cast(FlappingWing, snapshot.plant), array(snapshot.record.states), array(snapshot.replay)
     applied = array(snapshot.record.actions)
-    time, label = time_axis(plant, len(real))
     beat = round(1.0 / (plant.frequency * plant.dt))
     of_beats: dict[str, Any] = {"linewidth": 1.9, "label": "range within each beat"}
-    title = f"Flight, episode {last_episode(snapshot)}\nspeeds and actions: mean over each wing beat"
-    figure, axes = panels(3, 2, title=title, size=(11.0, 7.4), sharex=True)
-    for k, ax in enumerate(axes[0]):
+    title = f"Flight, episode {style.last_episode(snapshot)}\nspeeds and actions: mean over each wing beat"
+    figure, axes, time = style.timeline(plant, len(applied), 6, 2, title=title, size=(11.0, 7.4))
+    for k, ax in enumerate(axes[:2]):
         ax.plot(time, real[:, k], color=REAL, linewidth=1.9, label="real")
-        ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=twin_label(snapshot))
+        ax.plot(time, twin[:, k], color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         ax.axhline(plant.target[k].item(), label="target", **REFERENCE_LINE)
         caption(ax, plant.states[k].label)
-    for k, ax in enumerate(axes[1], 2):
-        draw_groups(ax, time[:-1], real[:-1, k], beat, **of_beats)
-        ax.plot(*means_of_groups(beat, time[:-1], twin[:-1, k]), color=TWIN, linewidth=0.9, label=twin_label(snapshot))
+    for k, ax in enumerate(axes[2:4], 2):
+        style.draw_groups(ax, time[:-1], real[:-1, k], beat, **of_beats)
+        means = style.means_of_groups(beat, time[:-1], twin[:-1, k])
+        ax.plot(*means, color=TWIN, linewidth=0.9, label=style.twin_label(snapshot))
         ax.axhline(0.0, label="target", **REFERENCE_LINE)
         caption(ax, plant.states[k].label)
-    for ax, k in zip(axes[2], (1, 0), strict=True):
-        draw_groups(ax, time[:-1], applied[:, k], beat, **of_beats)
-        limits(ax, plant.actions[k])
+    for k, ax in zip((1, 0), axes[4:], strict=True):
+        style.draw_groups(ax, time[:-1], applied[:, k], beat, **of_beats)
+        style.limits(ax, plant.actions[k])
         caption(ax, plant.actions[k].label)
-        ax.set_xlabel(label)
-    axes[0, 0].set_xlim(time[0], time[-1])
-    legend_below(figure, axes[:, 0].tolist())
+    style.legend_below(figure, axes[::2])
     return figure
 
 
@@ -182,27 +156,30 @@ def polars(snapshot: Snapshot) -> Figure:
     what was visited. Angles that no blade element had are pale.
     """
     visited = visited_features(snapshot)
-    C = {name: closure(visited) for name, closure in closures(snapshot).items()}
+    C = {name: closure(visited) for name, closure in style.closures(snapshot).items()}
     rms = {name: array((C[name] - C["true"]).square().mean(0).sqrt()) for name in ("twin", "initial twin")}
     title = "\n".join(["Polars of the wing", *_coefficients(snapshot)])
-    figure, axes = panels(3, title=title, size=(7.5, 8.4), sharex=True, height_ratios=(2.0, 2.0, 1.0))
-    _draw_polars(axes[:2, 0], snapshot)
-    names = ("lift coefficient $C_L$ [-]", "drag coefficient $C_D$ [-]")
-    for k, (ax, name) in enumerate(zip(axes[:2, 0], names, strict=True)):
-        caption(ax, name, f"RMS where visited {rms['twin'][k]:.2g}, initial {rms['initial twin'][k]:.2g}")
-    angle = np.degrees(np.arctan2(*array(visited).T))
+    label, size = r"effective angle of attack $\alpha_e$ [deg]", (7.5, 8.4)
+    figure, axes = style.grid(3, title=title, size=size, xlabel=label, height_ratios=(2.0, 2.0, 1.0))
+    angle = torch.linspace(-180.0, 180.0, 361, dtype=visited.dtype, device=visited.device)
+    around = torch.stack([angle.deg2rad().sin(), angle.deg2rad().cos()], -1)
+    for name, closure in style.closures(snapshot).items():
+        for ax, values in zip(axes, array(closure(around)).T, strict=False):
+            ax.plot(array(angle), values, **style.closure_look(name))
     edges = np.arange(-180.0, 180.0 + BIN, BIN)
     anywhere = np.degrees(np.arctan2(*array(features_of(snapshot.plant, snapshot.record)).reshape(-1, 2).T))
-    for ax in axes[:2, 0]:
-        veil(ax, edges, _touched(anywhere, edges))
-    share = np.full(len(angle), 100.0 / len(angle))
-    ax = axes[2, 0]
-    ax.hist(angle, edges, weights=share, color=SAMPLES)
-    caption(ax, f"share of the flight [%] per {BIN:g} deg at {SPAN_SHARE:.0%} of the span")
-    ax.set_xlabel(r"effective angle of attack $\alpha_e$ [deg]")
-    ax.set_xticks(np.arange(-180, 181, 45))
-    ax.set_xlim(-180.0, 180.0)
-    legend_below(figure, [axes[0, 0]])
+    filled = np.histogram(anywhere, edges)[0] > 0
+    for k, name in enumerate(("lift coefficient $C_L$ [-]", "drag coefficient $C_D$ [-]")):
+        note = f"RMS where visited {rms['twin'][k]:.2g}, initial {rms['initial twin'][k]:.2g}"
+        caption(axes[k], name, note)
+        # An edge borders on two bins.
+        style.veil(axes[k], edges, np.append(filled, False) | np.append(False, filled))
+    share = np.full(len(visited), 100.0 / len(visited))
+    axes[2].hist(np.degrees(np.arctan2(*array(visited).T)), edges, weights=share, color=SAMPLES)
+    caption(axes[2], f"share of the flight [%] per {BIN:g} deg at {SPAN_SHARE:.0%} of the span")
+    axes[2].set_xticks(np.arange(-180, 181, 45))
+    axes[2].set_xlim(-180.0, 180.0)
+    style.legend_below(figure, axes[:1])
     return figure
 
 
@@ -213,24 +190,9 @@ def visited_features(snapshot: Snapshot) -> Float[Tensor, "n 2"]:
     return features_of(plant, snapshot.record)[:, element]
 
 
-def _touched(values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m"]) -> np.ndarray:
-    """Whether each edge borders on a bin that holds a value."""
-    filled = np.histogram(values, edges)[0] > 0
-    return np.append(filled, False) | np.append(False, filled)
-
-
-def _draw_polars(axes: np.ndarray, snapshot: Snapshot) -> None:
-    angle = torch.linspace(-180.0, 180.0, 361, dtype=torch.float64, device=snapshot.record.states.device)
-    radians = torch.deg2rad(angle)
-    features = torch.stack([radians.sin(), radians.cos()], -1)
-    for name, closure in closures(snapshot).items():
-        for ax, values in zip(axes, array(closure(features)).T, strict=True):
-            ax.plot(array(angle), values, **closure_look(name))
-
-
 def _coefficients(snapshot: Snapshot) -> list[str]:
     """A line for each law that names its coefficients."""
-    found = {name: getattr(law, "named_coefficients", None) for name, law in closures(snapshot).items()}
+    found = {name: getattr(law, "named_coefficients", None) for name, law in style.closures(snapshot).items()}
     return [
         f"{name}: " + ", ".join(f"{letter} = {value:.4g}" for letter, value in named().items())
         for name, named in found.items()
@@ -240,18 +202,14 @@ def _coefficients(snapshot: Snapshot) -> list[str]:
 
 def control_surfaces(snapshot: Snapshot) -> Figure:
     """Both actions over the errors of x and of z and their rates; other observations are zero (paper, fig. 18)."""
-    actions = snapshot.plant.actions
-    figure, axes = panels(
-        2,
-        2 * len(actions),
-        title=f"Policies after episode {last_episode(snapshot)}\nobservations that are not shown are zero",
-        size=(16.0, 6.8),
-    )
+    count = len(snapshot.plant.actions)
+    title = f"Policies after episode {style.last_episode(snapshot)}\nobservations that are not shown are zero"
+    figure, axes = style.panels(2, 2 * count, title=title, size=(16.0, 6.8))
     zero = torch.zeros(len(snapshot.plant.observations), dtype=torch.float64, device=snapshot.record.states.device)
-    for k in range(len(actions)):
+    for k in range(count):
         pair = axes[:, 2 * k : 2 * k + 2]
         contours(snapshot, k, {(0, 2): pair[0], (1, 3): pair[1]}, others=zero)
-    legend_below(figure, [axes[0, 0]])
+    style.legend_below(figure, [axes[0, 0]])
     return figure
 
 
@@ -272,69 +230,50 @@ def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     Raises:
         ValueError: if the file has another suffix.
     """
-    return save_scene(_Scene(snapshot), len(snapshot.record.states), path)
+    return scene(snapshot).save(len(snapshot.record.states), path)
 
 
-class _Scene:
+def scene(snapshot: Snapshot) -> Scene:
     """The picture at any sample of the record."""
+    plant, place = cast(FlappingWing, snapshot.plant), array(snapshot.record.states)[:, :2]
+    # The sample at the end has no interval of its own; it shows the last interval.
+    held = np.minimum(np.arange(len(place)), len(snapshot.record.actions) - 1)
+    actions, wind = array(snapshot.record.actions)[held], array(snapshot.record.exogenous)[held, 0]
 
-    def __init__(self, snapshot: Snapshot):
-        self.plant = cast(FlappingWing, snapshot.plant)
-        self.place = array(snapshot.record.states)[:, :2]
-        # The sample at the end has no interval of its own; it shows the last interval.
-        last = len(snapshot.record.actions) - 1
-        held = np.minimum(np.arange(len(self.place)), last)
-        self.actions, self.wind = array(snapshot.record.actions)[held], array(snapshot.record.exogenous)[held, 0]
-        title = f"Flight, episode {last_episode(snapshot)}"
-        self.figure, ((self.ax,),) = panels(1, title=title, size=(6.2, 6.4))
-        self._draw_still()
-        self._prepare_moving()
-
-    def _draw_still(self) -> None:
-        ax, target = self.ax, array(self.plant.target)
-        ax.plot(*target, "*", color=REFERENCE, markersize=16, label="target")
-        low, high = _square(np.vstack([self.place, target]))
-        self.width = high[0] - low[0]
+    def draw(ax: Axes) -> tuple[list[Artist], Show]:
+        target = array(plant.target)
+        ax.plot(*target, "*", color=style.REFERENCE, markersize=16, label="target")
+        low, high = _square(np.vstack([place, target]))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        ax.set_xlabel(self.plant.states[0].label)
-        ax.set_ylabel(self.plant.states[1].label)
-
-    def _prepare_moving(self) -> None:
-        ax = self.ax
-        self.caption = MovingCaption(ax)
+        ax.set_xlabel(plant.states[0].label)
+        ax.set_ylabel(plant.states[1].label)
         bar = {"solid_capstyle": "round"}
-        (self.trail,) = ax.plot([], [], color="0.6", linewidth=1.4)
-        (self.plane,) = ax.plot([], [], color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$", **bar)
-        (self.normal,) = ax.plot([], [], color="0.45", linewidth=1.5, label="normal")
-        (self.wing,) = ax.plot([], [], color=REAL, linewidth=2.5, label="wing", **bar)
-        (self.body,) = ax.plot([], [], "o", color=REAL, markersize=6)
-        legend_below(self.figure, [ax])
-        arrow = {"color": SAMPLES, "scale": 12.0, "scale_units": "width", "width": 0.009}
-        self.arrow = ax.quiver([0.2], [0.93], [0.0], [0.0], transform=ax.transAxes, **arrow)
-        self.wind_text = ax.text(0.2, 0.96, "", transform=ax.transAxes, ha="center", fontsize=9)
+        (trail,) = ax.plot([], [], color="0.6", linewidth=1.4)
+        (plane,) = ax.plot([], [], color=SAMPLES, linewidth=3.0, label=r"stroke plane, as long as $A_\phi$", **bar)
+        (normal,) = ax.plot([], [], color="0.45", linewidth=1.5, label="normal")
+        (wing,) = ax.plot([], [], color=REAL, linewidth=2.5, label="wing", **bar)
+        (body,) = ax.plot([], [], "o", color=REAL, markersize=6)
+        look: dict[str, Any] = {"color": SAMPLES, "scale": 12.0, "scale_units": "width", "width": 0.009}
+        arrow = ax.quiver([0.2], [0.93], [0.0], [0.0], transform=ax.transAxes, **look)
+        note = ax.text(0.2, 0.96, "", transform=ax.transAxes, ha="center", fontsize=9)
 
-    @property
-    def moving(self) -> list[Artist]:
-        """What :meth:`show` moves."""
-        drone: list[Artist] = [self.trail, self.plane, self.normal, self.wing, self.body]
-        return [*drone, self.arrow, self.wind_text, *self.caption.moving]
+        def show(k: int) -> tuple[str, str]:
+            (A_phi, beta_w), t = actions[k], k * plant.dt
+            along, across = _stroke_axes(np.radians(beta_w))
+            reach = 0.075 * (high[0] - low[0]) * A_phi / plant.actions[0].high
+            phase = np.cos(2.0 * np.pi * plant.frequency * t)
+            trail.set_data(*place[: k + 1].T)
+            plane.set_data(*np.stack([place[k] - reach * along, place[k] + reach * along], -1))
+            wing.set_data(*np.stack([place[k], place[k] + reach * phase * along], -1))
+            normal.set_data(*np.stack([place[k], place[k] + reach * across], -1))
+            body.set_data(*place[k][:, None])
+            arrow.set_UVC([-wind[k]], [0.0])
+            note.set_text(f"headwind {round(wind[k], 1) + 0.0:.1f} m/s")
+            return f"time {t:.2f} s", rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
 
-    def show(self, k: int) -> None:
-        """Move everything to sample ``k``."""
-        A_phi, beta_w = self.actions[k]
-        t, body = k * self.plant.dt, self.place[k]
-        along, across = _stroke_axes(np.radians(beta_w))
-        reach = 0.075 * self.width * A_phi / self.plant.actions[0].high
-        phase = np.cos(2.0 * np.pi * self.plant.frequency * t)
-        self.trail.set_data(*self.place[: k + 1].T)
-        self.plane.set_data(*np.stack([body - reach * along, body + reach * along], -1))
-        self.wing.set_data(*np.stack([body, body + reach * phase * along], -1))
-        self.normal.set_data(*np.stack([body, body + reach * across], -1))
-        self.body.set_data(*body[:, None])
-        self.arrow.set_UVC([-self.wind[k]], [0.0])
-        self.wind_text.set_text(f"headwind {round(self.wind[k], 1) + 0.0:.1f} m/s")
-        note = rf"$A_\phi$ = {A_phi:.0f} deg,  $\beta_w$ = {beta_w:+.0f} deg"
-        self.caption.show(f"time {t:.2f} s", note)
+        return [trail, plane, normal, wing, body, arrow, note], show
+
+    return Scene(snapshot, draw, title="Flight", size=(6.2, 6.4))
 
 
 def _stroke_axes(beta_w: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

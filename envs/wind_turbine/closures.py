@@ -32,8 +32,9 @@ class SaintDrenan(nn.Module):
         C_p = c_1\Big(\frac{c_2}{\xi} - c_3\beta - c_4\xi\beta - c_5\beta^x - c_6\Big)e^{-c_7/\xi} + c_8\lambda, \qquad
         \frac1\xi = \frac1{\lambda + c_9\beta} - \frac{c_{10}}{\beta^3 + 1}
 
-    with β in degrees. The trained weights are the coefficients divided by their typical sizes, which differ by 10⁴. The
-    exponent is trained as log((x − 1)/0.5), so that x stays above 1.
+    with β in degrees. c1 only scales c2 ... c6 and is not trained. The trained weights are the other coefficients
+    divided by their typical sizes, which differ by 10⁴. The exponent is trained as log((x − 1)/0.5), so that x stays
+    above 1.
 
     Note: the paper's last term is c8·ξ, its exponent is c12, and it has a c11; here they are c8·λ and x, because with
     c8·ξ the published sets peak at the wrong height, and no c11 appears in any source. Note: the law computes β^x as
@@ -41,7 +42,6 @@ class SaintDrenan(nn.Module):
 
     Args:
         coefficients: c1 ... c10 and x, in the order of ``NAMES``.
-        free_c1: whether c1 is trained too; it only scales c2 ... c6.
 
     Raises:
         ValueError: if there are not eleven finite coefficients, or x is not above 1, where C_p has no slope at β = 0.
@@ -57,7 +57,7 @@ class SaintDrenan(nn.Module):
     scale: Tensor
     fixed: Tensor
 
-    def __init__(self, coefficients: Float[Tensor, "11"], *, free_c1: bool = False):
+    def __init__(self, coefficients: Float[Tensor, "11"]):
         super().__init__()
         coefficients = torch.as_tensor(coefficients, dtype=torch.float64)
         if coefficients.shape != (11,) or not coefficients.isfinite().all():
@@ -66,11 +66,11 @@ class SaintDrenan(nn.Module):
             raise ValueError(f"x={coefficients[-1].item()} must be above 1; with less, C_p has no slope at β = 0.")
         self.register_buffer("scale", torch.tensor(self.scales, dtype=torch.float64))
         scaled = torch.cat([coefficients[:-1] / self.scale, torch.log((coefficients[-1:] - 1.0) / 0.5)])
-        self.register_buffer("fixed", scaled[:0] if free_c1 else scaled[:1].clone())
-        self.scaled = nn.Parameter(scaled.clone() if free_c1 else scaled[1:].clone())
+        self.register_buffer("fixed", scaled[:1].clone())
+        self.scaled = nn.Parameter(scaled[1:].clone())
 
     @classmethod
-    def from_set(cls, name: str, *, free_c1: bool = False) -> "SaintDrenan":
+    def from_set(cls, name: str) -> "SaintDrenan":
         """A law with a published set of coefficients; c5 = 0 becomes c5 = 1e-3 with x = 1.5, or neither could move.
 
         Raises:
@@ -83,7 +83,7 @@ class SaintDrenan(nn.Module):
         coefficients = {key: float(sets[name][key]) for key in NAMES}
         if coefficients["c5"] == 0.0:
             coefficients |= {"c5": 1e-3, "x": 1.5}
-        return cls(torch.tensor(list(coefficients.values()), dtype=torch.float64), free_c1=free_c1)
+        return cls(torch.tensor(list(coefficients.values()), dtype=torch.float64))
 
     @property
     def coefficients(self) -> Float[Tensor, "11"]:

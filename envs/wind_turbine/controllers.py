@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.envs.wind_turbine.plant import FAST_FILTER, RATED_GENERATOR_SPEED, WindTurbine
+from rt_torchrl.plants.shapes import Action, Costs, Memory, State
 from rt_torchrl.plants.signal import bounds
 
 
@@ -55,15 +56,13 @@ class JonkmanController(ClassicalController):
         root = math.sqrt(self.slip_slope * (self.slip_slope - 4.0 * self.torque_gain * self.synchronous_speed))
         self.slip_speed = (self.slip_slope - root) / (2.0 * self.torque_gain)
 
-    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch 2"]:
+    def first_memory(self, state: State) -> Memory:
         """The memory at the start: the present speed, and the integral that keeps the present pitch."""
         pitch = torch.deg2rad(state[:, 5])
         integral = pitch * (1.0 + pitch / self.schedule_pitch) / self.integral_gain
         return torch.stack([self.plant.gear_ratio * state[:, 0], integral], -1)
 
-    def law(
-        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch 2"]
-    ) -> tuple[Float[Tensor, "batch 2"], Float[Tensor, "batch 2"]]:
+    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         speed, integral = memory.unbind(-1)
         pitch = torch.deg2rad(state[:, 5])
         speed = (1.0 - self.alpha) * self.plant.gear_ratio * state[:, 0] + self.alpha * speed
@@ -71,7 +70,7 @@ class JonkmanController(ClassicalController):
         pitch, integral = self.pitch(speed, pitch, integral)
         return torch.stack([torque, torch.rad2deg(pitch)], -1), torch.stack([speed, integral], -1)
 
-    def torque(self, speed: Float[Tensor, " batch"], pitch: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
+    def torque(self, speed: Costs, pitch: Costs) -> Costs:
         """Generator torque [N m] at a filtered speed [rad/s]; region 3 also while the blades are pitched [rad]."""
         line = self.slip_slope * (speed - self.synchronous_speed)
         torque = torch.where(speed < self.slip_speed, self.torque_gain * speed**2, line)

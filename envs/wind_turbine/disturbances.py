@@ -80,11 +80,8 @@ class KaimalWind:
         """Target standard deviation σ = I·U [m/s]."""
         return self.intensity * self.mean
 
-    def spectrum(self, f: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """One-sided spectral density S(f) [(m/s)²/Hz] at the frequencies f [Hz]; its integral over f > 0 is σ²."""
-        return self.sigma**2 * self._unit_spectrum(f)
-
     def _unit_spectrum(self, f: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """S(f)/σ² [s] at frequencies f [Hz]; its integral over f > 0 is 1."""
         transit = self.length_scale / self.mean
         return 4.0 * transit / (1.0 + 6.0 * f * transit) ** (5.0 / 3.0)
 

@@ -5,31 +5,16 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.figures.animation import Trace, TracedScene, save_scene, shown_samples
+from rt_torchrl.figures import style
+from rt_torchrl.figures.animation import Scene, Show, Trace, shown_samples
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import (
-    FILTERED,
-    LIMITS,
-    REAL,
-    REFERENCE,
-    REFERENCE_LINE,
-    SAMPLES,
-    TWIN,
-    array,
-    caption,
-    closures,
-    last_episode,
-    legend_above,
-    legend_below,
-    limits,
-    panels,
-    time_axis,
-)
+from rt_torchrl.figures.style import FILTERED, REAL, REFERENCE_LINE, SAMPLES, TWIN, array, caption
 
 CONTOURS = (0.1, 0.2, 0.3, 0.4, 0.45)
 GREATEST_SHOWN = 0.1
@@ -53,14 +38,13 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     """
     plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
     state = record.states[:-1]
-    time, label = time_axis(plant, len(state))
     omega_g = plant.gear_ratio * state[:, 0]
-    figure, axes = panels(5, title=f"Power and speed, episode {last_episode(snapshot)}", size=(8.5, 9.5), sharex=True)
-    wind, speed, power, torque, pitch = axes.flat
+    title = f"Power and speed, episode {style.last_episode(snapshot)}"
+    figure, axes, time = style.timeline(plant, len(state), 5, title=title, size=(8.5, 9.5))
+    wind, speed, power, torque, pitch = axes
 
-    def draw(ax: Axes, values: Tensor, label: str, **style: Any) -> None:
-        look: dict[str, Any] = {"color": REAL, "linewidth": 1.5} | style
-        ax.plot(time, array(values), label=label, **look)
+    def draw(ax: Axes, values: Tensor, label: str, **look: Any) -> None:
+        ax.plot(time[:-1], array(values), label=label, **{"color": REAL, "linewidth": 1.5} | look)
 
     draw(wind, record.exogenous[:, 0], "wind", linewidth=0.9)
     draw(wind, state[:, 2], "filtered", color=FILTERED, linewidth=2.0)
@@ -71,15 +55,13 @@ def power_and_speed(snapshot: Snapshot) -> Figure:
     draw(power, 1e-6 * plant.reference_power(omega_g), r"reference $\tilde P$", **REFERENCE_LINE)
     draw(torque, 1e-3 * record.actions[:, 0], "applied", drawstyle="steps-post")
     draw(pitch, record.actions[:, 1], "applied", drawstyle="steps-post")
-    limits(torque, plant.actions[0], 1e-3)
-    limits(pitch, plant.actions[1])
+    style.limits(torque, plant.actions[0], 1e-3)
+    style.limits(pitch, plant.actions[1])
     power_label, torque_label = r"generator power $\tau_g\omega_g$ [MW]", r"generator torque $\tau_g$ [kN m]"
     names = (WIND_LABEL, SPEED_LABEL, power_label, torque_label, PITCH_LABEL)
-    for ax, name in zip(axes.flat, names, strict=True):
+    for ax, name in zip(axes, names, strict=True):
         caption(ax, name)
-        legend_above(ax)
-    pitch.set_xlabel(label)
-    pitch.set_xlim(0.0, time[-1] + time[1])
+        style.legend_above(ax)
     return figure
 
 
@@ -96,11 +78,11 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
     lams = torch.linspace(2.0, max(13.0, lam.max().item()), 89, **grid)
     betas = torch.linspace(0.0, max(20.0, beta.max().item()), 81, **grid)
     everywhere, visited = torch.stack(torch.meshgrid(lams, betas, indexing="xy"), -1), torch.stack([lam, beta], -1)
-    C_p = {name: array(closure(everywhere).squeeze(-1)) for name, closure in closures(snapshot).items()}
-    true, *others = (closure(visited).squeeze(-1) for closure in closures(snapshot).values())
+    C_p = {name: array(closure(everywhere).squeeze(-1)) for name, closure in style.closures(snapshot).items()}
+    true, *others = (closure(visited).squeeze(-1) for closure in style.closures(snapshot).values())
     rms, rms_initial = ((C_p - true).square().mean().sqrt().item() for C_p in others)
     title = f"Power coefficient, RMS error where visited: {rms:.2g}, initial twin {rms_initial:.2g}"
-    figure, axes = panels(1, 3, title=title, size=(12.0, 4.8), sharex=True, sharey=True)
+    figure, axes = style.panels(1, 3, title=title, size=(12.0, 4.8), sharex=True, sharey=True)
     table, law, error = axes.flat
     for ax, name in ((table, "true"), (law, "twin")):
         drawn = ax.pcolormesh(array(lams), array(betas), C_p[name], shading="gouraud", vmin=0.0, vmax=0.5)
@@ -119,7 +101,7 @@ def power_coefficient(snapshot: Snapshot) -> Figure:
     table.set_ylabel(PITCH_LABEL)
     table.set_xlim(lams[0].item(), lams[-1].item())
     table.set_ylim(betas[0].item(), betas[-1].item())
-    legend_below(figure, [table])
+    style.legend_below(figure, [table])
     return figure
 
 
@@ -127,9 +109,9 @@ def scatter(snapshot: Snapshot) -> Figure:
     """Generator speed of the twin against the real one at the same instants (paper, fig. 12b)."""
     real, twin = (array(WindTurbine.gear_ratio * s[:, 0]) for s in (snapshot.record.states, snapshot.replay))
     error = twin - real
-    figure, ((ax,),) = panels(1, title="Twin against real generator speed", size=(5.4, 5.6))
+    figure, ((ax,),) = style.panels(1, title="Twin against real generator speed", size=(5.4, 5.6))
     ends = [min(real.min(), twin.min()), max(real.max(), twin.max())]
-    ax.plot(ends, ends, color=LIMITS, linewidth=1.2, label="perfect twin")
+    ax.plot(ends, ends, color=style.LIMITS, linewidth=1.2, label="perfect twin")
     ax.plot(real, twin, "o", color=TWIN, markersize=3, alpha=0.5, label="sample")
     ax.set_aspect("equal")
     caption(ax, f"bias {error.mean():.2g} rad/s, RMS {np.sqrt(np.mean(error**2)):.2g} rad/s")
@@ -166,60 +148,51 @@ def save_animation(snapshot: Snapshot, path: Path | str) -> Path:
     Raises:
         ValueError: if the file has another suffix.
     """
-    return save_scene(TurbineScene(snapshot), len(snapshot.record.actions), path)
+    return scene(snapshot).save(len(snapshot.record.actions), path)
 
 
-class TurbineScene(TracedScene):
-    """The picture at the start of any interval of the record.
+@torch.no_grad()
+def scene(snapshot: Snapshot) -> Scene:
+    """The picture at the start of any interval of the record."""
+    plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
+    state, wind, pitch = record.states[:-1], array(record.exogenous[:, 0]), array(record.actions[:, 1])
+    time, label = style.time_axis(plant, len(state))
+    unit = label.removeprefix("time [").removesuffix("]")
+    # The angle of a frame is the sum of what the frames before it have turned.
+    shown = shown_samples(len(state))
+    turned = np.cumsum(TURN * array(state[:, 0])[shown] / plant.rated_rotor_speed)
+    angles = dict(zip(shown, np.radians(turned), strict=True))
 
-    Args:
-        snapshot: snapshot with the episode.
-    """
-
-    @torch.no_grad()
-    def __init__(self, snapshot: Snapshot):
-        plant, record = cast(WindTurbine, snapshot.plant), snapshot.record
-        state = record.states[:-1]
-        super().__init__(snapshot, 4, title="Wind turbine", size=(9.0, 5.6), width_ratios=(1.15, 1.0))
-        self.wind, self.pitch = array(record.exogenous[:, 0]), array(record.actions[:, 1])
-        # The angle of a frame is the sum of what the frames before it have turned.
-        shown = shown_samples(len(state))
-        turned = np.cumsum(TURN * array(state[:, 0])[shown] / plant.rated_rotor_speed)
-        self.angle = dict(zip(shown, np.radians(turned), strict=True))
-        self._draw_tower()
-        omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
-        speed_wanted, power_wanted = plant.reference_speed(state[:, 2]), 1e-6 * plant.reference_power(omega_g)
-        wind, rotor, generator, pitch = self.beside
-        self.traces = [
-            Trace(wind, self.time, self.wind, WIND_LABEL, style={"linewidth": 0.8, "color": SAMPLES}),
-            Trace(rotor, self.time, array(omega_g), SPEED_LABEL, setpoint=array(speed_wanted)),
-            Trace(generator, self.time, array(power), "generator power [MW]", setpoint=array(power_wanted)),
-            Trace(pitch, self.time, self.pitch, PITCH_LABEL),
-        ]
-
-    def _draw_tower(self) -> None:
-        ax = self.ax
+    def draw(ax: Axes) -> tuple[list[Artist], Show]:
         ax.set(xlim=(-95.0, 95.0), ylim=(-5.0, 165.0), aspect="equal")
         ax.axis("off")
         ax.axhline(0.0, color="0.6", linewidth=1.0)
         ax.fill([-3.0, -2.0, 2.0, 3.0], [0.0, HUB, HUB, 0.0], color="0.75")
-        self.blades = [ax.fill([0.0], [0.0], color=REAL)[0] for _ in range(3)]
-        (self.hub,) = ax.plot([0.0], [HUB], "o", color=REFERENCE, markersize=7)
+        blades = [ax.fill([0.0], [0.0], color=REAL)[0] for _ in range(3)]
+        (hub,) = ax.plot([0.0], [HUB], "o", color=style.REFERENCE, markersize=7)
         units: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
-        self.arrow = ax.quiver([-90.0], [150.0], [0.0], [0.0], color=SAMPLES, width=0.012, **units)
-        self.note = ax.text(-90.0, 156.0, "", fontsize=9)
-        self.own += [*self.blades, self.hub, self.arrow, self.note]
+        arrow = ax.quiver([-90.0], [150.0], [0.0], [0.0], color=SAMPLES, width=0.012, **units)
+        note = ax.text(-90.0, 156.0, "", fontsize=9)
 
-    def show(self, k: int) -> None:
-        """Move everything to sample ``k``."""
-        width = 0.5 * CHORD * np.cos(np.radians(self.pitch[k]))
-        outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
-        for number, blade in enumerate(self.blades):
-            angle = self.angle[k] + 2.0 * np.pi * number / 3.0
-            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            blade.set_xy(outline @ turn + [0.0, HUB])
-        self.arrow.set_UVC([ARROW * self.wind[k]], [0.0])
-        self.note.set_text(f"wind {self.wind[k]:.1f} m/s")
-        for trace in self.traces:
-            trace.show(k)
-        self.caption.show(f"time {self.time[k]:.0f} {self.unit}", f"pitch {self.pitch[k]:.1f} deg")
+        def show(k: int) -> tuple[str, str]:
+            width = 0.5 * CHORD * np.cos(np.radians(pitch[k]))
+            outline = np.array([[0.0, 0.0], [width, 12.0], [0.25 * width, TIP], [-0.25 * width, TIP], [-width, 12.0]])
+            for number, blade in enumerate(blades):
+                angle = angles[k] + 2.0 * np.pi * number / 3.0
+                turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+                blade.set_xy(outline @ turn + [0.0, HUB])
+            arrow.set_UVC([ARROW * wind[k]], [0.0])
+            note.set_text(f"wind {wind[k]:.1f} m/s")
+            return f"time {time[k]:.0f} {unit}", f"pitch {pitch[k]:.1f} deg"
+
+        return [*blades, hub, arrow, note], show
+
+    omega_g, power = plant.gear_ratio * state[:, 0], 1e-6 * plant.generator_power(state, record.actions)
+    speed_wanted, power_wanted = plant.reference_speed(state[:, 2]), 1e-6 * plant.reference_power(omega_g)
+    traces = [
+        Trace(WIND_LABEL, wind, look={"linewidth": 0.8, "color": SAMPLES}),
+        Trace(SPEED_LABEL, array(omega_g), array(speed_wanted)),
+        Trace("generator power [MW]", array(power), array(power_wanted)),
+        Trace(PITCH_LABEL, pitch),
+    ]
+    return Scene(snapshot, draw, title="Wind turbine", size=(9.0, 5.6), traces=traces, width_ratios=(1.15, 1.0))

@@ -5,17 +5,16 @@ Development*, NREL/TP-500-38060, 2009, where no other source is named.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from rt_torchrl.envs.wind_turbine import unknown
 from rt_torchrl.envs.wind_turbine.closures import NeuralPowerCoefficient, SaintDrenan
 from rt_torchrl.envs.wind_turbine.disturbances import CUT_IN_WIND, KaimalWind, WindModel
 from rt_torchrl.envs.wind_turbine.rotor import PowerCoefficientTable
-from rt_torchrl.envs.wind_turbine.unknown import further_suspects, suspects
-from rt_torchrl.options import require_range
 from rt_torchrl.plants.plant import Plant, RunningCost, require_weights
 from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.sampling import between, lag, require_stable_step
@@ -152,13 +151,11 @@ class WindTurbine(Plant):
             the set-points ω̃_g and P̃ of its own optimum; with any other closure they are those of the NREL 5-MW rotor.
         wind: source of the wind speed.
         inertia: inertia J of the drivetrain on the low-speed shaft [kg m²].
-        rate_limits: greatest |dτ_g/dt| [N m/s] and |dβ/dt| [deg/s] of the actuators; None for ideal ones.
         cost: running cost L_a; None for the paper's.
         observe: names of ``measurements`` and of ``observation_sets``; by default the paper's errors.
 
     Raises:
-        ValueError: for a non-positive inertia or rate limit, an unknown measurement, or a step
-            that is unstable.
+        ValueError: for a non-positive inertia, an unknown measurement, or a step that is unstable.
     """
 
     name = "wind_turbine"
@@ -175,7 +172,7 @@ class WindTurbine(Plant):
     cut_in_generator_speed = 20.0  # middle of the band in which the torque sets in [rad/s]; ours, the paper has none
     cut_in_band = 10.0  # half width of that band [rad/s]
     standstill_tip_speed_ratio = 1.0  # λ below which the blades are taken out of the flow [-]; ours
-    slowest_actuator = 100.0  # time that no actuator of a turbine takes for its whole range [s]
+    rate_limits = (TORQUE_RATE, 8.0)  # greatest |dτ_g/dt| [N m/s] and |dβ/dt| [deg/s] of the actuators
 
     states: tuple[Signal, ...] = STATES
     actions = STATES[4:]
@@ -213,7 +210,6 @@ class WindTurbine(Plant):
         closure: nn.Module | None = None,
         wind: WindModel | None = None,
         inertia: float = DRIVETRAIN_INERTIA,
-        rate_limits: tuple[float, float] | None = (TORQUE_RATE, 8.0),
         cost: RunningCost | None = None,
         observe: Sequence[str] = (),
     ):
@@ -231,7 +227,7 @@ class WindTurbine(Plant):
         # Gain K [N m s²] of the law τ_g = K ω_g² that holds λ* (paper, eq. tau_g_squared).
         power = 0.5 * self.air_density * math.pi * self.radius**5 * self.best_power_coefficient
         self.optimal_gain = power / (self.best_tip_speed_ratio * self.gear_ratio) ** 3
-        self.register_buffer("greatest_increment", self._checked_rates(rate_limits) * dt)
+        self.register_buffer("greatest_increment", dt * torch.tensor(self.rate_limits, dtype=torch.float64))
         require_stable_step(
             self.name,
             dt,
@@ -240,19 +236,9 @@ class WindTurbine(Plant):
             remedy=f"the inertia of the whole drivetrain, {DRIVETRAIN_INERTIA:.6g} kg m²",
         )
 
-    def _checked_rates(self, rates: tuple[float, float] | None) -> Tensor:
-        if rates is None:
-            return torch.full((2,), math.inf, dtype=torch.float64)
-        if not min(rates) > 0:
-            raise ValueError(f"rate_limits={rates} (N m/s, deg/s) must be positive; None means ideal actuators.")
-        for action, rate in zip(self.actions, rates, strict=True):
-            least, of = (action.high - action.low) / self.slowest_actuator, f"the actuator of {action.name}"
-            require_range("rate_limits", rate, least, math.inf, unit=f"{action.unit}/s", of=of)
-        return torch.tensor(rates, dtype=torch.float64)
-
-    def time_constant(self, wind_speed: float, pitch: float = 0.0) -> float:
-        r"""Time constant −1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and a pitch [deg]."""
-        given = self.greatest_increment.new_tensor([self.rated_rotor_speed, pitch, wind_speed])
+    def time_constant(self, wind_speed: float) -> float:
+        r"""Time constant −1/(∂ω̇_r/∂ω_r) [s] of the rotor at rated speed, a wind speed [m/s] and fine pitch."""
+        given = self.greatest_increment.new_tensor([self.rated_rotor_speed, 0.0, wind_speed])
         omega_r, beta, u = given.requires_grad_().unbind()
         torque = self.aerodynamic_torque(omega_r, beta, u, self.closure)
         (slope,) = torch.autograd.grad(torque, omega_r)
@@ -438,13 +424,7 @@ class WindTurbine(Plant):
         """The paper's policy: one affine law per action through the smooth clip, by default without bias."""
         return SaturatedAffine(len(self.observations), self.actions, bias=bias, weight_scale=0.5, generator=generator)
 
-    def suspects(self) -> Mapping[str, Plant]:
-        """Lag and dead time of the pitch drive, and a lagging inflow."""
-        return suspects(self)
-
-    def further_suspects(self) -> Mapping[str, Plant]:
-        """A torque of unknown form that depends on the speed of the rotor, the pitch and the wind."""
-        return further_suspects(self)
+    suspects, further_suspects = unknown.suspects, unknown.further_suspects
 
 
 @dataclass(frozen=True, kw_only=True)

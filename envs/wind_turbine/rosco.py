@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
-from rt_torchrl.evaluation.baseline import RealController
+from rt_torchrl.evaluation.unseen import RealController
 from rt_torchrl.systems.calling_simulator import CallingSimulator, Controller
 from rt_torchrl.systems.reading import Reading
 from rt_torchrl.systems.real_system import RealSystem, episode_seed

@@ -61,13 +61,7 @@ class PowerCoefficientTable(nn.Module):
 
     def __init__(self, tip_speed_ratio: Axis, pitch: Axis, values: Rows):
         super().__init__()
-        lam, beta = _checked_axis("tip_speed_ratio", "-", tip_speed_ratio), _checked_axis("pitch", "deg", pitch)
-        if lam[0] <= 0:
-            raise ValueError(
-                f"tip_speed_ratio starts at {lam[0]}; it must be positive, because the stall element covers λ from 0 "
-                "to the first row. Drop the rows with λ <= 0."
-            )
-        cp = _checked_values(values, len(lam), len(beta))
+        lam, beta, cp = _checked(tip_speed_ratio, pitch, values)
         rows, lam_knots = _add_stall(_spline_cells(lam, cp), lam)
         cells = _spline_cells(beta, np.moveaxis(rows, -1, 0))  # [cell of β, power of β, cell of λ, power of λ]
         arrays = {
@@ -91,17 +85,13 @@ class PowerCoefficientTable(nn.Module):
             ValueError: if an entry is no number or the rows differ in length; the message names the path.
         """
         header, *rows = csv_rows(path)
-        lengths = {len(row) for row in rows}
-        if lengths != {len(header)}:
-            raise ValueError(
-                f"path={str(path)!r} has rows of {sorted(lengths)} entries under a header of {len(header)}; every row "
-                "must hold λ and one C_p per pitch angle. Complete or remove the others."
-            )
         try:
-            pitch = np.array(header[1:], dtype=np.float64)
-            body = np.array(rows, dtype=np.float64)
+            pitch, body = np.array(header[1:], dtype=np.float64), np.array(rows, dtype=np.float64)
         except ValueError as error:
-            raise ValueError(f"path={str(path)!r}: {error}; after its header every row must hold numbers.") from error
+            raise ValueError(
+                f"path={str(path)!r}: {error}; under a header of {len(header)} entries every row must hold as many "
+                "numbers, λ and one C_p per pitch angle. Complete or remove the others."
+            ) from error
         return cls(body[:, 0], pitch, body[:, 1:])
 
     @classmethod
@@ -195,39 +185,32 @@ def _subdivided(axis: Float[Tensor, " n"], parts: int) -> Float[Tensor, " m"]:
     return torch.cat([(axis[:-1, None] + steps * axis.diff()[:, None]).flatten(), axis[-1:]])
 
 
-def _checked_axis(name: str, unit: str, axis: Axis) -> Float[np.ndarray, " n"]:
-    array = array_of(name, axis)
-    if array.ndim != 1 or len(array) < 4:
+def _checked(
+    tip_speed_ratio: Axis, pitch: Axis, values: Rows
+) -> tuple[Float[np.ndarray, " n_lam"], Float[np.ndarray, " n_beta"], Float[np.ndarray, "n_lam n_beta"]]:
+    axes = {"tip_speed_ratio": array_of("tip_speed_ratio", tip_speed_ratio), "pitch": array_of("pitch", pitch)}
+    for name, axis in axes.items():
+        if axis.ndim != 1 or len(axis) < 4 or not np.isfinite(axis).all() or (np.diff(axis) <= 0).any():
+            raise ValueError(
+                f"{name}={axis.tolist()} must be at least 4 finite numbers that increase strictly, for a cubic spline; "
+                "sort it together with the values, drop duplicates and gaps, or add points."
+            )
+    lam, beta = axes.values()
+    if lam[0] <= 0:
         raise ValueError(
-            f"{name} has shape {array.shape}; a cubic spline needs one dimension with at least 4 entries. Add points."
+            f"tip_speed_ratio starts at {lam[0]}; it must be positive, because the stall element covers λ from 0 "
+            "to the first row. Drop the rows with λ <= 0."
         )
-    _require_finite(name, f" {unit}", array)
-    if (np.diff(array) <= 0).any():
-        at = int(np.argmax(np.diff(array) <= 0))
+    cp = array_of("values", values)
+    if cp.shape != (len(lam), len(beta)):
+        hint = "; transpose it" if cp.shape == (len(beta), len(lam)) else ""
         raise ValueError(
-            f"{name} goes from {array[at]} to {array[at + 1]} {unit} at entry {at + 1}; it must increase strictly. "
-            "Sort it together with the values and drop duplicates."
-        )
-    return array
-
-
-def _checked_values(values: Rows, n_lam: int, n_beta: int) -> Float[np.ndarray, "n_lam n_beta"]:
-    array = array_of("values", values)
-    if array.shape != (n_lam, n_beta):
-        hint = "; transpose it" if array.shape == (n_beta, n_lam) else ""
-        raise ValueError(
-            f"values has shape {array.shape}, the axes ask for ({n_lam}, {n_beta}): a row per tip-speed ratio, a "
+            f"values has shape {cp.shape}, the axes ask for ({len(lam)}, {len(beta)}): a row per tip-speed ratio, a "
             f"column per pitch angle{hint}."
         )
-    _require_finite("values", "", array)
-    if array.max() > 16 / 27:
+    if not (np.isfinite(cp) & (cp <= 16 / 27)).all():
         raise ValueError(
-            f"values reaches {array.max()}, but C_p cannot exceed Betz's 16/27; if it is in per cent, divide it by 100."
+            f"values reaches {cp.max()}, but C_p must be finite and cannot exceed Betz's 16/27; if it is in per cent, "
+            "divide it by 100."
         )
-    return array
-
-
-def _require_finite(name: str, unit: str, array: np.ndarray) -> None:
-    if not np.isfinite(array).all():
-        at = [int(k) for k in np.argwhere(~np.isfinite(array))[0]]
-        raise ValueError(f"{name}{at}={array[tuple(at)]}{unit} must be finite; correct or remove the entry.")
+    return lam, beta, cp

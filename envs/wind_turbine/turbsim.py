@@ -42,8 +42,7 @@ class WindRecord:
             array = array_of(f"{self.source}: {field}", getattr(self, field))
             array.setflags(write=False)
             object.__setattr__(self, field, array)
-        fault = self._fault_of_shape() or self._fault_of_speed() or self._fault_of_time()
-        if fault:
+        if fault := self._fault():
             raise ValueError(f"{self.source}: {fault}")
 
     @property
@@ -56,45 +55,33 @@ class WindRecord:
         """Mean sampling interval [s], which averages out the rounding of printed times."""
         return self.duration / (len(self.time) - 1)
 
-    def _fault_of_shape(self) -> str:
-        if self.time.ndim != 1 or self.time.shape != self.speed.shape:
-            return f"time has shape {self.time.shape} and speed {self.speed.shape}; pass two vectors of equal length."
-        if len(self.time) < 2:
-            return f"holds {len(self.time)} wind samples; at least 2 are needed: is the file written to its end?"
-        if not np.isfinite(self.time).all():
-            at = np.argmin(np.isfinite(self.time))
-            return f"time of sample {at} is {self.time[at]}; all must be finite. Write the file again."
-        return ""
-
-    def _fault_of_speed(self) -> str:
-        faults = {
-            "be finite. Fill the gap by interpolation or cut the record there.": ~np.isfinite(self.speed),
-            "not be negative. Check its sign and the direction, 0 deg along the rotor axis.": self.speed < 0,
-            f"not exceed {GREATEST_SPEED:g} m/s. Check its unit, and that the file is whole.": self.speed
-            > GREATEST_SPEED,
-        }
-        for demand, bad in faults.items():
-            if bad.any():
-                at = np.argmax(bad)
-                return f"wind speed at t = {self.time[at]:g} s is {self.speed[at]:g} m/s; it must {demand}"
-        return ""
-
-    def _fault_of_time(self) -> str:
-        steps = np.diff(self.time)
-        step = float(np.median(steps))
-        if (steps <= 0).any():
-            before, after = self.time[np.argmax(steps <= 0) :][:2]
+    def _fault(self) -> str:
+        """What is wrong with the record and what to do; empty if nothing is."""
+        time, speed = self.time, self.speed
+        if time.ndim != 1 or time.shape != speed.shape:
+            return f"time has shape {time.shape} and speed {speed.shape}; pass two vectors of equal length."
+        if len(time) < 2:
+            return f"holds {len(time)} wind samples; at least 2 are needed: is the file written to its end?"
+        if (bad := ~((speed >= 0.0) & (speed <= GREATEST_SPEED))).any():
+            at = np.argmax(bad)
+            return (
+                f"wind speed at t = {time[at]:g} s is {speed[at]:g} m/s; it must be from 0 to {GREATEST_SPEED:g} m/s. "
+                "Check its unit, its sign and the direction, 0 deg along the rotor axis, or fill the gap."
+            )
+        steps = np.diff(time)
+        if (bad := ~((steps > 0.0) & (steps < np.inf))).any():
+            before, after = time[np.argmax(bad) :][:2]
             return f"time goes from {before:g} s to {after:g} s; it must increase. Sort the samples, drop doubles."
         # Two times rounded to 1 ms give a step that is off by up to 1 ms; below 2 ms this would hide a missing sample.
-        uneven = np.abs(steps - step) > min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
-        if not uneven.any():
-            return ""
-        where, odd = self.time[np.argmax(uneven)], steps[np.argmax(uneven)]
-        found = f"after t = {where:g} s, {odd:g} s instead of {step:g} s"
-        if odd > 1.5 * step:
-            missing = round(odd / step) - 1
-            return f"gap {found}: {missing} samples are missing. Fill it by interpolation or cut the record there."
-        return f"unequal time step {found}. Resample the record to equal steps."
+        step = float(np.median(steps))
+        bad = np.abs(steps - step) > min(1.01 * PRINTED_TIME_RESOLUTION, 0.5 * step)
+        if bad.any():
+            where, odd = time[np.argmax(bad)], steps[np.argmax(bad)]
+            return (
+                f"the step after t = {where:g} s is {odd:g} s instead of {step:g} s. Fill the gap by interpolation, "
+                "cut the record there, or resample it to equal steps."
+            )
+        return ""
 
 
 def read_wind(path: str | os.PathLike[str]) -> WindRecord:

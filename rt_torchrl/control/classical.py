@@ -4,7 +4,7 @@ Learned policies are compared with them, and they act on a real system before an
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Input, Inputs, Memory, Starts, State
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
 from rt_torchrl.trajectories.rollout import DivergenceError, drive_of, require_finite
@@ -75,14 +76,12 @@ class ClassicalController(nn.Module, ABC):
         """The gains by name, for reports; numbers that :meth:`law` reads could not become machine code."""
         return dict(zip(self.gain_units, self.log_gains.exp().tolist(), strict=True))
 
-    def first_memory(self, state: Float[Tensor, "batch n_s"]) -> Float[Tensor, "batch n_m"]:
+    def first_memory(self, state: State) -> Memory:
         """Memory at the start of an episode; zeros by default."""
         return state.new_zeros(len(state), self.memory_size)
 
     @abstractmethod
-    def law(
-        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
-    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+    def law(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         """The command, which :meth:`respond` clamps to the ranges of the actions, and the new memory.
 
         Args:
@@ -90,9 +89,7 @@ class ClassicalController(nn.Module, ABC):
             memory: memory before the interval; it has no columns if :attr:`memory_size` is zero.
         """
 
-    def respond(
-        self, state: Float[Tensor, "batch n_s"], memory: Float[Tensor, "batch n_m"]
-    ) -> tuple[Float[Tensor, "batch n_a"], Float[Tensor, "batch n_m"]]:
+    def respond(self, state: State, memory: Memory) -> tuple[Action, Memory]:
         """The command within the ranges of the actions, and the new memory."""
         command, memory = self.law(state, memory)
         return command.clamp(self.low_action, self.high_action), memory
@@ -102,9 +99,7 @@ class ClassicalController(nn.Module, ABC):
         self._memory = None
 
     @torch.no_grad()
-    def act(
-        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
-    ) -> Float[Tensor, "batch n_a"]:
+    def act(self, t: float, state: State, exogenous: Input) -> Action:
         """The command in the measured state, within the ranges of the actions; time and inputs are not used."""
         memory = self.first_memory(state) if self._memory is None else self._memory
         command, self._memory = self.respond(state, memory)
@@ -116,12 +111,7 @@ class ClassicalController(nn.Module, ABC):
 
     @torch.no_grad()
     def fly(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        closure: nn.Module | None = None,
-        *,
-        plant: Plant | None = None,
+        self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
     ) -> Trajectory:
         """Episodes under this controller, which acts on what sensors read.
 
@@ -146,8 +136,7 @@ class ClassicalController(nn.Module, ABC):
         return Trajectory(states, plant.actuate(states[:, :-1], command), exogenous)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tuned:
+class Tuned(NamedTuple):
     """Mean J_a at the first gains and at the gains that the search found, and the number of its evaluations."""
 
     start: float
@@ -157,21 +146,21 @@ class Tuned:
 
 def tune(
     controller: ClassicalController,
-    initial_state: Float[Tensor, "batch n_s"],
-    exogenous: Float[Tensor, "batch n n_z"],
+    initial_state: Starts,
+    exogenous: Inputs,
     *,
     evaluations: int = 80,
-    spread: float = 2.0,
     plant: Plant | None = None,
 ) -> Tuned:
     """Minimise the mean J_a of the episodes over the logarithms of the gains by Nelder and Mead's simplex.
+
+    Between corners of the first simplex one gain doubles.
 
     Args:
         controller: the controller; the search starts from its present gains and leaves the best ones in it.
         initial_state: initial states of the episodes.
         exogenous: exogenous inputs of the episodes.
         evaluations: greatest number of evaluations; each flies all episodes.
-        spread: factor on one gain between corners of the first simplex, more than 1.
         plant: physics of the system that is flown; None for the controller's own plant.
 
     Raises:
@@ -181,8 +170,8 @@ def tune(
 
     if not len(controller.log_gains):
         raise ValueError(f"controller {type(controller).__name__} has no gains to tune.")
-    if evaluations < 1 or not spread > 1.0:
-        raise ValueError(f"evaluations={evaluations} must be at least 1 and spread={spread} more than 1.")
+    if evaluations < 1:
+        raise ValueError(f"evaluations={evaluations} must be at least 1.")
 
     system = controller.plant if plant is None else plant
 
@@ -196,7 +185,7 @@ def tune(
         return value if np.isfinite(value) else np.inf
 
     first = controller.log_gains.detach().cpu().numpy().copy()
-    simplex = np.vstack([first, first + np.log(spread) * np.eye(len(first))])
+    simplex = np.vstack([first, first + np.log(2.0) * np.eye(len(first))])
     options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-2, "fatol": 1e-4}
     start = cost(first)
     found = minimize(cost, first, method="Nelder-Mead", options=options)

@@ -1,4 +1,4 @@
-r"""The cost of held commands and its exact gradient, for optimisers of commands.
+r"""The cost of held commands and its exact gradient, and its bounded descent.
 
 .. math::
     J(u) = \frac1N\sum_{k<N}\Big(L_a(t_k, s_k, a_k, z_k)
@@ -11,24 +11,33 @@ action a that the actuators apply is itself a command that they apply at once, c
 the penalty is therefore zero at an optimum and does not move it.
 """
 
+import functools
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Inputs, Starts
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines import Native
-from rt_torchrl.trajectories.engines.code import Group, Inputs, IntervalCode, code_of, signals_of
+from rt_torchrl.trajectories.engines.code import Group, IntervalCode, code_of, signals_of
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.rollout import require_double
 
 TerminalCost = Callable[[Tensor], Tensor]
 """Function from the end states, ``batch n_s``, to the cost V after the window, ``batch``, in units of L_a·s."""
+Plans = Float[np.ndarray, "batch m n_a"]
+"""Held commands in [0, 1] of each realisation of a window."""
 PENALTY = 1.0
 """Weight w of the penalty, in units of L_a."""
+DIVERGED = 1e6
+"""Cost of a trial that diverges, in costs of the start: greater than any that a line search accepts."""
 
 
 class PenalisedInterval(nn.Module):
@@ -124,40 +133,31 @@ class CommandCost:
         """Number of commands of a window of n control intervals; the last may be held for less time."""
         return -(-n // self.hold)
 
-    def commands(self, unit: Float[np.ndarray, "batch m n_a"], n: int) -> Float[Tensor, "batch n n_a"]:
+    def commands(self, unit: Plans, n: int) -> Actions:
         """The commands of all n intervals."""
         return torch.from_numpy(np.repeat(self._low + self._span * unit, self.hold, 1)[:, :n].copy())
 
-    def units(self, commands: Float[Tensor, "batch n n_a"]) -> Float[np.ndarray, "batch m n_a"]:
+    def units(self, commands: Actions) -> Plans:
         """The held commands in [0, 1] that are nearest to commands of all intervals: the means over the blocks."""
         first = np.arange(0, commands.shape[1], self.hold)
         counts = np.diff(np.append(first, commands.shape[1]))[:, None]
         held = np.add.reduceat(commands.detach().numpy(), first, 1) / counts
         return np.clip((held - self._low) / self._span, 0.0, 1.0)
 
-    def begin(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        *,
-        start: float = 0.0,
-    ) -> None:
+    def begin(self, initial_state: Starts, exogenous: Inputs, *, start: float = 0.0) -> None:
         """Set the window: its initial states, exogenous inputs and the time of its start [s]."""
         n = exogenous.shape[1]
         t = start + self.plant.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1)
         state = torch.nn.functional.pad(initial_state, (0, 1))
         command = exogenous.new_full((n, len(state), len(self.plant.actions)), 0.5)
         self._state, self._drive, self.n = state, Drive(t, exogenous.transpose(0, 1), command), n
-        found, self._code = self._traced(), None
+        with torch.enable_grad():
+            found = code_of(self.interval, state, self._drive._replace(command=command.clone().requires_grad_()))
+        self._code = None
         if found is not None:  # kept code, unless the plant or the closure is another one by now
             self._code, inputs = found
             self._weights = inputs.row()
             self._place(self._code)
-
-    def _traced(self) -> tuple[IntervalCode, Inputs] | None:
-        with torch.enable_grad():
-            drive = self._drive._replace(command=self._drive.command.clone().requires_grad_())
-            return code_of(self.interval, self._state, drive)
 
     def _place(self, code: IntervalCode) -> None:
         """Lay out the arrays of the window, one set for each group of lanes."""
@@ -185,9 +185,7 @@ class CommandCost:
             self._x[k, :, 1:first] = group.gather(exogenous)
             self._states[k, 0] = group.gather(state)[0]
 
-    def __call__(
-        self, unit: Float[np.ndarray, "batch m n_a"]
-    ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, "batch m n_a"]]:
+    def __call__(self, unit: Plans) -> tuple[Float[np.ndarray, " batch"], Plans]:
         """J and its gradient by the commands u in [0, 1] of each realisation of the window."""
         if self._code is None:
             return self._by_torch(unit)
@@ -198,14 +196,7 @@ class CommandCost:
         gradient /= self.n
         return costs, gradient
 
-    def _sweep(
-        self,
-        k: int,
-        group: Group,
-        unit: np.ndarray,
-        costs: np.ndarray,
-        gradient: np.ndarray,
-    ) -> None:
+    def _sweep(self, k: int, group: Group, unit: np.ndarray, costs: np.ndarray, gradient: np.ndarray) -> None:
         x, states, n, n_a = self._x[k], self._states[k], self.n, unit.shape[-1]
         lanes = group.gather(unit.transpose(1, 0, 2))
         x[:, -n_a:] = lanes if self.hold == 1 else np.repeat(lanes, self.hold, 0)[:n]
@@ -243,3 +234,120 @@ class CommandCost:
                 cost = cost + self.terminal(ends[-1, :, :-1]) / self.plant.dt
             (slope,) = torch.autograd.grad(cost.sum(), u)
         return cost.detach().numpy() / self.n, slope.numpy() / self.n
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundedDescentConfig:
+    """How commands descend a cost.
+
+    The cost is divided by its value at the start, so that no parameter depends on a plant's units.
+
+    Args:
+        iterations: greatest number of iterations.
+        tolerance: relative decrease of the cost in an iteration below which the descent stops.
+        gradient: greatest component of the projected gradient, of the relative cost, below which the descent stops.
+        memory: number of pairs that approximate the curvature.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    iterations: int = 1000
+    tolerance: float = 1e-10
+    gradient: float = 1e-8
+    memory: int = 20
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for argument, least in (("iterations", 1), ("memory", 1), ("tolerance", 0.0), ("gradient", 0.0)):
+            if not getattr(self, argument) >= least:
+                raise ValueError(f"{argument}={getattr(self, argument)} of the descent must be at least {least}.")
+
+
+class Minimum(NamedTuple):
+    """The best point that a descent found, its cost and gradient, and the number of evaluations."""
+
+    point: np.ndarray
+    cost: float
+    gradient: np.ndarray
+    evaluations: int
+
+
+class _Seen:
+    """The function that L-BFGS-B calls; it remembers the best point."""
+
+    def __init__(self, evaluate: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray):
+        self._evaluate, self.count = evaluate, 1
+        cost, gradient = evaluate(start)
+        if not (np.isfinite(cost) and np.isfinite(gradient).all()):
+            raise FloatingPointError("the cost or its gradient is not finite at the start of the descent.")
+        self.best, self._scale = Minimum(start, cost, gradient, 1), abs(cost) or 1.0
+
+    def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
+        best = self.best
+        # L-BFGS-B begins at the start, whose cost is known.
+        if self.count > 1 or not (flat == best.point.ravel()).all():
+            point = flat.reshape(best.point.shape)
+            cost, gradient = self._evaluate(point)
+            self.count += 1
+            if not (np.isfinite(cost) and np.isfinite(gradient).all()):
+                return DIVERGED, np.zeros_like(flat)
+            best = Minimum(point.copy(), cost, gradient, self.count)
+            if cost < self.best.cost:
+                self.best = best
+        return best.cost / self._scale, best.gradient.ravel() / self._scale
+
+
+def descend(
+    evaluate: Callable[[Float[np.ndarray, "..."]], tuple[float, Float[np.ndarray, "..."]]],
+    start: Float[np.ndarray, "..."],
+    config: BoundedDescentConfig,
+) -> Minimum:
+    """Minimise a cost over a box [0, 1] in all variables.
+
+    Args:
+        evaluate: function from a point to cost and gradient; a trial that is not finite counts as a bad one.
+        start: first point, in the box.
+        config: parameters of the descent.
+
+    Raises:
+        FloatingPointError: if the cost is not finite at the start.
+
+    Source: Zhu, Byrd, Lu and Nocedal, ACM Trans. Math. Softw. 23 (1997) 550, in SciPy.
+    """
+    from scipy.optimize import fmin_l_bfgs_b  # here, because it takes a second to load and --help need not wait for it
+
+    seen = _Seen(evaluate, start)
+    with _libraries().limit(limits=1, user_api="blas"):
+        fmin_l_bfgs_b(  # ``minimize`` converts the bounds two times more, in a tenth of a solve of a short window
+            seen,
+            start.ravel(),
+            bounds=[(0.0, 1.0)] * start.size,
+            m=config.memory,
+            factr=config.tolerance / np.finfo(float).eps,
+            pgtol=config.gradient,
+            maxiter=config.iterations,
+            maxfun=2 * config.iterations + 20,
+        )
+    return seen.best._replace(evaluations=seen.count)
+
+
+@functools.cache
+def _libraries() -> Any:
+    """The linear algebra of NumPy and SciPy.
+
+    L-BFGS-B takes scalar products of thousands of numbers. Two threads wait for each other in each of them, and on a
+    machine with other work they wait for milliseconds.
+    """
+    from threadpoolctl import ThreadpoolController  # after SciPy, whose libraries it finds
+
+    return ThreadpoolController()
+
+
+def projected_gradient(
+    point: Float[np.ndarray, "batch ..."], gradient: Float[np.ndarray, "batch ..."]
+) -> Float[np.ndarray, " batch"]:
+    """Norm of the part of the gradient that leads into the box [0, 1]; zero where no feasible direction descends."""
+    outwards = ((point <= 0.0) & (gradient > 0.0)) | ((point >= 1.0) & (gradient < 0.0))
+    inwards = np.where(outwards, 0.0, gradient)
+    return np.sqrt(np.square(inwards).reshape(len(point), -1).sum(-1))

@@ -5,56 +5,56 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
+from rt_torchrl.plants.shapes import Input, Inputs
+
+Futures = Float[Tensor, "batch n_futures {n} n_z"]
+"""Exogenous inputs of n control intervals in each future."""
 WINDOWS = 100
 """Number of windows of a record in which the errors of a forecast are taken; neighbours say nearly the same."""
 
 
 @runtime_checkable
 class Forecast(Protocol):
-    """Anything that forecasts the exogenous inputs."""
+    """Anything that forecasts the exogenous inputs: one future, or several that are equally likely."""
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
-        """The inputs of the n control intervals from t [s] on, of which the first is measured."""
-
-
-@runtime_checkable
-class Futures(Forecast, Protocol):
-    """A forecast that also says what else may come: several futures, equally likely."""
-
-    def futures(
-        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
-    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
-        """The inputs of the n control intervals from t [s] on in each future; the first are measured."""
+    def __call__(self, t: float, exogenous: Input, n: int) -> Futures:
+        """The inputs of the n control intervals from t [s] on in each future, of which the first are measured."""
 
 
 class Held:
     """The measured input, held."""
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
-        return exogenous.unsqueeze(1).expand(-1, n, -1)
+    def __call__(self, t: float, exogenous: Input, n: int) -> Futures:
+        return exogenous[:, None, None].expand(-1, -1, n, -1)
 
 
-class Decaying:
+class Decaying(nn.Module):
     r"""The measured input decays to its mean, :math:`\hat z_{k+j} = \bar z + (z_k - \bar z)e^{-j\Delta t/\tau}`.
 
     Args:
         mean: mean of each input.
-        time: decay time τ of each input [s].
+        time: decay time τ of each input [s]; infinity holds it.
         dt: control interval [s].
 
     Raises:
         ValueError: if a decay time is not positive.
     """
 
+    mean: Tensor
+    time: Tensor
+
     def __init__(self, mean: Float[Tensor, " n_z"], time: Float[Tensor, " n_z"], *, dt: float):
+        super().__init__()
         if not (time > 0.0).all():
             raise ValueError(f"time={time.tolist()} s of the decay must be positive.")
-        self.mean, self.time, self.dt = mean, time, dt
+        self.register_buffer("mean", mean)
+        self.register_buffer("time", time)
+        self.dt = dt
 
     @classmethod
-    def fitted(cls, records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float) -> "Decaying":
+    def fitted(cls, records: Inputs, *, dt: float, horizon: float) -> "Decaying":
         r"""The decay times of the least mean squared error of the forecast over the horizon.
 
         .. math::
@@ -78,44 +78,28 @@ class Decaying:
         times = [_decay_time(column, dt, records.shape[1] * dt) for column in covariance.T]
         return cls(mean, torch.tensor(times, dtype=torch.float64), dt=dt)
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
+    def forward(self, t: float, exogenous: Input, n: int) -> Futures:
         share = torch.exp(-self.dt * torch.arange(n, dtype=torch.float64).unsqueeze(-1) / self.time)
-        return self.mean + (exogenous - self.mean).unsqueeze(1) * share
+        return self.mean + (exogenous - self.mean)[:, None, None] * share
 
 
 class Foreseen:
-    """The inputs themselves for a time ahead, as a lidar measures them, and another forecast from there on.
+    """The inputs themselves, as if a lidar measured them however far ahead; after their end the last one holds.
 
     Args:
         record: inputs of whole episodes.
         dt: control interval [s].
-        reach: time for which the inputs are known [s]; infinity for all of them.
-        beyond: forecast beyond the reach, from the last input that is known.
     """
 
-    def __init__(
-        self,
-        record: Float[Tensor, "batch n n_z"],
-        *,
-        dt: float,
-        reach: float = float("inf"),
-        beyond: Forecast | None = None,
-    ):
-        if not reach >= 0.0:
-            raise ValueError(f"reach={reach} s of the inputs that are known must not be negative.")
-        self.record, self.dt, self.reach, self.beyond = record, dt, reach, beyond or Held()
+    def __init__(self, record: Inputs, *, dt: float):
+        self.record, self.dt = record, dt
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
-        k = round(t / self.dt)
-        ahead = n if self.reach == float("inf") else min(n, 1 + int(self.reach / self.dt + 1e-9))
-        known = self.record[:, k : k + ahead]
-        if known.shape[1] == n:
-            return known
-        last = t + self.dt * (known.shape[1] - 1)
-        return torch.cat([known, self.beyond(last, known[:, -1], n - known.shape[1] + 1)[:, 1:]], 1)
+    def __call__(self, t: float, exogenous: Input, n: int) -> Futures:
+        last = self.record.shape[1] - 1
+        return self.record[:, None, (round(t / self.dt) + torch.arange(n)).clamp(max=last)]
 
 
-class Scattered:
+class Scattered(nn.Module):
     r"""Equally likely futures in pairs about another forecast, as its errors on records scatter.
 
     .. math::
@@ -132,6 +116,10 @@ class Scattered:
         high: greatest recorded value of each input.
     """
 
+    deviations: Tensor
+    low: Tensor
+    high: Tensor
+
     def __init__(
         self,
         forecast: Forecast,
@@ -139,12 +127,13 @@ class Scattered:
         low: Float[Tensor, " n_z"],
         high: Float[Tensor, " n_z"],
     ):
-        self.forecast, self.deviations, self.low, self.high = forecast, deviations, low, high
+        super().__init__()
+        self.forecast = forecast
+        for name, value in {"deviations": deviations, "low": low, "high": high}.items():
+            self.register_buffer(name, value)
 
     @classmethod
-    def fitted(
-        cls, forecast: Forecast, records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float, pairs: int = 4
-    ) -> "Scattered":
+    def fitted(cls, forecast: Forecast, records: Inputs, *, dt: float, horizon: float, pairs: int = 4) -> "Scattered":
         """The scatter of a forecast's errors on records.
 
         Args:
@@ -165,7 +154,9 @@ class Scattered:
                 f"pairs={pairs} of futures must be at least 1, and at most the number of inputs that are forecast, "
                 f"{lags * n_z}, and of recorded windows, {episodes * len(places)}."
             )
-        errors = torch.cat([records[:, k : k + lags + 1] - forecast(k * dt, records[:, k], lags + 1) for k in places])
+        errors = torch.cat(
+            [records[:, k : k + lags + 1] - forecast(k * dt, records[:, k], lags + 1)[:, 0] for k in places]
+        )
         scale = records.std((0, 1), correction=0)
         scale = torch.where(scale > 0.0, scale, 1.0)
         root = (errors / scale).flatten(1) / len(errors) ** 0.5
@@ -173,15 +164,10 @@ class Scattered:
         deviations = (pairs**0.5 * sizes[:pairs, None] * directions[:pairs]).reshape(pairs, lags + 1, n_z) * scale
         return cls(forecast, deviations, records.amin((0, 1)), records.amax((0, 1)))
 
-    def __call__(self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int) -> Float[Tensor, "batch {n} n_z"]:
-        return self.forecast(t, exogenous, n)
-
-    def futures(
-        self, t: float, exogenous: Float[Tensor, "batch n_z"], n: int
-    ) -> Float[Tensor, "batch n_futures {n} n_z"]:
+    def forward(self, t: float, exogenous: Input, n: int) -> Futures:
         """The futures, those with added deviations first."""
         change = self.reaching(n)
-        found = self.forecast(t, exogenous, n).unsqueeze(1) + torch.cat([change, -change])
+        found = self.forecast(t, exogenous, n) + torch.cat([change, -change])
         found = torch.maximum(torch.minimum(found, self.high), self.low)
         found[:, :, 0] = exogenous.unsqueeze(1)  # what is measured is certain
         return found
@@ -191,7 +177,7 @@ class Scattered:
         return self.deviations[:, torch.arange(n).clamp(max=self.deviations.shape[1] - 1)]
 
 
-def lags_within(records: Float[Tensor, "episodes n n_z"], *, dt: float, horizon: float) -> int:
+def lags_within(records: Inputs, *, dt: float, horizon: float) -> int:
     """The number of control intervals of a horizon [s].
 
     Raises:

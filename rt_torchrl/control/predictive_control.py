@@ -1,39 +1,60 @@
-"""Model predictive control that acts in the place of a policy, on a model whose closure may be trained meanwhile."""
+"""Model predictive control: the best commands over a horizon by bounded descent, planned again every period."""
 
 import copy
 import dataclasses
+import functools
+import itertools
 import math
 import statistics
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from rt_torchrl.control.command_cost import BoundedDescentConfig, CommandCost, Plans, descend
 from rt_torchrl.control.forecasts import Decaying, Forecast, Held, Scattered
-from rt_torchrl.control.receding_horizon import RecedingHorizon, RecedingHorizonConfig, Solve
+from rt_torchrl.interruption import safe_point
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Action, Actions, Input, Inputs, Starts, State
+from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.trajectory import Trajectory
+from rt_torchrl.trajectories.twin import constant
 
+Variables = Float[np.ndarray, "variables n_a"]
+"""Held commands in [0, 1] that several futures share, and below them those of each."""
+PAIRS = 10
+"""Number of pairs that approximate the curvature in a solve."""
+Tail = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Function from end times ``batch``, states ``batch n_s`` and inputs ``batch n_z`` there to a cost V ``batch``."""
 CostToGo = Callable[[Tensor], Tensor]
 """Function from observations ``batch n_o`` to what comes after them ``batch``, in units of L_a."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PredictiveConfig(RecedingHorizonConfig):
-    """Parameters of model predictive control that acts in the place of a policy.
+class PredictiveConfig:
+    """Parameters of model predictive control.
 
     Args:
         horizon: length of the window over which a plan is made [s]; every plant needs its own.
-        forecast: forecast of the exogenous inputs: held for the measured ones, decaying to the mean of the inputs met
-            so far with the time that fits them best, or scattered, several futures about the decaying one as its errors
-            on these inputs scatter; until inputs have been met, they are held.
+        period: time between two plans [s]; None for ``hold``.
+        hold: time for which a command is held [s]; None for the plant's control interval.
+        ends: whether a window ends with the episode, whose last intervals cost nothing after it; otherwise it rolls on.
+        iterations: greatest number of iterations of L-BFGS-B in a solve.
+        tolerance: relative decrease of the cost in an iteration below which a solve ends.
+        deadline: longest wall-clock time of a solve [s]; after it the last plan goes on.
+        forecast: forecast of the exogenous inputs of :class:`PredictiveControl`: held for the measured ones, decaying
+            to the mean of the inputs met so far with the time that fits them best, or scattered, several futures about
+            the decaying one as its errors on these inputs scatter; until inputs have been met, they are held.
         pairs: number of pairs of futures of the scattered forecast.
-        terminal: cost of the state at the end of a window: plant for the plant's own where the window ends with the
-            episode, or critic for the value that the model-free half has learned of what comes after the window.
+        terminal: cost of the state at the end of a window of :class:`PredictiveControl`: plant for the plant's own
+            where the window ends with the episode, or critic for the value that the model-free half has learned of what
+            comes after the window.
         virtual_episodes: number of virtual episodes that it flies in each of the steps 5 and 6, instead of
             virtual_episodes of the algorithm, because each takes as long as all solves of a real episode.
 
@@ -42,23 +63,283 @@ class PredictiveConfig(RecedingHorizonConfig):
     """
 
     horizon: float = 1.0
+    period: float | None = None
+    hold: float | None = None
+    ends: bool = False
+    iterations: int = 20
+    tolerance: float = 1e-4
+    deadline: float = math.inf
     forecast: Literal["held", "decaying", "scattered"] = "decaying"
     pairs: int = 4
     terminal: Literal["plant", "critic"] = "plant"
     virtual_episodes: int = 3
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_options(self, infinite=("deadline",))
-        for argument in ("pairs", "virtual_episodes"):
-            if getattr(self, argument) < 1:
-                raise ValueError(f"{argument}={getattr(self, argument)} of the receding horizon must be at least 1.")
+        for argument in ("horizon", "period", "hold", "deadline"):
+            value = getattr(self, argument)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{argument}={value} s of the receding horizon must be positive.")
+        for argument, least in (("iterations", 1), ("tolerance", 0.0), ("pairs", 1), ("virtual_episodes", 1)):
+            if not getattr(self, argument) >= least:
+                value = getattr(self, argument)
+                raise ValueError(f"{argument}={value} of the receding horizon must be at least {least}.")
+
+
+class SharedCommands:
+    r"""The mean cost of several futures, which share the commands until the next plan, and its gradient, as one point.
+
+    .. math:: J = \frac1S\sum_{i\le S} J_i(u_0, \dots, u_{p-1}, u^{(i)}_p, \dots, u^{(i)}_{m-1})
+
+    At the next plan the input is measured again, so that the later commands are those of one future each. A plan whose
+    commands are shared to the end cannot answer what comes, and is too cautious; a plan for one future is too bold.
+
+    Args:
+        cost: cost of each future, one realisation of its window each.
+        shared: number p of held commands that all futures share, at least 1.
+
+    Source: Lucia, Finkler and Engell, J. Process Control 23 (2013) 1306, with a tree that branches once.
+    """
+
+    def __init__(self, cost: CommandCost, shared: int):
+        self.cost, self.shared = cost, shared
+
+    def point(self, plans: Plans) -> Variables:
+        """The variables of a plan for each future; where they must share commands, the means."""
+        return self._joined(plans[:, : self.shared].mean(0), plans)
+
+    def plans(self, point: Variables, count: int) -> Plans:
+        """The plan of each of ``count`` futures; p is less where the window is shorter."""
+        shared, n_a = min(len(point), self.shared), point.shape[-1]
+        first = np.broadcast_to(point[:shared], (count, shared, n_a))
+        return np.concatenate([first, point[shared:].reshape(count, -1, n_a)], 1)
+
+    def __call__(self, point: Variables, count: int) -> tuple[float, Variables]:
+        """J and its gradient by the variables of ``count`` futures."""
+        costs, slopes = self.cost(self.plans(point, count))
+        return float(costs.mean()), self._joined(slopes[:, : self.shared].sum(0), slopes) / count
+
+    def _joined(self, first: np.ndarray, each: np.ndarray) -> np.ndarray:
+        """What all futures share, and below it what each has of its own."""
+        return np.concatenate([first, each[:, self.shared :].reshape(-1, each.shape[-1])])
+
+
+class Solve(NamedTuple):
+    """One solve of model predictive control.
+
+    Args:
+        seconds: wall-clock time [s].
+        gradients: number of gradients.
+        late: whether the deadline passed, so that the last plan went on.
+        diverged: whether the model diverged under the last plan, so that this or a constant command went on.
+    """
+
+    seconds: float
+    gradients: int
+    late: bool
+    diverged: bool = False
+
+
+class _LateError(Exception):
+    """The deadline of a solve has passed."""
+
+
+def _after(tail: Tail, t: float, exogenous: Float[Tensor, " n_z"], state: State) -> Tensor:
+    """A tail as a function of the end states alone."""
+    return tail(state.new_full((len(state),), t), state, exogenous.expand(len(state), -1))
+
+
+class RecedingHorizon:
+    r"""Plans commands over a horizon by L-BFGS-B on exact gradients, and acts by the first ones until the next plan.
+
+    .. math:: \min_{c}\ \int_t^{t+H} L_a\,dt' + V(s(t + H)) \quad\text{from the measured state, under a forecast of z}
+
+    Under a forecast with several futures the integral is the mean over them. They share the commands until the next
+    plan; later ones answer what has come by then, see :class:`SharedCommands`.
+
+    Every plan starts from the rest of the last one, whose end is held. The first plan of an episode starts from the
+    best constant command and has no deadline, because there is no plan to go on with; :meth:`prepare` makes one before
+    the episode begins, so that the first solve has a deadline too.
+
+    Args:
+        plant: the physics of the model.
+        closure: closure of the model; a twin's closure may be trained while the controller acts.
+        config: parameters.
+        forecast: forecast of the exogenous inputs; None holds what is measured.
+        tail: cost V after the horizon, of the time, the end states and the inputs there, of several futures their mean,
+            in units of L_a·s; None for none. A window that ends with the episode has the plant's ``terminal_cost``
+            instead.
+
+    Raises:
+        ValueError: if horizon, period and hold are no whole multiples of each other, or of the control interval.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        closure: nn.Module,
+        config: PredictiveConfig,
+        *,
+        forecast: Forecast | None = None,
+        tail: Tail | None = None,
+    ):
+        self.plant, self.config = plant, config
+        self.forecast: Forecast = forecast or Held()
+        hold = self._whole("hold", plant.dt if config.hold is None else config.hold, 1)
+        self.horizon = self._whole("horizon", config.horizon, hold)
+        self.period = hold if config.period is None else self._whole("period", config.period, hold)
+        if self.period > self.horizon:
+            raise ValueError(f"period={config.period} s must not be longer than horizon={config.horizon} s.")
+        self.cost, self._tail = CommandCost(plant, constant(closure), hold=hold), tail
+        self._descent = BoundedDescentConfig(
+            iterations=config.iterations, tolerance=config.tolerance, gradient=0.0, memory=PAIRS
+        )
+        self._shared = SharedCommands(self.cost, self.period // hold)
+        self._prepared: np.ndarray | None = None
+        self.solves: list[Solve] = []
+        self.begin()
+
+    def _whole(self, argument: str, seconds: float, multiple: int) -> int:
+        """A time in control intervals, which is a whole multiple of others."""
+        unit = multiple * self.plant.dt
+        count = round(seconds / unit)
+        if count < 1 or abs(count * unit - seconds) > 1e-6 * unit:
+            raise ValueError(f"{argument}={seconds} s must be a whole multiple of {unit:g} s.")
+        return count * multiple
+
+    def begin(self) -> None:
+        """Begin new episodes; what :meth:`prepare` has planned stays."""
+        self._plans: list[np.ndarray] = []
+        self._commands: Tensor | None = None
+
+    def prepare(self, state: Float[Tensor, "1 n_s"], exogenous: Float[Tensor, "1 n_z"]) -> None:
+        """Plan before episodes begin, so that their first solves have a plan to go on with when they are late.
+
+        The plan is one more start of the first solves. The first call also makes the machine code, which takes seconds.
+
+        Args:
+            state: state that is typical of the beginning of an episode.
+            exogenous: typical measured inputs.
+
+        Raises:
+            DivergenceError: if the model diverges under every constant command.
+        """
+        self._prepared = None
+        self.begin()
+        self.plan(0.0, state, exogenous)
+        self._prepared = self._plans[0]
+        self.begin()
+
+    def plan(self, t: float, state: State, exogenous: Input) -> Actions:
+        """Plan anew and return the commands of the whole window.
+
+        Args:
+            t: present time [s], in the episode.
+            state: measured states of the episodes.
+            exogenous: measured inputs.
+
+        Raises:
+            DivergenceError: if the model diverges under every start of a first plan.
+        """
+        k = round(t / self.plant.dt)
+        n = min(self.horizon, self.plant.n_steps - k) if self.config.ends else self.horizon
+        ends = self.config.ends and k + n == self.plant.n_steps
+        self.cost.terminal = self.plant.terminal_cost if ends else None
+        inputs = self.forecast(t, exogenous, n)
+        first, found = not self._plans, []
+        for episode in range(len(state)):
+            safe_point()
+            begins, coming = state[episode].expand(inputs.shape[1], -1), inputs[episode]
+            began = time.perf_counter()
+            if self._tail is not None and not ends:
+                self.cost.terminal = functools.partial(_after, self._tail, t + n * self.plant.dt, coming[:, -1].mean(0))
+            self.cost.begin(begins, coming, start=t)
+            last = self._prepared if first else self._shifted(self._plans[episode])
+            starts = ([] if last is None else [last]) + (self._constants() if first else [])
+            start = starts[0] if len(starts) == 1 else self._cheapest(starts)
+            found.append(self._solved(start, last, began))
+        self._plans = found
+        return self.cost.commands(np.stack([plans.mean(0) for plans in found]), n)
+
+    def _solved(self, start: np.ndarray, last: np.ndarray | None, began: float) -> np.ndarray:
+        """The plans for the futures of an episode; if it is late or diverges, the last ones go on, if there are any."""
+        count, deadline = 0, math.inf if last is None else self.config.deadline
+
+        def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
+            nonlocal count
+            if time.perf_counter() - began > deadline:
+                raise _LateError
+            count += 1
+            cost, gradient = self._shared(point[0], len(start))
+            return cost, gradient[None]
+
+        late = diverged = False
+        try:
+            best = descend(evaluate, self._shared.point(start)[None], self._descent).point[0]
+            found = self._shared.plans(best, len(start))
+        except _LateError:
+            found, late = start, True
+        except FloatingPointError as error:
+            if last is None:
+                raise DivergenceError(f"plant {self.plant.name!r} diverges in every first plan: {error}") from error
+            # A constant command goes on where the model diverges under the last plan too.
+            found, diverged = self._cheapest([last, *self._constants()]), True
+        self.solves.append(Solve(time.perf_counter() - began, count, late, diverged))
+        return found
+
+    def _shifted(self, plans: np.ndarray) -> np.ndarray:
+        """The rest of the last plans, whose ends are held for as long as the window needs."""
+        blocks, passed = self.cost.blocks(self.cost.n), self.period // self.cost.hold
+        return plans[:, np.minimum(np.arange(passed, passed + blocks), plans.shape[1] - 1)]
+
+    def _constants(self) -> list[np.ndarray]:
+        """Constant commands at both ends and the middle of every range."""
+        shape = self.cost.count, self.cost.blocks(self.cost.n), len(self.plant.actions)
+        return [np.full(shape, levels) for levels in itertools.product((0.0, 0.5, 1.0), repeat=shape[-1])]
+
+    def _cheapest(self, plans: Sequence[np.ndarray]) -> np.ndarray:
+        """The plan of the least cost; one that diverges costs more than any other, and the first is taken if all do."""
+        costs = [self._shared(self._shared.point(plan), len(plan))[0] for plan in plans]
+        return plans[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
+
+    def act(self, t: float, state: State, exogenous: Input) -> Action:
+        """The command of the control interval at t [s], which follow each other; every period it plans."""
+        k = round(t / self.plant.dt) % self.period
+        if k == 0 or self._commands is None:
+            self._commands = self.plan(t, state, exogenous)
+        return self._commands[:, k]
+
+    @torch.no_grad()
+    def fly(
+        self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
+    ) -> Trajectory:
+        """Episodes of a system, side by side.
+
+        Args:
+            initial_state: initial states of the episodes.
+            exogenous: exogenous inputs, of which each solve sees the present one.
+            closure: closure of the system; None for that of ``plant``.
+            plant: physics of the system; None for that of the model.
+        """
+        plant = self.plant if plant is None else plant
+        system = Rollout(plant, plant.closure if closure is None else closure)
+        self.begin()
+        state, states, actions = initial_state, [initial_state.unsqueeze(1)], []
+        for k in range(0, exogenous.shape[1], self.period):
+            t, inputs = k * self.plant.dt, exogenous[:, k : k + self.period]
+            read = state[:, : len(self.plant.states)]  # the system may have more than the model knows
+            command = self.plan(t, read, exogenous[:, k])[:, : inputs.shape[1]]
+            flown = system(state, inputs, command, start=t)
+            states.append(flown.states[:, 1:])
+            actions.append(flown.actions)
+            state = flown.states[:, -1]
+        return Trajectory(torch.cat(states, 1), torch.cat(actions, 1), exogenous)
 
 
 class PredictiveControl(nn.Module):
     """State feedback by :class:`RecedingHorizon`; see :class:`StateFeedback` for the methods.
 
-    Its weights are those of the closure that it plans on, and it has no others; its buffers are those of the forecast.
+    Its weights are those of the closure that it plans on, and it has no others; its buffers are those of its forecast.
     Before every episode it plans once from a typical state, which is a draw of the plant, so that the first solve has a
     plan to go on with when it is late. Only :meth:`act` has the deadline: a simulated episode knows no wall clock.
 
@@ -74,34 +355,18 @@ class PredictiveControl(nn.Module):
         ValueError: if :class:`RecedingHorizon` refuses the parameters, or the closure is not on the CPU.
     """
 
-    mean: Tensor
-    time: Tensor
-    deviations: Tensor
-    low: Tensor
-    high: Tensor
-
     def __init__(self, plant: Plant, closure: nn.Module, config: PredictiveConfig):
         super().__init__()
         self.closure, self._plant, self._config = closure, [plant], config  # in a list, it is no submodule
         devices = {str(weight.device) for weight in (*closure.parameters(), *closure.buffers())} - {"cpu"}
         if devices:
             raise ValueError(f"closure is on {', '.join(devices)}; model predictive control needs it on the CPU.")
-        n_z = len(plant.inputs)
-        # With an infinite time, the inputs are held.
-        self.register_buffer("mean", torch.zeros(n_z, dtype=torch.float64))
-        self.register_buffer("time", torch.full((n_z,), math.inf, dtype=torch.float64))
-        if config.forecast == "scattered":
-            deviations = torch.zeros(config.pairs, round(config.horizon / plant.dt), n_z, dtype=torch.float64)
-            ends = torch.full((2, n_z), math.inf, dtype=torch.float64)
-            self.register_buffer("deviations", deviations)
-            self.register_buffer("low", -ends[0])
-            self.register_buffer("high", ends[1])
+        self.forecast = self._unlearned()
         self.value: CostToGo | None = None
         tail = self._tail if config.terminal == "critic" else None
         timeless = dataclasses.replace(config, deadline=math.inf)
         self._acting, self._virtual = (
-            RecedingHorizon(plant, closure, chosen, forecast=self._forecast(), tail=tail)
-            for chosen in (config, timeless)
+            RecedingHorizon(plant, closure, chosen, forecast=self.forecast, tail=tail) for chosen in (config, timeless)
         )
         generator = torch.Generator().manual_seed(0)
         self._typical = plant.draw_initial_state(1, generator), plant.draw_exogenous(1, generator)[:, 0]
@@ -116,14 +381,17 @@ class PredictiveControl(nn.Module):
         """Number of virtual episodes that it flies at a time."""
         return self._config.virtual_episodes
 
-    def _forecast(self) -> Forecast:
-        """The forecast of the configuration, whose numbers are the buffers."""
-        if self._config.forecast == "held":
+    def _unlearned(self) -> Forecast:
+        """The forecast of the configuration before any inputs have been met: all hold them."""
+        (plant,), config = self._plant, self._config
+        if config.forecast == "held":
             return Held()
-        decaying = Decaying(self.mean, self.time, dt=self._plant[0].dt)
-        if self._config.forecast == "decaying":
+        still = torch.full((len(plant.inputs),), math.inf, dtype=torch.float64)
+        decaying = Decaying(torch.zeros_like(still), still, dt=plant.dt)
+        if config.forecast == "decaying":
             return decaying
-        return Scattered(decaying, self.deviations, self.low, self.high)
+        deviations = still.new_zeros(config.pairs, round(config.horizon / plant.dt), len(still))
+        return Scattered(decaying, deviations, -still, still.clone())
 
     def _tail(self, t: Tensor, state: Tensor, exogenous: Tensor) -> Tensor:
         if self.value is None:
@@ -134,25 +402,21 @@ class PredictiveControl(nn.Module):
         plant = self._plant[0]
         return plant.dt * self.value(plant.observe(t, state, exogenous))
 
-    def learn(self, records: Float[Tensor, "episodes n n_z"]) -> None:
+    def learn(self, records: Inputs) -> None:
         """Fit the forecast to inputs that have been met, if it is not to hold what is measured.
 
         Args:
             records: inputs of whole episodes.
         """
         plant = self._plant[0]
-        if self._config.forecast == "held" or not plant.inputs:
+        if isinstance(self.forecast, Held) or not plant.inputs:
             return
-        longest = min(self._acting.horizon, records.shape[1] - 1) * plant.dt
-        fitted = Decaying.fitted(records, dt=plant.dt, horizon=longest)
-        self.mean.copy_(fitted.mean)
-        self.time.copy_(fitted.time)
-        if self._config.forecast == "scattered":
-            pairs = self._config.pairs
-            scattered = Scattered.fitted(fitted, records, dt=plant.dt, horizon=longest, pairs=pairs)
-            self.deviations.copy_(scattered.reaching(self.deviations.shape[1]))
-            self.low.copy_(scattered.low)
-            self.high.copy_(scattered.high)
+        over = {"dt": plant.dt, "horizon": min(self._acting.horizon, records.shape[1] - 1) * plant.dt}
+        fitted: Decaying | Scattered = Decaying.fitted(records, **over)
+        if isinstance(self.forecast, Scattered):
+            fitted = Scattered.fitted(fitted, records, **over, pairs=self._config.pairs)
+            fitted.deviations = fitted.reaching(self.forecast.deviations.shape[1])
+        self.forecast.load_state_dict(fitted.state_dict())
 
     @property
     def solves(self) -> list[Solve]:
@@ -164,19 +428,12 @@ class PredictiveControl(nn.Module):
         self._acting.solves.clear()
 
     @torch.no_grad()
-    def act(
-        self, t: float, state: Float[Tensor, "batch n_s"], exogenous: Float[Tensor, "batch n_z"]
-    ) -> Float[Tensor, "batch n_a"]:
+    def act(self, t: float, state: State, exogenous: Input) -> Action:
         return self._acting.act(t, state, exogenous)
 
     @torch.no_grad()
     def fly(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        closure: nn.Module | None = None,
-        *,
-        plant: Plant | None = None,
+        self, initial_state: Starts, exogenous: Inputs, closure: nn.Module | None = None, *, plant: Plant | None = None
     ) -> Trajectory:
         self._virtual.prepare(*self._typical)
         flown = self._virtual.fly(initial_state, exogenous, closure, plant=plant)

@@ -29,9 +29,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.control.command_cost import PENALTY, CommandCost, PenalisedInterval, TerminalCost
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig, descend, projected_gradient
+from rt_torchrl.control.command_cost import (
+    BoundedDescentConfig,
+    CommandCost,
+    PenalisedInterval,
+    Plans,
+    TerminalCost,
+    descend,
+    projected_gradient,
+)
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Costs, Inputs, Starts, State
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.interval import Drive
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
@@ -80,18 +88,12 @@ class RelaxedCost(CommandCost):
         super().__init__(plant, closure, terminal=terminal)
         self.closure, self.interval = closure, RelaxedInterval(plant, closure, FIRST_WEIGHT)
 
-    def begin(
-        self,
-        initial_state: Float[Tensor, "batch n_s"],
-        exogenous: Float[Tensor, "batch n n_z"],
-        *,
-        start: float = 0.0,
-    ) -> None:
+    def begin(self, initial_state: Starts, exogenous: Inputs, *, start: float = 0.0) -> None:
         """Set the window, without shifts; see :meth:`CommandCost.begin`."""
         self._n_z, self._charged = exogenous.shape[-1], False
         super().begin(initial_state, torch.nn.functional.pad(exogenous, (0, len(self.plant.actions))), start=start)
 
-    def charge(self, unit: Float[np.ndarray, "batch n n_a"], weight: float) -> None:
+    def charge(self, unit: Plans, weight: float) -> None:
         """Charge what is held back by a new weight w; the shifts become the differences v − Π(v) under some commands.
 
         Without shifts of an earlier charge they stay zero.
@@ -108,12 +110,12 @@ class RelaxedCost(CommandCost):
         super().begin(self._state[:, :-1], torch.cat([z, shifts], -1), start=self._drive.t[0].item())
         self._charged = True
 
-    def excess(self, unit: Float[np.ndarray, "batch n n_a"]) -> float:
+    def excess(self, unit: Plans) -> float:
         """Greatest distance of a command from what real actuators would make of it, in units of its range."""
         return self._differences(unit, torch.zeros(len(self.plant.actions), dtype=torch.float64)).abs().max().item()
 
     @torch.no_grad()
-    def _differences(self, unit: np.ndarray, shifts: Tensor) -> Float[Tensor, "batch n n_a"]:
+    def _differences(self, unit: np.ndarray, shifts: Tensor) -> Actions:
         """v − Π(v) in units of the range."""
         self(unit)  # which leaves the states
         each = [self._states[k, :-1, :-1, : group.live] for k, group in enumerate(self._groups)]
@@ -123,12 +125,10 @@ class RelaxedCost(CommandCost):
         return (shifted - self.plant.actuate(states, shifted)) / (high - low)
 
 
-def held_back(plant: Plant, state: Float[Tensor, "batch n_s"]) -> bool:
+def held_back(plant: Plant, state: State) -> bool:
     """Whether the actuators hold back some of the commands at the ends of all ranges, such as by rate limits."""
-    ends = bounds(plant.actions)
-    return any(
-        not torch.equal(plant.actuate(state, end.expand(len(state), -1)), end.expand(len(state), -1)) for end in ends
-    )
+    ends = [end.expand(len(state), -1) for end in bounds(plant.actions)]
+    return not all(torch.equal(plant.actuate(state, end), end) for end in ends)
 
 
 class Clairvoyant(NamedTuple):
@@ -145,12 +145,12 @@ class Clairvoyant(NamedTuple):
         gradients: number of gradients of all episodes together.
     """
 
-    costs: Float[Tensor, " batch"]
+    costs: Costs
     flown: Trajectory
-    gradient: Float[Tensor, " batch"]
+    gradient: Costs
     excess: float
-    start_costs: dict[str, Float[Tensor, " batch"]]
-    first_costs: dict[str, Float[Tensor, " batch"]]
+    start_costs: dict[str, Costs]
+    first_costs: dict[str, Costs]
     gradients: int
 
     def spread(self, *, first: bool = False) -> dict[str, float]:
@@ -177,13 +177,12 @@ _Descent = Callable[[np.ndarray, BoundedDescentConfig], _End]
 
 def clairvoyant(
     plant: Plant,
-    initial_state: Float[Tensor, "batch n_s"],
-    exogenous: Float[Tensor, "batch n n_z"],
-    starts: Mapping[str, Float[Tensor, "batch n n_a"]],
+    initial_state: Starts,
+    exogenous: Inputs,
+    starts: Mapping[str, Actions],
     *,
     closure: nn.Module | None = None,
     hold: int = 1,
-    penalty: float = PENALTY,
     config: BoundedDescentConfig | None = None,
 ) -> Clairvoyant:
     """Descend the costs of episodes by all their commands, from several starts.
@@ -202,10 +201,9 @@ def clairvoyant(
         plant: the plant.
         initial_state: initial states of the episodes.
         exogenous: exogenous inputs of the episodes, all known.
-        starts: commands from which a descent starts, by name; see :func:`constant_starts` and :func:`random_starts`.
+        starts: commands from which a descent starts, by name; see :func:`constant_starts` and :func:`random_start`.
         closure: closure of the system; None for the plant's own.
         hold: number of control intervals for which a command is held.
-        penalty: weight of (command − applied)² over the squared range, in units of L_a, for commands that are held.
         config: parameters of the descents; the twenty that follow each other share the iterations.
 
     Raises:
@@ -215,7 +213,7 @@ def clairvoyant(
     if not starts:
         raise ValueError("starts is empty; name at least one, such as the commands of a classical controller.")
     closure, config = constant(plant.closure if closure is None else closure), config or BoundedDescentConfig()
-    cost = CommandCost(plant, closure, hold=hold, penalty=penalty, terminal=plant.terminal_cost)
+    cost = CommandCost(plant, closure, hold=hold, terminal=plant.terminal_cost)
     cost.begin(initial_state, exogenous)
     episodes = Scenario(initial_state, exogenous)
     descent: _Descent = partial(_ended, cost, episodes)
@@ -231,12 +229,11 @@ def clairvoyant(
             costs[name], first[name] = ends[name].costs, ended.costs
     if not ends:
         raise DivergenceError(f"plant {plant.name!r} diverges from every start: {', '.join(starts)}.")
-    best, slope = _best_of_each(costs, ends)
-    commands, (low, high) = cost.commands(best, exogenous.shape[1]), bounds(plant.actions)
+    best = _best(*ends.values())
+    commands, (low, high) = cost.commands(best.point, exogenous.shape[1]), bounds(plant.actions)
     flown = Rollout(plant, closure)(initial_state, exogenous, commands)
-    excess = ((commands - flown.actions) / (high - low)).abs().max().item()
-    gradients = sum(end.evaluations for end in ends.values())
-    return Clairvoyant(control_cost(plant, flown), flown, torch.from_numpy(slope), excess, costs, first, gradients)
+    excess, slope = ((commands - flown.actions) / (high - low)).abs().max().item(), torch.from_numpy(best.slope)
+    return Clairvoyant(control_cost(plant, flown), flown, slope, excess, costs, first, best.evaluations)
 
 
 def constant_starts(plant: Plant, batch: int, n: int) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:
@@ -245,13 +242,10 @@ def constant_starts(plant: Plant, batch: int, n: int) -> dict[str, Float[Tensor,
     return {f"constant {share:g}": (low + share * (high - low)).expand(batch, n, -1) for share in (0.25, 0.5, 0.75)}
 
 
-def random_starts(
-    plant: Plant, batch: int, n: int, *, generator: torch.Generator, count: int = 1
-) -> dict[str, Float[Tensor, "{batch} {n} n_a"]]:
+def random_start(plant: Plant, batch: int, n: int, *, generator: torch.Generator) -> Float[Tensor, "{batch} {n} n_a"]:
     """Commands that are uniform on the ranges, drawn for every interval."""
     low, high = bounds(plant.actions)
-    draws = (torch.rand(batch, n, len(plant.actions), generator=generator, dtype=torch.float64) for _ in range(count))
-    return {f"random {k}": low + (high - low) * draw for k, draw in enumerate(draws)}
+    return low + (high - low) * torch.rand(batch, n, len(plant.actions), generator=generator, dtype=torch.float64)
 
 
 def _together(cost: CommandCost, point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -259,7 +253,7 @@ def _together(cost: CommandCost, point: np.ndarray) -> tuple[float, np.ndarray]:
     return float(costs.mean()), gradient / len(costs)
 
 
-def _costs(cost: CommandCost, episodes: Scenario, point: np.ndarray) -> Float[Tensor, " batch"]:
+def _costs(cost: CommandCost, episodes: Scenario, point: np.ndarray) -> Costs:
     """J_a of each episode, without penalty or charge."""
     commands = cost.commands(point, episodes.exogenous.shape[1])
     return Rollout(cost.plant, cost.interval.closure).costs(*episodes, commands)
@@ -299,18 +293,13 @@ def _again(descent: _Descent, config: BoundedDescentConfig, first: _End) -> _End
         second = descent(start, dataclasses.replace(config, iterations=max(1, config.iterations // 2)))
     except FloatingPointError:
         return first
-    better = (second.costs < first.costs).numpy()
-    return _End(
-        np.where(better[:, None, None], second.point, first.point),
-        torch.minimum(first.costs, second.costs),
-        np.where(better, second.slope, first.slope),
-        first.evaluations + second.evaluations,
-    )
+    return _best(first, second)
 
 
-def _best_of_each(costs: Mapping[str, Tensor], ends: Mapping[str, _End]) -> tuple[np.ndarray, np.ndarray]:
-    """The best commands of each episode, and the norms of their gradients."""
-    names = list(ends)
-    chosen = [ends[names[k]] for k in torch.stack([costs[name] for name in names]).argmin(0).tolist()]
-    best = np.stack([end.point[episode] for episode, end in enumerate(chosen)])
-    return best, np.stack([end.slope[episode] for episode, end in enumerate(chosen)])
+def _best(*ends: _End) -> _End:
+    """The best of several ends, episode by episode; of equal ones the first."""
+    costs = torch.stack([end.costs for end in ends])
+    chosen = list(enumerate(costs.argmin(0).tolist()))
+    point = np.stack([ends[k].point[episode] for episode, k in chosen])
+    slope = np.stack([ends[k].slope[episode] for episode, k in chosen])
+    return _End(point, costs.amin(0), slope, sum(end.evaluations for end in ends))

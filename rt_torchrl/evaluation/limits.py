@@ -1,4 +1,4 @@
-"""The limit of a plant's cost, and how far classical controllers and model predictive control are from it."""
+"""The limit of a plant's cost, the best of a class of policies, and how far controllers are from it."""
 
 import dataclasses
 import math
@@ -6,20 +6,22 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
+from rt_torchrl.control.command_cost import BoundedDescentConfig
 from rt_torchrl.control.forecasts import Decaying, Forecast, Foreseen, Held, Scattered
-from rt_torchrl.control.predictive_control import PredictiveConfig
-from rt_torchrl.control.receding_horizon import BoundedDescentConfig, RecedingHorizon, RecedingHorizonConfig
-from rt_torchrl.evaluation.clairvoyant import Clairvoyant, clairvoyant, constant_starts, random_starts
-from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.control.predictive_control import PredictiveConfig, RecedingHorizon
+from rt_torchrl.evaluation.clairvoyant import clairvoyant, constant_starts, random_start
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
 from rt_torchrl.options import check_options
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Actions, Inputs
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -28,6 +30,10 @@ from rt_torchrl.trajectories.trajectory import Trajectory
 RECORDS = 20
 """Number of episodes, with other draws, whose inputs a forecast is fitted to."""
 RECORDS_SEED = 0
+CALLS = 50
+"""Number of actions that are timed."""
+REST = 0.2
+"""Longest part of an episode, as a share of it, in which a start may rest at its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,19 +97,22 @@ def judged(
 
 
 def limit(
-    episodes: UnseenEpisodes,
-    starts: Mapping[str, Float[Tensor, "batch n n_a"]],
-    *,
-    hold: int,
-    config: BoundedDescentConfig,
+    episodes: UnseenEpisodes, starts: Mapping[str, Actions], *, hold: int, config: BoundedDescentConfig
 ) -> Contender:
-    """The clairvoyant optimum from commands by name; see :func:`clairvoyant`."""
+    """The clairvoyant optimum from commands by name, see :func:`clairvoyant`, with what says that it is an optimum."""
     plant, state, exogenous = episodes.plant, episodes.initial_state, episodes.exogenous
     found = clairvoyant(plant, state, exogenous, starts, closure=episodes.known_closure(), hold=hold, config=config)
-    return judged(episodes, found.flown, None, **evidence(found))
+    evidence = {
+        "projected_gradient": found.gradient.max().item(),
+        "excess": found.excess,
+        "above_the_best": found.spread(),
+        "above_the_best_at_first": found.spread(first=True),
+        "gradients": found.gradients,
+    }
+    return judged(episodes, found.flown, None, **evidence)
 
 
-def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Float[Tensor, "batch n n_a"]]:
+def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Actions]:
     """The commands of the controllers, some of which rest at the end."""
     starts = {}
     for name, kind in config.starts.items():
@@ -115,68 +124,48 @@ def flown_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Flo
     return starts
 
 
-def few_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Float[Tensor, "batch n n_a"]]:
+def few_starts(episodes: UnseenEpisodes, config: LimitConfig) -> dict[str, Actions]:
     """The commands of the controllers, and the middle of all ranges, where a descent knows nothing of them."""
     middle = constant_starts(episodes.plant, len(episodes.initial_state), episodes.plant.n_steps)["constant 0.5"]
     return flown_starts(episodes, config) | {"constant 0.5": middle}
 
 
-def general_starts(episodes: UnseenEpisodes, *, seed: int) -> dict[str, Float[Tensor, "batch n n_a"]]:
+def general_starts(episodes: UnseenEpisodes, *, seed: int) -> dict[str, Actions]:
     """Constant commands, and random ones of a seed."""
-    plant, batch = episodes.plant, len(episodes.initial_state)
-    generator = torch.Generator().manual_seed(seed)
-    starts = constant_starts(plant, batch, plant.n_steps)
-    return starts | random_starts(plant, batch, plant.n_steps, generator=generator)
+    plant, generator = episodes.plant, torch.Generator().manual_seed(seed)
+    shape = len(episodes.initial_state), plant.n_steps
+    return constant_starts(plant, *shape) | {"random 0": random_start(plant, *shape, generator=generator)}
 
 
-def resting_at_the_end(
-    episodes: UnseenEpisodes, commands: Float[Tensor, "batch n n_a"], *, most: float = 0.2, count: int = 25
-) -> Float[Tensor, "batch n n_a"]:
+def resting_at_the_end(episodes: UnseenEpisodes, commands: Actions) -> Actions:
     """The commands, but the least ones for the last part of each episode, which is as long as costs least.
 
     Nobody pays for the state at the end of an episode, so that an optimum may rest there; a descent from commands that
-    act until the end hardly finds it.
-
-    Args:
-        episodes: the episodes.
-        commands: commands of whole episodes.
-        most: longest part, as a share of the episode.
-        count: number of lengths that are tried.
+    act until the end hardly finds it. Twenty-five lengths are tried.
     """
     rollout = Rollout(episodes.plant, episodes.known_closure())
     low, n = bounds(episodes.plant.actions)[0], commands.shape[1]
-    ends = [round(n * (1.0 - most * k / count)) for k in range(count + 1)]
+    ends = [round(n * (1.0 - REST * k / 25)) for k in range(26)]
     tried = [torch.cat([commands[:, :end], low.expand(len(commands), n - end, -1)], 1) for end in ends]
     costs = torch.stack([rollout.costs(episodes.initial_state, episodes.exogenous, each) for each in tried])
     return torch.stack([tried[k][episode] for episode, k in enumerate(costs.argmin(0).tolist())])
 
 
-def evidence(found: Clairvoyant) -> dict[str, Any]:
-    """What says that commands are an optimum."""
-    return {
-        "projected_gradient": found.gradient.max().item(),
-        "excess": found.excess,
-        "above_the_best": found.spread(),
-        "above_the_best_at_first": found.spread(first=True),
-        "gradients": found.gradients,
-    }
-
-
-def classical(episodes: UnseenEpisodes, kind: type[ClassicalController], *, calls: int = 50) -> Contender:
-    """A classical controller with its default gains; ``calls`` is the number of actions that are timed."""
+def classical(episodes: UnseenEpisodes, kind: type[ClassicalController]) -> Contender:
+    """A classical controller with its default gains."""
     controller = kind(episodes.physics)
     flown, state = episodes.fly_baseline(controller), episodes.initial_state[:1, : len(episodes.plant.readings)]
     memory = controller.first_memory(state)
-    return judged(episodes, flown, timed(lambda: controller.law(state, memory), calls))
+    return judged(episodes, flown, timed(lambda: controller.law(state, memory)))
 
 
-def learned(episodes: UnseenEpisodes, policy: nn.Module, *, calls: int = 50) -> Contender:
-    """A trained policy; ``calls`` is the number of actions that are timed, each of one observation."""
+def learned(episodes: UnseenEpisodes, policy: nn.Module) -> Contender:
+    """A trained policy; what is timed is an action of one observation."""
     plant, flown = episodes.plant, episodes.fly(policy)
     if isinstance(policy, StateFeedback):
         return judged(episodes, flown, None)
     seen = torch.zeros(1, dtype=torch.float64), episodes.initial_state[:1], episodes.exogenous[:1, 0]
-    return judged(episodes, flown, timed(lambda: policy(plant.observe(*seen)), calls))
+    return judged(episodes, flown, timed(lambda: policy(plant.observe(*seen))))
 
 
 def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
@@ -196,7 +185,7 @@ def fitting(window: PredictiveConfig, plant: Plant) -> PredictiveConfig:
 
 
 def receding(
-    episodes: UnseenEpisodes, model: Plant, closure: nn.Module, config: RecedingHorizonConfig, forecast: Forecast
+    episodes: UnseenEpisodes, model: Plant, closure: nn.Module, config: PredictiveConfig, forecast: Forecast
 ) -> Contender:
     """Model predictive control on a model with a closure, such as those of the system, or those of a twin."""
     exact = episodes.known_closure()
@@ -215,7 +204,7 @@ def predictive(episodes: UnseenEpisodes, window: PredictiveConfig) -> Contender:
     return receding(episodes, episodes.plant, episodes.known_closure(), window, known[window.forecast])
 
 
-def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], window: PredictiveConfig) -> dict[str, Forecast]:
+def forecasts(plant: Plant, exogenous: Inputs, window: PredictiveConfig) -> dict[str, Forecast]:
     """The forecasts that are compared: held, decaying to the mean as other episodes do, with its scatter, and known."""
     records = plant.draw_exogenous(RECORDS, torch.Generator().manual_seed(RECORDS_SEED))
     over = {"dt": plant.dt, "horizon": min(window.horizon, 0.5 * plant.horizon)}
@@ -225,10 +214,10 @@ def forecasts(plant: Plant, exogenous: Float[Tensor, "batch n n_z"], window: Pre
 
 
 @torch.no_grad()
-def timed(action: Callable[[], object], calls: int) -> dict[str, float]:
+def timed(action: Callable[[], object]) -> dict[str, float]:
     """Median and greatest wall-clock time of some calls of an action [ms]."""
     seconds = []
-    for _ in range(calls):
+    for _ in range(CALLS):
         began = time.perf_counter()
         action()
         seconds.append(time.perf_counter() - began)
@@ -238,3 +227,79 @@ def timed(action: Callable[[], object], calls: int) -> dict[str, float]:
 def in_milliseconds(seconds: list[float]) -> dict[str, float]:
     """Median and greatest of some times [ms]."""
     return {"median": 1e3 * statistics.median(seconds), "max": 1e3 * max(seconds)}
+
+
+@torch.no_grad()
+def untrained_costs(
+    unseen: UnseenEpisodes, make_policy: Callable[[torch.Generator], nn.Module], *, starts: int
+) -> Float[Tensor, " {starts}"]:
+    """Mean J_a of random initial policies; a training's cost over it does not depend on the training's own start.
+
+    Args:
+        unseen: the unseen episodes.
+        make_policy: function that draws a random policy of the class.
+        starts: number of policies.
+    """
+    device = unseen.initial_state.device
+    generator = torch.Generator(device=device).manual_seed(UNSEEN_SEED)
+    costs = [unseen.control_costs(make_policy(generator).to(device)).mean().item() for _ in range(starts)]
+    return torch.tensor(costs, dtype=torch.float64, device=device)
+
+
+TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
+FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}
+"""Numbers of gradients with which three starts of a small perceptron end within 3 % of each other."""
+
+
+class Optimum(NamedTuple):
+    """Best mean J_a found, its policy, and the cost that each start reached on the first few episodes."""
+
+    cost: float
+    policy: nn.Module
+    costs: list[float]
+
+
+def exact_optimum(
+    unseen: UnseenEpisodes,
+    make_policy: Callable[[torch.Generator], nn.Module],
+    *,
+    starts: int = 3,
+    iterations: int = 80,
+    few: int = 10,
+    polish: int = 20,
+    approach: int = 0,
+    seed: int = UNSEEN_SEED,
+) -> Optimum:
+    """The best policy of a class, found by exact gradients on the *true* plant and on the unseen episodes themselves.
+
+    Every start descends on a few episodes, because a gradient over a hundred episodes takes ten times as long and has
+    the same direction as one over ten. The best start goes on with all episodes.
+
+    Args:
+        unseen: the unseen episodes.
+        make_policy: function that draws a random policy of the class.
+        starts: number of random initial policies.
+        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes.
+        few: number of episodes on which every start descends.
+        polish: gradients of the best start, on all episodes.
+        approach: gradients of Adam from each start before those of L-BFGS. Perceptrons need some 600; L-BFGS alone
+            takes them to the next poor minimum.
+        seed: seed of the initial weights.
+    """
+    generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
+
+    def descend(policy: nn.Module, count: int, steps: int, *, approaching: int = 0) -> float:
+        rollout = unseen.rollout(policy)
+        state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
+
+        def cost() -> Tensor:
+            return rollout.costs(state, exogenous).mean()
+
+        if approaching:
+            by_small_steps(policy, cost, approaching)
+        return Descent(policy, TO_THE_END).run(cost, steps).best
+
+    policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
+    costs = [descend(policy, few, iterations, approaching=approach) for policy in policies]
+    best = policies[min(range(starts), key=costs.__getitem__)]
+    return Optimum(descend(best, len(unseen.initial_state), polish), best, costs)

@@ -1,13 +1,13 @@
 """Unseen episodes on a real system whose true closure nobody knows."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from rt_torchrl.evaluation.baseline import Baseline, RealController
-from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, Baseline, RealController, UnseenEpisodes
+from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
 from rt_torchrl.systems.real_system import RealSystem
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -36,7 +36,7 @@ class RealEpisodes(UnseenEpisodes):
     def fly(self, policy: nn.Module) -> Trajectory:
         return self._flown(policy, self._count)
 
-    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+    def control_costs(self, policy: nn.Module) -> Costs:
         return control_cost(self.plant, self.fly(policy))
 
     def validation(self) -> None:

@@ -1,7 +1,7 @@
-"""Evaluation of twin and policies on episodes that they were never trained on."""
+"""Evaluation of twin and policies on episodes that they were never trained on: on the plant, or on the twin."""
 
 import copy
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.baseline import Baseline
-from rt_torchrl.optimisers.descent import Descent, DescentConfig, by_small_steps
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.shapes import Costs
 from rt_torchrl.trajectories.rollout import DivergenceError, Rollout
 from rt_torchrl.trajectories.state_feedback import StateFeedback
-from rt_torchrl.trajectories.trajectory import Trajectory, control_cost, identification_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, batch_of, control_cost, identification_cost
+from rt_torchrl.trajectories.twin import DigitalTwin
 
 if TYPE_CHECKING:
     from rt_torchrl.plants.signal import StateBounds
@@ -24,6 +24,27 @@ UNSEEN_SEED = 1_000_000
 """Seed of the unseen episodes: the same for every training, so that trainings compare on common random numbers."""
 VALIDATION_SEED = 2_000_000
 """Seed of the validation episodes, on which a policy is chosen; its cost is then reported on the unseen episodes."""
+
+
+class RealController(nn.Module, ABC):
+    """A controller that can only be flown on the real system.
+
+    Args:
+        plant: physics and control problem of the twin.
+        compiled: compile what can be.
+    """
+
+    def __init__(self, plant: Plant, *, compiled: bool = False):
+        super().__init__()
+        self.plant = plant
+
+    @abstractmethod
+    def fly_real(self, count: int, *, seed: int) -> Trajectory:
+        """As many episodes of the sequence that belongs to a seed."""
+
+
+Baseline = ClassicalController | RealController
+"""A controller that is judged beside the policies: on the plant, or on a real system of which no closure is known."""
 
 
 class UnseenEpisodes:
@@ -83,9 +104,10 @@ class UnseenEpisodes:
         """Fly the episodes with a policy on the real system."""
         if isinstance(policy, StateFeedback):
             return policy.fly(self.initial_state, self.exogenous, self.known_closure(), plant=self.plant)
-        return self._rollout(policy)(self.initial_state, self.exogenous)
+        return self.rollout(policy)(self.initial_state, self.exogenous)
 
-    def _rollout(self, policy: nn.Module) -> Rollout:
+    def rollout(self, policy: nn.Module) -> Rollout:
+        """The closed loop of a policy and the real system."""
         return Rollout(self.plant, self.known_closure(), policy, compiled=self._compiled)
 
     def known_closure(self) -> nn.Module:
@@ -115,19 +137,18 @@ class UnseenEpisodes:
         return law.fly(self.initial_state, self.exogenous, self.closure, plant=self.plant)
 
     @torch.no_grad()
-    def control_costs(self, policy: nn.Module) -> Float[Tensor, " count"]:
+    def control_costs(self, policy: nn.Module) -> Costs:
         """J_a of each episode."""
         if isinstance(policy, StateFeedback):
             return control_cost(self.plant, self.fly(policy))
-        return self._rollout(policy).costs(self.initial_state, self.exogenous)
+        return self.rollout(policy).costs(self.initial_state, self.exogenous)
 
     def validation(self) -> "UnseenEpisodes | None":
         """Validation episodes: as many, with other draws, on the system as it is now; None if they would cost flights.
 
         A policy that is chosen by its cost on some episodes costs less on these than on others.
         """
-        device = self.initial_state.device
-        count = len(self.initial_state)
+        count, device = self.initial_state.shape[0], self.initial_state.device
         found = UnseenEpisodes(self.plant, count, compiled=self._compiled, device=device, seed=VALIDATION_SEED)
         found.closure = self.closure
         return found
@@ -144,7 +165,7 @@ class UnseenEpisodes:
         return self.plant.categories(self.exogenous)
 
     @torch.no_grad()
-    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Float[Tensor, " count"]:
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
         """J_p of each episode, which a twin replays with the flown actions and the true disturbances.
 
         The twin begins with what sensors read, and is compared with it. J_p is infinite where the twin diverges.
@@ -169,11 +190,65 @@ class UnseenEpisodes:
         return costs(slice(len(measured)))
 
 
+class TwinEpisodes(UnseenEpisodes):
+    """Episodes that are flown on the twin as it is now: the one that is most likely to be right.
+
+    The real system does not move. Costs here are what the twin says, not what the real system would cost. Initial
+    states and disturbances are the plant's draws. An episode in which the twin diverges costs NaN, and so do its mean
+    and its confidence interval.
+
+    Args:
+        twin: the twin.
+        plant: physics and control problem of the real system.
+        count: number of episodes, at least 2.
+        device: device of the twin.
+    """
+
+    judged_on = "twin"
+
+    def __init__(self, twin: DigitalTwin, plant: Plant, count: int = 20, *, device: torch.device | str = "cpu"):
+        super().__init__(plant, count, device=device)
+        self.closure, self._twin = None, twin
+
+    @property
+    def flying(self) -> Plant:
+        """The plant of the believed twin, which has more states than the real system's where a hypothesis adds some."""
+        return self._twin.believed.plant
+
+    @torch.no_grad()
+    def fly(self, policy: nn.Module) -> Trajectory:
+        """Fly the episodes with a policy on the twin; one in which the twin diverges is NaN from its first interval."""
+
+        def flown(start: Tensor, exogenous: Tensor) -> Trajectory:
+            try:
+                return self._twin.believed.control(policy, start, exogenous)
+            except DivergenceError:
+                if len(start) > 1:
+                    alone = (flown(start[k : k + 1], exogenous[k : k + 1]).each()[0] for k in range(len(start)))
+                    return batch_of(list(alone))
+                nan = start.new_full((1, exogenous.shape[1], start.shape[-1] + len(self.plant.actions)), torch.nan)
+                lost, actions = nan.split([start.shape[-1], len(self.plant.actions)], -1)
+                return Trajectory(torch.cat([start[:, None], lost], 1), actions, exogenous)
+
+        return flown(self.flying.at_rest(self.initial_state), self.exogenous)
+
+    @torch.no_grad()
+    def control_costs(self, policy: nn.Module) -> Costs:
+        return control_cost(self.flying, self.fly(policy))
+
+    def validation(self) -> None:
+        """No validation episodes, because the referee has compared the policies on the twin already."""
+
+    def identification_costs(self, physics: Plant, closure: nn.Module, flown: Trajectory) -> Costs:
+        """Not a number: the real system has not flown these episodes, so that no twin can be compared with it."""
+        return torch.full((len(flown.states),), torch.nan, dtype=torch.float64, device=flown.states.device)
+
+
 class Judged(NamedTuple):
     """J_a and the plant's own quantities of each unseen episode under one controller."""
 
-    control_costs: Float[Tensor, " count"]
-    merit: dict[str, Float[Tensor, " count"]]
+    control_costs: Costs
+    merit: dict[str, Costs]
 
     def means(self) -> dict[str, float]:
         """Mean of each of the plant's own quantities."""
@@ -193,89 +268,8 @@ class Judged(NamedTuple):
         return {"J_a": mean_with_confidence(self.control_costs[chosen]), "merit": merit}
 
 
-@torch.no_grad()
-def untrained_costs(
-    unseen: UnseenEpisodes,
-    make_policy: Callable[[torch.Generator], nn.Module],
-    *,
-    starts: int,
-    seed: int = UNSEEN_SEED,
-) -> Float[Tensor, " {starts}"]:
-    """Mean J_a of random initial policies; a training's cost over it does not depend on the training's own start.
-
-    Args:
-        unseen: the unseen episodes.
-        make_policy: function that draws a random policy of the class.
-        starts: number of policies.
-        seed: seed of the policies' weights.
-    """
-    device = unseen.initial_state.device
-    generator = torch.Generator(device=device).manual_seed(seed)
-    costs = [unseen.control_costs(make_policy(generator).to(device)).mean().item() for _ in range(starts)]
-    return torch.tensor(costs, dtype=torch.float64, device=device)
-
-
-TO_THE_END = DescentConfig(optimiser="lbfgs", rate=1.0)
-FOR_PERCEPTRONS = {"approach": 600, "iterations": 300, "polish": 150}
-"""Numbers of gradients with which three starts of a small perceptron end within 3 % of each other."""
-
-
-class Optimum(NamedTuple):
-    """Best mean J_a found, its policy, and the cost that each start reached on the first few episodes."""
-
-    cost: float
-    policy: nn.Module
-    costs: list[float]
-
-
-def exact_optimum(
-    unseen: UnseenEpisodes,
-    make_policy: Callable[[torch.Generator], nn.Module],
-    *,
-    starts: int = 3,
-    iterations: int = 80,
-    few: int = 10,
-    polish: int = 20,
-    approach: int = 0,
-    seed: int = UNSEEN_SEED,
-) -> Optimum:
-    """The best policy of a class, found by exact gradients on the *true* plant and on the unseen episodes themselves.
-
-    Every start descends on a few episodes, because a gradient over a hundred episodes takes ten times as long and has
-    the same direction as one over ten. The best start goes on with all episodes.
-
-    Args:
-        unseen: the unseen episodes.
-        make_policy: function that draws a random policy of the class.
-        starts: number of random initial policies.
-        iterations: gradients of L-BFGS from each start, on the first ``few`` episodes.
-        few: number of episodes on which every start descends.
-        polish: gradients of the best start, on all episodes.
-        approach: gradients of Adam from each start before those of L-BFGS. Perceptrons need some 600; L-BFGS alone
-            takes them to the next poor minimum.
-        seed: seed of the initial weights.
-    """
-    generator = torch.Generator(device=unseen.initial_state.device).manual_seed(seed)
-
-    def descend(policy: nn.Module, count: int, steps: int, *, approaching: int = 0) -> float:
-        rollout = unseen._rollout(policy)
-        state, exogenous = unseen.initial_state[:count], unseen.exogenous[:count]
-
-        def cost() -> Tensor:
-            return rollout.costs(state, exogenous).mean()
-
-        if approaching:
-            by_small_steps(policy, cost, approaching)
-        return Descent(policy, TO_THE_END).run(cost, steps).best
-
-    policies = [make_policy(generator).to(unseen.initial_state.device) for _ in range(starts)]
-    costs = [descend(policy, few, iterations, approaching=approach) for policy in policies]
-    best = policies[min(range(starts), key=costs.__getitem__)]
-    return Optimum(descend(best, len(unseen.initial_state), polish), best, costs)
-
-
-def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) -> dict[str, Any]:
-    """Mean and percentile-bootstrap confidence interval (2000 resamples), as ``metrics.json`` holds them.
+def mean_with_confidence(values: Float[Tensor, " n"]) -> dict[str, Any]:
+    """Mean and percentile-bootstrap 95 % confidence interval (2000 resamples), as ``metrics.json`` holds them.
 
     Of values that are not all finite, the mean and both ends of the interval are not finite either.
     """
@@ -285,7 +279,6 @@ def mean_with_confidence(values: Float[Tensor, " n"], *, level: float = 0.95) ->
     mean = float(numbers.mean())
     if not np.isfinite(numbers).all() or np.ptp(numbers) == 0.0:
         return {"mean": mean, "confidence_interval": [mean, mean]}
-    interval = bootstrap(
-        (numbers,), np.mean, n_resamples=2000, confidence_level=level, method="percentile", rng=np.random.default_rng(0)
-    ).confidence_interval
+    options = {"n_resamples": 2000, "method": "percentile", "rng": np.random.default_rng(0)}
+    interval = bootstrap((numbers,), np.mean, **options).confidence_interval
     return {"mean": mean, "confidence_interval": [float(interval.low), float(interval.high)]}

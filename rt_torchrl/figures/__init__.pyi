@@ -1,13 +1,10 @@
 """The figures of a training; ``__init__.py`` imports each at its first use, from the module named here."""
 
-from .episode import actions, exogenous, states
-from .flights import flights
-from .learning import closure_weights, learning_curves, seconds
-from .overview import figures_of
+from .comparison import flights, unseen
 from .policy import policy_contours
 from .snapshot import Snapshot
 from .style import pixels, save_figure, save_pixels
-from .unseen_episodes import unseen
+from .training import actions, closure_weights, exogenous, figures_of, learning_curves, seconds, states
 
 __all__ = [
     "Snapshot",

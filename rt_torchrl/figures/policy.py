@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from rt_torchrl.figures import style
 from rt_torchrl.figures.snapshot import Snapshot
-from rt_torchrl.figures.style import ROLES, array, caption, last_episode, legend_below, limits, panels, role_name
+from rt_torchrl.figures.style import ROLES, array, caption, legend_below, role_name
 from rt_torchrl.plants.signal import Signal
 from rt_torchrl.steps.config import Role
 from rt_torchrl.trajectories.state_feedback import StateFeedback
@@ -22,8 +22,10 @@ RESOLUTION = 81
 """Number of points along each observation."""
 SHOWN = 400
 """Greatest number of visited observations that are shown; more would hide the contours."""
+DOTS: dict[str, Any] = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.4, "alpha": 0.6}
 
 
+@torch.no_grad()
 def policy_contours(snapshot: Snapshot) -> Figure:
     """Every action as a function of the observations, model-based beside model-free on the same colour scale.
 
@@ -47,37 +49,35 @@ def _curves(snapshot: Snapshot) -> Figure:
     plant, seen = snapshot.plant, visited_observations(snapshot)
     # The axis has errors of both signs, so that it shows the target.
     axis = _axis(plant.observations[0], torch.cat([seen[:, 0], -seen[:, 0]]))
-    figure, axes = panels(
+    figure, axes = style.grid(
         len(plant.actions),
-        title=f"Policies after episode {last_episode(snapshot)}",
+        title=f"Policies after episode {style.last_episode(snapshot)}",
         size=(6.5, 1.2 + 2.4 * len(plant.actions)),
-        sharex=True,
+        xlabel=plant.observations[0].label,
     )
     for role in functions_of_observation(snapshot):
-        values = _evaluate(snapshot, role, axis[:, None])
-        for k, ax in enumerate(axes.flat):
+        values = array(snapshot.policies[role](axis[:, None]))
+        for k, ax in enumerate(axes):
             ax.plot(array(axis), values[:, k], color=ROLES[role], linewidth=1.8, label=role_name(role))
-    shown = array(seen[:: -(-len(seen) // SHOWN), 0])
-    for ax, action in zip(axes.flat, plant.actions, strict=True):
-        limits(ax, action)
+    shown = array(_some(seen[:, 0]))
+    for ax, action in zip(axes, plant.actions, strict=True):
+        style.limits(ax, action)
         ax.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
         rug = {"transform": ax.get_xaxis_transform(), "color": "0.4", "alpha": 0.4, "markersize": 7}
         ax.plot(shown, np.full_like(shown, 0.02), "|", label="visited", **rug)
         caption(ax, action.label)
-    axes[-1, 0].set_xlabel(plant.observations[0].label)
-    axes[-1, 0].set_xlim(axis[0].item(), axis[-1].item())
-    legend_below(figure, tuple(axes.flat))
+    axes[0].set_xlim(axis[0].item(), axis[-1].item())
+    legend_below(figure, axes)
     return figure
 
 
 def _contours(snapshot: Snapshot) -> Figure:
-    plant, mean = snapshot.plant, visited_observations(snapshot).mean(0)
+    mean, rows = visited_observations(snapshot).mean(0), len(snapshot.plant.actions)
     others = "" if len(mean) == 2 else "\nother observations at their mean in the last episode"
-    rows = len(plant.actions)
-    figure, axes = panels(
+    figure, axes = style.panels(
         rows,
         2,
-        title=f"Policies after episode {last_episode(snapshot)}{others}",
+        title=f"Policies after episode {style.last_episode(snapshot)}{others}",
         size=(9.5, 1.0 + 2.9 * rows),
         sharex=True,
         sharey=True,
@@ -90,6 +90,7 @@ def _contours(snapshot: Snapshot) -> Figure:
     return figure
 
 
+@torch.no_grad()
 def contours(
     snapshot: Snapshot,
     action: int,
@@ -112,7 +113,7 @@ def contours(
         points = others.expand(RESOLUTION**2, -1).clone()
         points[:, plane] = torch.cartesian_prod(*grid)
         for role in functions_of_observation(snapshot):
-            fields[plane, role] = _evaluate(snapshot, role, points)[:, action].reshape(RESOLUTION, RESOLUTION)
+            fields[plane, role] = array(snapshot.policies[role](points)[:, action]).reshape(RESOLUTION, RESOLUTION)
     levels = _levels(list(fields.values()))
     for plane, pair in planes.items():
         for role, ax in zip(ROLES, pair, strict=True):
@@ -122,7 +123,7 @@ def contours(
             else:
                 place: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "va": "center", "fontsize": 9}
                 ax.text(0.5, 0.5, "plans its actions:\nno function of the observation", **place)
-            _scatter(ax, array(seen[:, plane]))
+            ax.scatter(*array(_some(seen[:, plane])).T, label="visited in the last episode", **DOTS)
             caption(ax, role_name(role), "live" if role == snapshot.live else "idle")
             ax.set_xlabel(signals[plane[0]].label)
             ax.xaxis.set_major_locator(MaxNLocator(5))
@@ -136,15 +137,9 @@ def functions_of_observation(snapshot: Snapshot) -> list[Role]:
     return [role for role in ROLES if not isinstance(snapshot.policies[role], StateFeedback)]
 
 
-def _scatter(ax: Axes, seen: Float[np.ndarray, "n 2"]) -> None:
-    shown = seen[:: -(-len(seen) // SHOWN)]
-    style: dict[str, Any] = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.4, "alpha": 0.6}
-    ax.scatter(shown[:, 0], shown[:, 1], label="visited in the last episode", **style)
-
-
-@torch.no_grad()
-def _evaluate(snapshot: Snapshot, role: Role, points: Float[Tensor, "m n_o"]) -> Float[np.ndarray, "m n_a"]:
-    return array(snapshot.policies[role](points))
+def _some(seen: Tensor) -> Tensor:
+    """As many of the visited observations as are shown."""
+    return seen[:: -(-len(seen) // SHOWN)]
 
 
 def _axis(signal: Signal, seen: Float[Tensor, " n"]) -> Float[Tensor, " m"]:

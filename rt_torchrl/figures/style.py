@@ -16,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from torch import Tensor, nn
 
 from rt_torchrl.atomic_file import write_atomically
@@ -65,6 +66,39 @@ def panels(
     return figure, axes
 
 
+def grid(
+    count: int, columns: int = 1, *, title: str, size: tuple[float, float], xlabel: str, **layout: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a number of panels over one abscissa, row by row, whose label stands below the last of each column.
+
+    Args:
+        count: number of panels; there are as many rows as they need, and the last one need not be full.
+        columns: number of columns.
+        title: title of the figure.
+        size: width and height of the figure [inch].
+        xlabel: label of the abscissa.
+        layout: further arguments of ``Figure.subplots``.
+    """
+    figure, axes = panels(-(-count // columns), columns, title=title, size=size, sharex=True, **layout)
+    shown = axes.flat[:count].tolist()
+    for ax in axes.flat[count:]:
+        ax.remove()
+    for ax in shown[max(0, count - columns) :]:
+        ax.set_xlabel(xlabel)
+        ax.tick_params(labelbottom=True)
+    return figure, shown
+
+
+def timeline(
+    plant: Plant, intervals: int, count: int, columns: int = 1, **of_grid: Any
+) -> tuple[Figure, list[Axes], np.ndarray]:
+    """A :func:`grid` over the time of some control intervals, and the times of their ends, from 0 on."""
+    time, label = time_axis(plant, intervals)
+    figure, axes = grid(count, columns, xlabel=label, **of_grid)
+    axes[0].set_xlim(0.0, time[-1])
+    return figure, axes, time
+
+
 def pixels(figure: Figure) -> np.ndarray:
     """The figure drawn once at 120 dpi: red, green and blue of each pixel, (height, width, 3) of ``uint8``."""
     figure.set_dpi(120)
@@ -106,8 +140,10 @@ def legend_above(ax: Axes) -> None:
 def legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
     """Draw one legend for all panels below them, in as many columns as fit the figure."""
     entries = _entries(axes)
+    if not entries:
+        return
     # A line's sample takes about five letters of 0.085 inch.
-    width = 0.085 * (max(map(len, entries), default=0) + 5)
+    width = 0.085 * (max(map(len, entries)) + 5)
     columns = max(1, min(len(entries), int(figure.get_figwidth() / width)))
     handles, labels = list(entries.values()), list(entries)
     figure.legend(handles, labels, fontsize=9.5, frameon=False, loc="outside lower center", ncols=columns)
@@ -126,6 +162,13 @@ def limits(ax: Axes, signal: Signal, scale: float = 1.0) -> None:
     """Draw the finite ends of a signal's range, times ``scale``, as dashed lines."""
     for bound in filter(np.isfinite, (signal.low, signal.high)):
         ax.axhline(bound * scale, label="limits", **LIMIT_LINE)
+
+
+def plain_numbers(ax: Axes) -> None:
+    """Write 1, 2 and 5 of each decade on a logarithmic axis, as plain numbers."""
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def veil(ax: Axes, x: np.ndarray, visited: np.ndarray) -> None:
@@ -155,10 +198,10 @@ def closure_look(name: str) -> dict[str, Any]:
     return {"color": CLOSURE_COLOURS[name], "linestyle": CLOSURE_LINES[name], "linewidth": 1.8, "label": name}
 
 
-def time_axis(plant: Plant, samples: int) -> tuple[np.ndarray, str]:
-    """Times of the samples in s, min or h, whichever reads best, and the label of the axis."""
-    unit, length = time_unit(plant.dt * samples)
-    return plant.dt / length * np.arange(samples), f"time [{unit}]"
+def time_axis(plant: Plant, intervals: int) -> tuple[np.ndarray, str]:
+    """Start and ends of control intervals in s, min or h, whichever reads best, and the label of the axis."""
+    unit, length = time_unit(plant.dt * intervals)
+    return plant.dt / length * np.arange(intervals + 1), f"time [{unit}]"
 
 
 def time_unit(seconds: float) -> tuple[str, float]:

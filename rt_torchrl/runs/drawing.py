@@ -8,8 +8,7 @@ import numpy as np
 from torch import nn
 
 from rt_torchrl import figures
-from rt_torchrl.evaluation.baseline import Baseline
-from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.evaluation.unseen import Baseline, UnseenEpisodes
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.steps.config import Role
 

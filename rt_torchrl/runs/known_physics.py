@@ -2,7 +2,7 @@
 
 from rt_torchrl.contract.check import check_plant, require_controller
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.baseline import Baseline, RealController
+from rt_torchrl.evaluation.unseen import Baseline, RealController
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.configured_plant import require_plant
 from rt_torchrl.runs.run_config import RunConfig

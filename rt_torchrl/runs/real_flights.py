@@ -10,9 +10,8 @@ import torch
 from torch import nn
 
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.baseline import Baseline, RealController
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import Judged, mean_with_confidence
+from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController, mean_with_confidence
 from rt_torchrl.runs.run_config import RunConfig
 from rt_torchrl.steps.config import Role
 from rt_torchrl.steps.imitation import clones

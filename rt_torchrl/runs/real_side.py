@@ -6,8 +6,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.twin_episodes import TwinEpisodes
-from rt_torchrl.evaluation.unseen import UnseenEpisodes
+from rt_torchrl.evaluation.unseen import TwinEpisodes, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.plants.signal import StateBounds
 from rt_torchrl.runs.run_config import RunConfig

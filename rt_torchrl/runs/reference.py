@@ -6,8 +6,16 @@ from typing import Any
 import torch
 from torch import nn
 
-from rt_torchrl.evaluation.limits import Contender, LimitConfig, few_starts, limit, predictive
-from rt_torchrl.evaluation.unseen import FOR_PERCEPTRONS, UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.limits import (
+    FOR_PERCEPTRONS,
+    Contender,
+    LimitConfig,
+    exact_optimum,
+    few_starts,
+    limit,
+    predictive,
+)
+from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.runs.run_config import RunConfig
 
 

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from rt_torchrl.evaluation.baseline import Baseline
-from rt_torchrl.evaluation.closure_error import rms_error, visited_features
-from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes, mean_with_confidence
+from rt_torchrl.evaluation.checks import rms_error, visited_features
+from rt_torchrl.evaluation.unseen import Baseline, Judged, UnseenEpisodes, mean_with_confidence
 from rt_torchrl.plants.closures import described_weights, named_weights
 from rt_torchrl.plants.extension import ExtendedClosure
 from rt_torchrl.steps.config import Role

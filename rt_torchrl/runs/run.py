@@ -14,10 +14,10 @@ from torchrl.envs import EnvBase
 from rt_torchrl import figures
 from rt_torchrl.atomic_file import finite, write_json
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.baseline import Baseline, RealController
-from rt_torchrl.evaluation.gradient_check import engine_gap, require_agreement
+from rt_torchrl.evaluation.checks import engine_gap, require_agreement
+from rt_torchrl.evaluation.limits import untrained_costs
 from rt_torchrl.evaluation.real_episodes import RealEpisodes
-from rt_torchrl.evaluation.unseen import Judged, untrained_costs
+from rt_torchrl.evaluation.unseen import Baseline, Judged, RealController
 from rt_torchrl.figures.snapshot import Snapshot
 from rt_torchrl.interruption import Interrupted, Interruption, safe_point, termination_as_interrupt
 from rt_torchrl.plants.plant import Plant

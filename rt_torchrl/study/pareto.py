@@ -12,7 +12,8 @@ from torch import nn
 
 from rt_torchrl import figures
 from rt_torchrl.control.classical import ClassicalController
-from rt_torchrl.evaluation.unseen import Judged, Optimum, UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.limits import Optimum, exact_optimum
+from rt_torchrl.evaluation.unseen import Judged, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.configured_plant import physics_of, plant_of
 from rt_torchrl.runs.results_file import write_results
@@ -140,7 +141,7 @@ def keep(
         effort: how thoroughly the optima were sought.
         title: title of the figure.
     """
-    from rt_torchrl.figures.pareto import pareto  # here, because the help of a recipe need not wait for Matplotlib
+    from rt_torchrl.figures.comparison import pareto  # here, because the help of a recipe need not wait for Matplotlib
 
     front = [found._asdict() for found in points]
     classical = {name: found.merit for name, found in others.items()}

@@ -14,11 +14,12 @@ from rt_torchrl.control.classical import ClassicalController, tune
 from rt_torchrl.evaluation.limits import (
     Contender,
     LimitConfig,
+    exact_optimum,
     few_starts,
     limit,
     predictive,
 )
-from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes, exact_optimum
+from rt_torchrl.evaluation.unseen import UNSEEN_SEED, UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.runs.command_line import from_command_line, load_recipe
 from rt_torchrl.runs.configured_plant import physics_of, plant_of

@@ -1,14 +1,15 @@
-"""The check that a run makes before it trains: it compares the gradient of its engine with that of plain autograd."""
+"""Checks of a run: the gradient of its engine against that of plain autograd, and its closure where it has been."""
 
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.evaluation.unseen import UnseenEpisodes
 from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.rollout import Engine, Rollout
-from rt_torchrl.trajectories.trajectory import control_cost
+from rt_torchrl.trajectories.trajectory import Trajectory, control_cost
 
 STEPS = 40
 TOLERANCE = 1e-8
@@ -41,8 +42,7 @@ def engine_gap(
     Raises:
         ValueError: if no weight of the closure or the policy is trained.
     """
-    found, reference = (_gradient(plant, closure, policy, unseen, one) for one in (engine, "autograd"))
-    (gradient, _), (exact, cost) = found, reference
+    (gradient, _), (exact, cost) = (_gradient(plant, closure, policy, unseen, one) for one in (engine, "autograd"))
     if not exact.isfinite().all():
         return math.nan
     apart, scale = (gradient - exact).norm().item(), max(exact.norm().item(), NEGLIGIBLE * abs(cost))
@@ -86,3 +86,43 @@ def _gradient(
         return torch.zeros(sum(w.numel() for w in weights), dtype=cost.dtype, device=cost.device), cost.item()
     gradient = torch.autograd.grad(cost, weights, allow_unused=True, materialize_grads=True)
     return torch.cat([part.flatten() for part in gradient]), cost.item()
+
+
+class Probe(nn.Module):
+    """A closure that returns what another closure returns, and keeps the features that it was called with.
+
+    Args:
+        closure: closure that gives the coefficients.
+    """
+
+    def __init__(self, closure: nn.Module):
+        super().__init__()
+        self.closure = closure
+
+    def forward(self, features: Tensor) -> Tensor:
+        self.features = features
+        return self.closure(features)
+
+
+@torch.no_grad()
+def visited_features(plant: Plant, record: Trajectory) -> Float[Tensor, "n *elements n_f"]:
+    """The features on which the vector field calls its closure, in every sample of a real episode.
+
+    Args:
+        plant: plant with the closure of the real system.
+        record: the real episode.
+    """
+    probe = Probe(plant.closure)
+    clock = torch.arange(len(record.actions), dtype=torch.float64, device=record.states.device)
+    t = record.start + plant.dt * clock
+    plant.vector_field(t, record.states[:-1], record.actions, record.exogenous, probe)
+    return probe.features
+
+
+@torch.no_grad()
+def rms_error(
+    closure: nn.Module, true: nn.Module, features: Float[Tensor, "*points n_f"]
+) -> Float[Tensor, " n_coefficients"]:
+    """Root mean square error of every coefficient of a closure over the points."""
+    error = closure(features) - true(features)
+    return error.flatten(0, -2).square().mean(0).sqrt()

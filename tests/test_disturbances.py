@@ -1,4 +1,4 @@
-"""Wind of the turbine: the Kaimal spectrum against its formula, draws from records, and TurbSim's files."""
+"""Disturbances of the plants against their formulas, draws from records of wind, and TurbSim's files."""
 
 import math
 import struct
@@ -7,9 +7,12 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from scipy import integrate, signal
+from scipy import signal
 from seeds_and_numbers import seeded
 
+from rt_torchrl.envs.cryogenic_tank.disturbances import CyclicLoad
+from rt_torchrl.envs.flapping_wing.disturbances import GaussianGust
+from rt_torchrl.envs.flapping_wing.plant import FlappingWing
 from rt_torchrl.envs.wind_turbine.disturbances import KaimalWind, RecordedWind
 from rt_torchrl.envs.wind_turbine.turbsim import WindRecord, read_hh, read_wind
 
@@ -29,14 +32,6 @@ def periodogram(wind, dt):
     if n % 2 == 0:
         power[..., -1] /= 2.0
     return np.fft.rfftfreq(n, dt)[1:], power[..., 1:]
-
-
-def test_spectrum_is_the_formula_and_integrates_to_the_variance():
-    f = np.geomspace(1e-7, 1e5, 20001)
-    S = KaimalWind().spectrum(torch.from_numpy(f)).numpy()
-    np.testing.assert_allclose(S, kaimal(f), rtol=1e-13)
-    # Left out below 1e-7 Hz and above 1e5 Hz: 1e-5 of the variance each; trapezium rule: 1e-6.
-    assert integrate.trapezoid(S, f) == pytest.approx(SIGMA**2, rel=1e-4)
 
 
 @pytest.mark.parametrize("n", [N, N - 1])
@@ -174,13 +169,17 @@ T5 = 0.5 * np.arange(5)
         ([], [], "r.hh: holds 0 wind samples"),
         ([0.0], [8.0], "r.hh: holds 1 wind samples"),
         (T5, np.ones(4), r"r.hh: time has shape \(5,\) and speed \(4,\)"),
-        (T5, [8, 8, math.nan, 8, 8], "r.hh: wind speed at t = 1 s is nan .* interpolation"),
-        ([0, 0.5, math.nan, 1.5, 2], np.ones(5), "r.hh: time of sample 2 is nan"),
-        (T5, [8, -0.5, 8, 8, 8], "r.hh: wind speed at t = 0.5 s is -0.5 m/s; it must not be negative"),
-        (T5, [8, 1e42, 8, 8, 8], r"r.hh: wind speed at t = 0.5 s is 1e\+42 m/s; it must not exceed 200 m/s"),
+        (
+            T5,
+            [8, 8, math.nan, 8, 8],
+            "r.hh: wind speed at t = 1 s is nan m/s; it must be from 0 to 200 m/s.*fill the gap",
+        ),
+        ([0, 0.5, math.nan, 1.5, 2], np.ones(5), "r.hh: time goes from 0.5 s to nan s; it must increase"),
+        (T5, [8, -0.5, 8, 8, 8], "r.hh: wind speed at t = 0.5 s is -0.5 m/s; it must be from 0"),
+        (T5, [8, 1e42, 8, 8, 8], r"r.hh: wind speed at t = 0.5 s is 1e\+42 m/s; it must be from 0 to 200 m/s"),
         ([0, 0.5, 0.5, 1.0, 1.5], np.ones(5), "r.hh: time goes from 0.5 s to 0.5 s; it must increase"),
-        ([0, 0.5, 1.0, 2.5, 3.0], np.ones(5), "r.hh: gap after t = 1 s, 1.5 s instead of 0.5 s: 2 samples are missing"),
-        ([0, 0.5, 1.0, 1.6, 2.1], np.ones(5), "r.hh: unequal time step after t = 1 s, 0.6 s instead of 0.5 s"),
+        ([0, 0.5, 1.0, 2.5, 3.0], np.ones(5), "r.hh: the step after t = 1 s is 1.5 s instead of 0.5 s. Fill the gap"),
+        ([0, 0.5, 1.0, 1.6, 2.1], np.ones(5), "r.hh: the step after t = 1 s is 0.6 s instead of 0.5 s.*resample"),
     ],
 )
 def test_faulty_records_are_refused(time, speed, message):
@@ -238,7 +237,7 @@ def test_a_comment_behind_numbers_drops_no_row(tmp_path):
 @pytest.mark.parametrize(
     "spoil, message",
     [
-        (lambda lines: [*lines[:3], *lines[5:]], r"wind\.hh: gap after t = 1 s, .*: 2 samples are missing"),
+        (lambda lines: [*lines[:3], *lines[5:]], r"wind\.hh: the step after t = 1 s is 1.5 s"),
         (lambda lines: [lines[0].replace("8.00", " NaN"), *lines[1:]], r"wind\.hh, line 4: value 'NaN' is not finite"),
         (lambda lines: [*lines[:4], "********" + lines[4][8:]], r"wind\.hh, line 8: could not convert"),
         (lambda lines: [*lines[:9], lines[9][:20]], r"wind\.hh, line 13: 3 columns, but 8 are needed"),
@@ -347,3 +346,89 @@ def test_a_field_is_not_read_as_a_whole(tmp_path):
         file.write(content[:2] + sizes + content[18:79])
         file.truncate(79 + 2 * 3 * 103 * 104 * 1000)
     assert peak_memory(lambda: read_wind(path)) < 1e6
+
+
+def test_wind_has_the_mean_and_covariance_of_the_process():
+    draws, n, dt = 20_000, 26, 0.2
+    gust = GaussianGust(mean=1.5, std=0.8, time_scale=0.9)
+    wind = gust.draw(draws, n, dt, seeded()).numpy()
+    lag = dt * (np.arange(n)[:, None] - np.arange(n)[None])
+    # Standard errors are σ/√N = 0.0057 and at most σ²√(2/N) = 0.0064; four of them.
+    np.testing.assert_allclose(wind.mean(0), 1.5, atol=0.023)
+    np.testing.assert_allclose(np.cov(wind.T), 0.64 * np.exp(-0.5 * (lag / 0.9) ** 2), atol=0.026)
+
+
+def test_default_wind_is_the_papers():
+    wind = FlappingWing(dt=2.5e-3).draw_exogenous(4000, seeded(2))[:, ::400, 0]
+    # One standard error is 0.016 for the mean and 0.022 for the variance, at each of the five times.
+    torch.testing.assert_close(wind.mean(0), torch.ones(5, dtype=torch.float64), rtol=0, atol=0.064)
+    torch.testing.assert_close(wind.var(0), torch.ones(5, dtype=torch.float64), rtol=0, atol=0.09)
+    correlation = torch.corrcoef(wind.T)[0]
+    expected = torch.exp(-0.5 * (torch.arange(5, dtype=torch.float64) / 3.0) ** 2)
+    torch.testing.assert_close(correlation, expected, rtol=0, atol=0.064)
+
+
+def test_finer_sampling_is_the_same_gust():
+    coarse, fine = (GaussianGust().draw(2, n, 5.0 / n, seeded()) for n in (100, 1000))
+    torch.testing.assert_close(fine[:, ::10], coarse, rtol=0, atol=1e-13)
+
+
+def test_steady_wind():
+    wind = GaussianGust(mean=2.0, std=0.0).draw(2, 10, 0.1, seeded())
+    torch.testing.assert_close(wind, torch.full((2, 10), 2.0, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("arguments", [{"mean": math.inf}, {"std": -1.0}, {"time_scale": 0.0}])
+def test_bad_gust_raises(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        GaussianGust(**arguments)
+
+
+@pytest.mark.parametrize("request_", [(0, 10, 0.1), (1, 0, 0.1), (1, 10, 0.0)])
+def test_bad_draw_raises(request_):
+    with pytest.raises(ValueError, match="must be"):
+        GaussianGust().draw(*request_, seeded())
+
+
+def test_load_statistics():
+    load = CyclicLoad()
+    drawn = load.draw(20, 14_400, 30.0, seeded())
+    assert load.mean == pytest.approx(128.3, abs=0.1)
+    # One episode has 80 peaks and 14 400 samples of noise: 0.55 W, so 0.12 W over twenty.
+    assert drawn.mean().item() == pytest.approx(load.mean, abs=0.5)
+    by_phase = drawn.view(20, 80, 180).mean((0, 1))
+    phase = 30.0 * torch.arange(180, dtype=torch.float64)
+    profile = 50.0 + 250.0 * torch.exp(-0.5 * ((phase - 2700.0) / 675.0) ** 2)
+    assert (by_phase - profile).abs().max() < 5.0  # 25 W over the root of 1600 samples is 0.6 W
+    assert drawn.min() > 0.0 and 300.0 < drawn.max() < 50.0 + 275.0 + 44.0
+
+
+def test_noise_and_peaks_of_the_load():
+    noise = CyclicLoad(peak=0.0).draw(1, 20_000, 30.0, seeded()) - 50.0
+    assert noise.std().item() == pytest.approx(25.0, rel=0.02)
+    assert noise.abs().max().item() == pytest.approx(25.0 * math.sqrt(3.0), rel=1e-3)
+    heights = CyclicLoad(noise=0.0, minimum=0.0).draw(50, 180, 30.0, seeded())[:, 90] / 250.0
+    assert 0.9 < heights.min() < 0.93 and 1.07 < heights.max() < 1.1
+    assert (CyclicLoad(minimum=0.0, peak=0.0).draw(1, 1000, 30.0, seeded()) == 0).sum() > 400  # the floor
+
+
+def test_wide_peaks_overlap():
+    load = CyclicLoad(noise=0.0, variation=0.0, width=10_800.0)
+    # A train of peaks this wide is flat: its first harmonic is e^{−2π²(σ/T_h)²} = 5e-35.
+    torch.testing.assert_close(
+        load.draw(1, 500, 30.0, seeded()), torch.full((1, 500), load.mean).double(), rtol=1e-7, atol=0
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"minimum": -1.0}, {"peak": math.nan}, {"variation": 1.5}, {"period": 0.0}, {"width": -1.0}]
+)
+def test_bad_loads_raise(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        CyclicLoad(**arguments)
+
+
+@pytest.mark.parametrize("batch, n_steps, dt", [(0, 10, 30.0), (1, 0, 30.0), (1, 10, 0.0), (1, 10, math.nan)])
+def test_bad_draws_raise(batch, n_steps, dt):
+    with pytest.raises(ValueError, match="must be"):
+        CyclicLoad().draw(batch, n_steps, dt, seeded())

@@ -1,0 +1,141 @@
+"""Figures of controllers beside each other: one episode, all unseen episodes, and what one quantity costs another."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from rt_torchrl.evaluation.unseen import Judged
+from rt_torchrl.figures import style
+from rt_torchrl.figures.style import REFERENCE, ROLES, array, caption, legend_below, panels
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.trajectories.trajectory import Trajectory
+
+OTHERS = ("0.35", "#CC79A7", "#7f3c8d", "#a0522d")
+"""Colours of controllers that are no policies."""
+COLOURS: Mapping[str, str] = {str(role): colour for role, colour in ROLES.items()}
+MARKERS = ("o", "^", "s", "D")
+"""Marker of each kind of episodes."""
+WIDEST_LINEAR = 30.0
+"""Ratio of the greatest to the least value above which a panel is logarithmic."""
+
+
+@torch.no_grad()
+def flights(plant: Plant, flown: Mapping[str, Trajectory]) -> Figure:
+    """Setpoints and actions of one episode under several controllers, over time.
+
+    A plant that states no setpoints shows its states. The setpoints drawn are those of the first controller.
+
+    Args:
+        plant: physics that the states are those of.
+        flown: an episode under each controller, by name, with the policy that matters most first; none has a batch
+            dimension, and states beyond those of the plant are left out.
+    """
+    shown = {name: _held(plant, one) for name, one in flown.items()}
+    labels, intervals = list(next(iter(shown.values()))), max(len(one.actions) for one in flown.values())
+    rows = len(labels) + len(plant.actions)
+    size = (8.5, 1.0 + 1.75 * rows)
+    figure, axes, time = style.timeline(plant, intervals, rows, title="One unseen episode", size=size)
+    for place, (name, one) in enumerate(flown.items()):
+        look: dict[str, Any] = {"color": COLOURS.get(name, OTHERS[place % len(OTHERS)])}
+        look |= {"linewidth": 2.0 if place == 0 else 1.1, "label": style.role_name(name) if name in ROLES else name}
+        actions = array(one.actions)
+        for ax, quantity in zip(axes, labels, strict=False):
+            value, setpoint = shown[name][quantity]
+            ax.plot(time[: len(actions)], value, **look)
+            if setpoint is not None and place == 0:
+                ax.plot(time[: len(actions)], setpoint, label="setpoint", zorder=3, **style.REFERENCE_LINE)
+        for k, ax in enumerate(axes[len(labels) :]):
+            ax.step(time[: len(actions)], actions[:, k], where="post", **look)
+    for ax, label in zip(axes, (*labels, *(signal.label for signal in plant.actions)), strict=True):
+        caption(ax, label)
+    for ax, signal in zip(axes[len(labels) :], plant.actions, strict=True):
+        style.limits(ax, signal)
+    legend_below(figure, axes)
+    return figure
+
+
+def _held(plant: Plant, one: Trajectory) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
+    """Value and setpoint of each quantity at the start of every interval; the states where there are no setpoints."""
+    states = one.states[:-1, : len(plant.states)]
+    found = plant.setpoints(states, one.actions, one.exogenous)
+    if found:
+        return {label: (array(value), array(setpoint)) for label, (value, setpoint) in found.items()}
+    return {signal.label: (array(states[:, k]), None) for k, signal in enumerate(plant.states)}
+
+
+def unseen(judged: dict[str, Judged], categories: dict[str, Bool[Tensor, " count"]], *, where: str = "") -> Figure:
+    """J_a and every quantity of the plant's merit by controller, a point for each episode and a bar at each mean.
+
+    Args:
+        judged: results of each controller by name, with the policies first.
+        categories: episodes of each kind by name; each kind has its own marker.
+        where: words of the title that say where the episodes were flown, such as "on the twin".
+    """
+    first = next(iter(judged.values()))
+    quantities = {"$J_a$": {name: found.control_costs for name, found in judged.items()}}
+    quantities |= {name: {who: found.merit[name] for who, found in judged.items()} for name in first.merit}
+    count = len(first.control_costs)
+    title = f"{count} unseen episodes{f' {where}' if where else ''}, a point each; bar: mean"
+    figure, axes = panels(1, len(quantities), title=title, size=(max(4.5, 3.1 * len(quantities)), 4.2))
+    kinds = {kind: array(chosen) for kind, chosen in categories.items()} or {"": np.ones(count, dtype=bool)}
+    for ax, (name, values) in zip(axes.flat, quantities.items(), strict=True):
+        _strip(ax, {who: array(found) for who, found in values.items()}, kinds)
+        caption(ax, name)
+    if categories:
+        # The legend is grey, because the marker tells the kind and the colour tells the controller.
+        for marker, kind in zip(MARKERS, kinds, strict=False):
+            axes[0, 0].plot([], [], marker, color="0.4", markersize=6, markeredgewidth=0.0, label=kind)
+        legend_below(figure, [axes[0, 0]])
+    return figure
+
+
+def _strip(ax: Axes, values: dict[str, np.ndarray], kinds: dict[str, np.ndarray]) -> None:
+    """Draw a column of points for each controller, spread sideways so that they do not hide each other."""
+    rng = np.random.default_rng(0)
+    for column, (who, found) in enumerate(values.items()):
+        place = column + 0.25 * rng.uniform(-1.0, 1.0, len(found))
+        look: dict[str, Any] = {"color": COLOURS.get(who, REFERENCE), "alpha": 0.6, "markersize": 4.5}
+        for marker, chosen in zip(MARKERS, kinds.values(), strict=False):
+            ax.plot(place[chosen], found[chosen], marker, markeredgewidth=0.0, **look)
+        ax.plot([column - 0.35, column + 0.35], [found.mean()] * 2, color="0.1", linewidth=2.0)
+    together = np.concatenate(list(values.values()))
+    if together.min() > 0.0 and together.max() > WIDEST_LINEAR * together.min():
+        ax.set_yscale("log")
+    # Names take two lines, because four of them beside each other are wider than a panel.
+    ax.set_xticks(range(len(values)), [who.replace("_", "-\n") for who in values])
+    ax.set_xlim(-0.6, len(values) - 0.4)
+
+
+def pareto(
+    front: Sequence[tuple[float, float, float]],
+    others: Mapping[str, tuple[float, float]],
+    *,
+    title: str,
+    axes: tuple[str, str],
+) -> Figure:
+    """Optima along a weight as a curve, with the weight at each of them, and other controllers as points.
+
+    Args:
+        front: weight and the two quantities of each optimum.
+        others: the two quantities of each other controller, by name.
+        title: title of the figure.
+        axes: names of the two quantities, with their units.
+    """
+    figure, ((ax,),) = panels(1, title=title, size=(6.4, 4.6))
+    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
+    ax.plot([x for _, x, _ in front], [y for _, _, y in front], "o-", color=ROLES["model_based"], markersize=6)
+    for weight, x, y in front:
+        ax.annotate(f"{weight:g}", (x, y), xytext=(6, 5), **beside)
+    for name, (x, y) in others.items():
+        ax.plot([x], [y], "D", color=REFERENCE, markersize=7)
+        ax.annotate(name, (x, y), xytext=(8, -4), color=REFERENCE, **beside)
+    ax.set_xlabel(axes[0])
+    ax.set_ylabel(axes[1])
+    ax.margins(0.12)
+    return figure
