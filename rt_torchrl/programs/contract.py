@@ -54,7 +54,7 @@ CHANGING = (
 """Types of libraries whose objects hold what may change."""
 MADE_BY = {"abc", "types"}
 """Modules that classes name as theirs which are made by a call, whoever calls."""
-LIBRARIES = {"torch", "tensordict", "torchrl", "numpy", "scipy", "jaxtyping", "beartype"}
+LIBRARIES = {"torch", "tensordict", "torchrl", "numpy", "scipy", "sympy", "opt_einsum", "jaxtyping", "beartype"}
 FOREIGN = (sys.stdlib_module_names - MADE_BY) | LIBRARIES
 """Packages whose globals do not change."""
 OWN = __name__.partition(".")[0]
@@ -509,8 +509,9 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
             question changes a buffer; or if the answer for a realisation depends on the others.
     """
     last = tree_map(lambda x: x[-1:], arguments)
-    other = tree_map(lambda x: x[-1:].expand_as(x), arguments)
-    kept = {name: (buffer, buffer.clone()) for name, buffer in module.named_buffers()}
+    other = tree_map(lambda x: x[-1:].expand_as(x).clone(), arguments)
+    strided = {name: x for name, x in module.named_buffers() if x.layout is torch.strided}
+    kept = {name: (buffer, buffer.clone()) for name, buffer in strided.items()}
     first = module(*arguments).detach()
     module(*other)
     second = module(*arguments).detach()

@@ -323,7 +323,8 @@ def require_equal(what: str, computed: np.ndarray, exact: np.ndarray, scale: np.
         kind = UntraceableError if np.isfinite(exact[wrong]).all() else UncomparedError
         raise kind(
             f"{what} differs from what torch computes, for example {computed[wrong][0]} instead of {exact[wrong][0]}. "
-            "A number has left torch where tracing cannot follow it, such as by .numpy()"
+            "A number has left torch where tracing cannot follow it, such as by .numpy(), or torch itself is inexact, "
+            "as with integers beyond 2**53"
         )
 
 
