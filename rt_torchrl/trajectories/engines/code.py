@@ -389,7 +389,7 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (holdings.digest, lanes_of_this_machine(), *widths)
         code, alive = _kept.get(key, (None, tuple(holdings.alive)))
-        if isinstance(code, IntervalCode) and not code.outside.unchanged():
+        if isinstance(code, IntervalCode) and not code.outside.same():
             code, alive = None, tuple(holdings.alive)
         driven = any(x.requires_grad for x in drive)
         wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
