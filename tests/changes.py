@@ -350,7 +350,6 @@ REFUSED = {
     "global object of another module": "settings.OPTIONS",
     "global import": "imports 'settings_of_a_user' inside",
     "global import from": "imports 'settings_of_a_user' inside",
-    "attribute context variable": "the attribute thing, a ContextVar",
     "dict around a class": "variable table of the function around it, a dict",
 } | {
     f"class {kind}": "class attribute Attributed.thing" for kind in (*(name for name in HELD if "number" not in name),)

@@ -472,7 +472,6 @@ REFUSED = {
     "addmm alpha": "alpha",
     "hardtanh etc": "hardshrink_backward",
     "logcumsumexp": "logcumsumexp",
-    "cumprod": "gather",
     "det": "_linalg_det",
     "matrix_exp": "linalg_matrix_exp",
     "cdist": "_cdist",

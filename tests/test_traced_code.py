@@ -5,6 +5,7 @@ import warnings
 from collections import OrderedDict
 
 import changes
+import more_snippets
 import pytest
 import snippets
 import torch
@@ -25,21 +26,33 @@ from rt_torchrl.trajectories.engines.parallel import Parallel
 from rt_torchrl.trajectories.rollout import ENGINES, Rollout
 from rt_torchrl.trajectories.twin import DigitalTwin
 
+CASES, REFUSED = snippets.CASES | more_snippets.CASES, snippets.REFUSED | more_snippets.REFUSED
+REMEDIES = "use|make|write|take|multiply|eliminate|they belong|machine code has|compute"
+UNEQUAL = (*snippets.MIXED, *more_snippets.UNEQUAL, *more_snippets.NO_GRADIENT)
 
-@pytest.mark.parametrize(
-    "case", [case for case in snippets.CASES if case not in snippets.REFUSED and case not in snippets.MIXED]
-)
+
+@pytest.mark.parametrize("case", [case for case in CASES if case not in {*REFUSED, *UNEQUAL, *more_snippets.IMPURE}])
 def test_equals_eager(case):
     # Rounding, summed in another order: a Newton iteration amplifies it most.
-    for found, exact in compared(snippets.CASES[case], *signals(11, 3)):
+    for found, exact in compared(CASES[case], *signals(11, 3)):
         assert gap(found, exact) < 1e-10
 
 
-@pytest.mark.parametrize("case", snippets.REFUSED)
-def test_refused_with_the_line_of_the_code(case):
-    with pytest.raises(UntraceableError, match=re.escape(snippets.REFUSED[case])) as refusal:
-        traced(snippets.CASES[case], *signals(11, 3))
-    assert re.search(r"snippets\.py:\d+: .", str(refusal.value)), refusal.value
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_with_the_line_of_the_code_and_the_remedy(case):
+    with pytest.raises(UntraceableError, match=re.escape(REFUSED[case])) as refusal:
+        traced(CASES[case], *signals(11, 3))
+    assert re.search(r"snippets\.py:\d+: .", str(refusal.value)) or case == "deepcopy", refusal.value
+    assert re.search(
+        r"; (use|make|write|take|multiply|eliminate|they belong|machine code has|compute) |raises", str(refusal.value)
+    )
+
+
+@pytest.mark.parametrize("case", more_snippets.IMPURE)
+def test_no_function_of_its_arguments_is_refused_with_the_remedy(case):
+    remedy = "Policy, closure and plant must|Rows are systems of their own"
+    with pytest.raises(ImpureError, match=f"{more_snippets.IMPURE[case]}.*({remedy})"):
+        Native(compiled=False).end_states(CASES[case], *signals(11, 3))
 
 
 @pytest.mark.parametrize("case", snippets.MIXED)

@@ -9,8 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from rt_torchrl.contract.draws import draws, modules, signals
-from rt_torchrl.contract.gradients_and_tracing import forward_mode, gradients, stability, tracing, untraceable
-from rt_torchrl.contract.methods import Calls, costs, ends, methods, periods
+from rt_torchrl.contract.gradients_and_tracing import (
+    first_line,
+    forward_mode,
+    gradients,
+    stability,
+    tracing,
+    untraceable,
+)
+from rt_torchrl.contract.methods import Calls, costs, ends, judgement, made, method, periods
 from rt_torchrl.control.classical import ClassicalController
 from rt_torchrl.plants.plant import Plant
 
@@ -18,23 +25,15 @@ Check = Callable[[Calls], Iterable[str]]
 STATES = 3
 """Number of states that a classical controller is tried in."""
 ALWAYS = ("signals", "draws", "closures and policy")
-ON_FLIGHTS: dict[str, Check] = {
-    "shapes and purity": methods,
-    "costs": costs,
-    "early ends": ends,
-    "periods": periods,
-    "stability of the step": stability,
-    "gradients": gradients,
-    "forward mode": forward_mode,
-    "one graph": tracing,
-}
-
-OF_EPISODES = ("merit", "categories", "setpoints")
-ANYWHERE = "It must work for every leading dimension, under forward and reverse differentiation."
 EPISODES = (
     "It must take any number of episodes and of control intervals: read both from the shapes of its arguments, not "
     "from n_steps."
 )
+ANYWHERE = (
+    "It must work for every leading dimension, under forward and reverse differentiation; call .eval() on layers that "
+    "normalise a batch."
+)
+REMEDIES = dict.fromkeys(("merit", "categories", "setpoints"), EPISODES)
 
 
 class ContractReport(NamedTuple):
@@ -109,13 +108,12 @@ def check_plant(
             raise ValueError(f"{argument}={value} of the check must be at least 2.")
     if isinstance(plant, type):
         raise ValueError(f"plant={plant.__name__} is a class; give a plant, such as {plant.__name__}().")
-    plant = _on_cpu(plant)
-    found = list(signals(plant)) or list(attempt(draws, plant, seed)) + list(attempt(modules, plant, seed))
-    checks = ON_FLIGHTS if traced else {name: check for name, check in ON_FLIGHTS.items() if check is not tracing}
-    steps = min(steps, plant.n_steps)
-    found = found or _on_flights(plant, episodes, steps, seed, checks.values(), trained=trained)
-    if found:
-        raise PlantContractError(getattr(plant, "name", type(plant).__name__), found)
+    plant, steps = _on_cpu(plant), min(steps, plant.n_steps)
+    checks = {name: check for name, check in ON_FLIGHTS.items() if traced or check is not tracing}
+    violations = [*signals(plant)] or [*attempt(draws, plant, seed), *attempt(modules, plant, seed)]
+    violations = violations or _on_flights(plant, episodes, steps, seed, checks.values(), trained=trained)
+    if violations:
+        raise PlantContractError(getattr(plant, "name", type(plant).__name__), violations)
     reason = untraceable(Calls.at_the_start(plant, episodes, seed)) if traced else None
     return ContractReport(plant.name, (*ALWAYS, *checks), episodes, steps, plant.dt, reason)
 
@@ -131,42 +129,38 @@ def _on_flights(
 ) -> list[str]:
     """The violations that need states to be found; an early violation ends the search."""
     calls = Calls.at_the_start(plant, episodes, seed)
-    found = [*attempt(methods, calls), *attempt(stability, calls)]
-    if found:
-        return found
+    violations = [*attempt(methods, calls), *attempt(stability, calls)]
+    if violations:
+        return violations
     try:
         calls = Calls.in_flight(plant, episodes, steps, seed)
     except FloatingPointError as error:
         return [f"step: {error}"]
-    if not trained:
-        calls.closure.requires_grad_(False)
-    return [text for check in checks for text in attempt(check, calls)]
+    calls.closure.requires_grad_(trained)
+    return [text for check in (*checks, judgement) for text in attempt(check, calls)]
 
 
-def attempt(check: Callable[..., Iterable[str]], *arguments: Any) -> Iterator[str]:
-    """The violations that a check finds; an error that the plant raises is one more."""
+def attempt(check: Callable[..., Iterable[str]], subject: Plant | Calls, *rest: Any, name: str = "") -> Iterator[str]:
+    """The violations that a check finds; an error that the plant raises is one more, under the name of what failed."""
     try:
-        yield from check(*arguments)
+        yield from check(subject, *rest)
     except Exception as error:
-        method, place = _blamed(inspect.trace(), arguments[0])
+        plant, trace = subject.plant if isinstance(subject, Calls) else subject, inspect.trace()
+        own = [k for k, x in enumerate(trace) if x.frame.f_locals.get("self") is plant and hasattr(plant, x.function)]
+        method = trace[own[-1]].function if own else name or trace[-1].function
+        inside = trace[own[-1] if own else 0 :]
+        theirs = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
+        place = (theirs or inside)[-1]
         yield (
-            f"{method}: raised {type(error).__name__} in {place.filename}, line {place.lineno}: "
-            f"{str(error).splitlines()[0] if str(error) else ''}. {EPISODES if method in OF_EPISODES else ANYWHERE}"
+            f"{method}: raised {type(error).__name__} in {place.filename}, line {place.lineno}: {first_line(error)}. "
+            f"{REMEDIES.get(method, ANYWHERE)}"
         )
 
 
-def _blamed(trace: list[inspect.FrameInfo], checked: Plant | Calls) -> tuple[str, inspect.FrameInfo]:
-    """The method of the plant that raised an error, and the last frame of the user's code before the error.
-
-    If there is no frame of the plant, the call itself failed; the result is then the last frame.
-    """
-    plant = checked.plant if isinstance(checked, Calls) else checked
-    own = [frame for frame in trace if frame.frame.f_locals.get("self") is plant and hasattr(plant, frame.function)]
-    if not own:
-        return trace[-1].function, trace[-1]
-    inside = trace[trace.index(own[-1]) :]
-    theirs = [frame for frame in inside if "site-packages" not in frame.filename and frame.filename != "<string>"]
-    return own[-1].function, (theirs or inside)[-1]
+def methods(calls: Calls) -> Iterator[str]:
+    """Violations of every method, of the policy and of the neural closure."""
+    for found in (*calls.methods(), *made(calls)):
+        yield from attempt(method, calls, found, name=found.name)
 
 
 def require_controller(name: str, law: object, plant: Plant) -> None:
@@ -213,3 +207,15 @@ def _require(about: str, found: object, columns: int, why: str) -> None:
         )
     if not found.isfinite().all():
         raise ValueError(f"{about} numbers that are not finite for states that the plant draws.")
+
+
+ON_FLIGHTS: dict[str, Check] = {
+    "shapes and purity": methods,
+    "costs": costs,
+    "early ends": ends,
+    "periods": periods,
+    "stability of the step": stability,
+    "gradients": gradients,
+    "forward mode": forward_mode,
+    "one graph": tracing,
+}

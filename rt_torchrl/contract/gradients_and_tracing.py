@@ -1,7 +1,6 @@
 """Checks of what engines and compilers need: stable steps, exact derivatives in both modes, and traceable methods."""
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -87,11 +86,9 @@ def gradients(calls: Calls) -> Iterator[str]:
     arguments, told = calls.some(5), set()
     latest = {method.name: method for method in calls.methods()}  # under the twin's closure
     for method in calls.methods():
-        if method.name not in CHECKED or method.name in told:
-            continue
-        for argument in ("state", "command", "applied"):
-            if argument in method.takes:
-                for text in _by_argument(calls, method, arguments, argument):
+        if method.name in CHECKED and method.name not in told:
+            for argument in ("state", "command", "applied"):
+                for text in _by_argument(calls, method, arguments, argument) if argument in method.takes else ():
                     told.add(method.name)
                     yield text
     for name in ("vector_field", "step"):
@@ -103,121 +100,106 @@ def gradients(calls: Calls) -> Iterator[str]:
         yield from _by_weights(calls, command, arguments, policy, "policy")
 
 
-class _Derivative(NamedTuple):
-    """A directional derivative by reverse mode and by finite differences."""
-
-    reverse: Tensor
-    differences: Tensor
-
-
 def _by_argument(calls: Calls, method: Method, arguments: Arguments, argument: str) -> Iterator[str]:
-    measure = _measure(method, arguments, calls.seed)
-    value = arguments[argument].clone().requires_grad_()
-    gradient = _gradient(lambda: measure({**arguments, argument: value}), [value])
-    signals = getattr(calls.plant, SIGNALS[argument])
-    for k, signal in enumerate(signals):
-        shift = torch.zeros_like(value.detach())
-        size = 1e-3 + value.detach()[..., k].abs().max()
-        shift[..., k] = STEP * size
-        with torch.no_grad():
-            ends = [measure({**arguments, argument: value + sign * shift}) for sign in (1.0, -1.0)]
-        derivative = _Derivative(gradient[0][..., k] * size, (ends[0] - ends[1]) / (2.0 * STEP))
-        yield from _verdict(method.name, f"{argument} {signal.name!r}", derivative)
+    """Wrong derivatives along each signal of an argument, at each time and episode."""
+    value = arguments[argument].clone()
+    measure = _measure(method, {**arguments, argument: value}, calls.seed)
+    (gradient,) = _gradients(measure, [value.requires_grad_()])
+    for k, signal in enumerate(getattr(calls.plant, SIGNALS[argument])):
+        direction = torch.zeros_like(value)
+        direction[..., k] = 1e-3 + value.detach()[..., k].abs().max()
+        differences, slope = _along(value, direction, measure), (gradient * direction).sum(-1)
+        yield from _verdict(method.name, f"{argument} {signal.name!r}", slope, differences)
 
 
 def _by_weights(calls: Calls, method: Method, arguments: Arguments, module: nn.Module, whose: str) -> Iterator[str]:
     """Wrong derivatives along one random direction for each tensor of weights."""
-    measure = _measure(method, arguments, calls.seed)
+    measure, generator, dormant = _measure(method, arguments, calls.seed), seeded(calls.seed), _dormant(module)
     weights = {name: w for name, w in module.named_parameters() if w.requires_grad}
-    gradient = _gradient(lambda: measure(arguments).sum(), list(weights.values()))
-    generator, dormant = seeded(calls.seed), _dormant(module)
-    for (name, weight), slope in zip(weights.items(), gradient, strict=True):
+    for (name, weight), gradient in zip(weights.items(), _gradients(measure, [*weights.values()]), strict=True):
         direction = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
         direction *= 1e-3 + weight.detach().abs().max()
-        differences = _along(weight, direction, lambda: measure(arguments).sum())
-        derivative = _Derivative((slope * direction).sum(), differences)
-        violations = list(_verdict(method.name, f"{whose} weight {name!r}", derivative))
+        differences, slope = _along(weight, direction, measure).sum(), (gradient * direction).sum()
+        violations = [*_verdict(method.name, f"{whose} weight {name!r}", slope, differences)]
         yield from violations
-        matters = slope.any() or differences.any() or id(weight) in dormant
+        matters = gradient.any() or differences.any() or id(weight) in dormant
         if not violations and method.name == "vector_field" and not matters:
             yield (
-                f"vector_field: closure weight {name!r} changes it at none of {measure(arguments).numel()} states; "
-                "leave the weight out, or start it where it matters."
+                f"vector_field: closure weight {name!r} changes it at none of {measure().numel()} states; leave the "
+                "weight out, or start it where it matters."
             )
 
 
 def _dormant(closure: nn.Module) -> set[int]:
     """Weights of hidden layers that matter as soon as the last layer of their perceptron is no longer zero."""
-    found = [m.network for m in closure.modules() if isinstance(m, BoundedPerceptron)]
-    asleep = [network for network in found if not network[-1].get_parameter("weight").any()]
+    networks = [m.network for m in closure.modules() if isinstance(m, BoundedPerceptron)]
+    asleep = [network for network in networks if not network[-1].get_parameter("weight").any()]
     return {id(weight) for network in asleep for layer in network[:-1] for weight in layer.parameters()}
 
 
 @torch.no_grad()
-def _along(weight: nn.Parameter, direction: Tensor, measure: Callable[[], Tensor]) -> Tensor:
-    """The central difference along a direction; the weight then has its value again, to the bit."""
-    kept, ends = weight.clone(), []
+def _along(x: Tensor, direction: Tensor, measure: Callable[[], Tensor]) -> Tensor:
+    """The central difference along a direction of a tensor, which then has its value again, to the bit."""
+    kept, ends = x.clone(), []
     for sign in (1.0, -1.0):
-        weight.copy_(kept + sign * STEP * direction)
+        x.copy_(kept + sign * STEP * direction)
         ends.append(measure())
-    weight.copy_(kept)
+    x.copy_(kept)
     return (ends[0] - ends[1]) / (2.0 * STEP)
 
 
-def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[Arguments], Tensor]:
+def _measure(method: Method, arguments: Arguments, seed: int) -> Callable[[], Tensor]:
     """A random combination of a method's outputs, in units of their size, for each time and episode."""
     with torch.no_grad():
         outputs = method.outputs(arguments)
     generator, weights = seeded(seed), []
-    for (_, trailing), value in zip(method.gives.items(), outputs, strict=True):
+    for trailing, value in zip(method.gives.values(), outputs, strict=True):
         share = torch.randn(trailing, generator=generator, dtype=torch.float64)
         weights.append(share / (1e-3 + value.abs().amax((0, 1))))
 
-    def measure(changed: Arguments) -> Tensor:
-        pairs = zip(method.outputs(changed), weights, strict=True)
+    def measure() -> Tensor:
+        pairs = zip(method.outputs(arguments), weights, strict=True)
         return torch.stack([(value * w).reshape(*value.shape[:2], -1).sum(-1) for value, w in pairs]).sum(0)
 
     return measure
 
 
-def _gradient(measure: Callable[[], Tensor], inputs: list[Tensor]) -> list[Tensor]:
+def _gradients(measure: Callable[[], Tensor], inputs: list[Tensor]) -> Sequence[Tensor]:
     """The gradients by inputs, which are zero where autograd sees no path."""
     with torch.enable_grad():
         total = measure().sum()
         if not total.requires_grad:
             return [torch.zeros_like(x) for x in inputs]
-        return list(torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True))
+        return torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
 
 
-def _verdict(method: str, by: str, derivative: _Derivative) -> Iterator[str]:
-    reverse, differences = torch.broadcast_tensors(derivative.reverse.detach(), derivative.differences)
-    gap = (reverse - differences).abs()
-    bad = ~(gap <= ABSOLUTE + RELATIVE * differences.abs())
+def _verdict(method: str, by: str, slope: Tensor, differences: Tensor) -> Iterator[str]:
+    """A violation if a slope by autograd is not that by finite differences."""
+    bad = ~((slope - differences).abs() <= ABSOLUTE + RELATIVE * differences.abs())
+
+    def largest(values: Tensor) -> str:
+        picked = values[bad]
+        return f"{picked[picked.abs().argmax()].item():.6g}"
+
     if not bad.any():
         return
-    if not reverse.isfinite().all():
+    if not slope.isfinite().all():
         yield (
             f"{method}: its derivative by {by} is not finite; expected a finite slope everywhere: mind sqrt, norm and "
             "pow at zero, and torch.where, whose unused branch still passes its slope on."
         )
-    elif not reverse[bad].any():
+    elif not slope[bad].any():
         yield (
-            f"{method}: autograd finds no dependence on {by}, finite differences do ({_largest(differences, bad)}); "
-            "the path is cut: use torch operations on the tensors themselves, without detach, item, float, numpy, "
-            "torch.tensor or no_grad."
+            f"{method}: autograd finds no dependence on {by}, finite differences do ({largest(differences)}); the path "
+            "is cut: use torch operations on the tensors themselves, without detach, item, float, numpy, torch.tensor "
+            "or no_grad."
         )
     else:
         yield (
-            f"{method}: its derivative by {by} is {_largest(reverse, bad)}, by finite differences "
-            f"{_largest(differences, bad)} (in units of the signals' sizes, in {int(bad.sum())} of {bad.numel()} "
-            "places); a part of the path is cut (detach, item, numpy), or it jumps: use smooth laws, or torch.where "
-            "between laws that meet."
+            f"{method}: its derivative by {by} is {largest(slope)}, by finite differences {largest(differences)} (in "
+            f"units of the signals' sizes, in {int(bad.sum())} of {bad.numel()} places); a part of the path is cut "
+            "(detach, item, numpy), or it jumps: use smooth laws, or torch.where between laws that meet."
         )
-
-
-def _largest(values: Tensor, chosen: Tensor) -> str:
-    picked = values[chosen]
-    return f"{picked[picked.abs().argmax()].item():.6g}"
 
 
 def forward_mode(calls: Calls) -> Iterator[str]:
@@ -233,7 +215,7 @@ def forward_mode(calls: Calls) -> Iterator[str]:
         with without_warnings_of_libraries():
             jacobians = linearise(interval, (), state.detach(), drive)
     except Exception as error:
-        yield f"step: torch.func.jvp under vmap fails: {_first_line(error)} {_where(error)}Expected {TRACEABLE}."
+        yield f"step: torch.func.jvp under vmap fails: {first_line(error)} {_where(error)}Expected {TRACEABLE}."
         return
     rows = [torch.autograd.grad(end.sum(), state, retain_graph=True)[0] for end in interval(state, drive).unbind(-1)]
     reverse = torch.stack(rows, -2)
@@ -257,9 +239,9 @@ def tracing(calls: Calls) -> Iterator[str]:
             with raised_limits():
                 found = torch.compile(traced, fullgraph=True, backend="eager")(arguments)
         except Exception as error:
-            yield f"{method.name}: is not one graph: {_first_line(error)} {_where(error)}Expected {TRACEABLE}."
+            yield f"{method.name}: is not one graph: {first_line(error)} {_where(error)}Expected {TRACEABLE}."
             continue
-        for (name, _), one, other in zip(method.gives.items(), found, method.outputs(arguments), strict=True):
+        for name, one, other in zip(method.gives, found, method.outputs(arguments), strict=True):
             if not torch.allclose(one, other, rtol=1e-10, atol=1e-10):
                 yield f"{method.name}: {name} has another value when it is traced; expected {TRACEABLE}."
 
@@ -278,11 +260,12 @@ def untraceable(calls: Calls) -> str | None:
         interval = CostInterval(Interval(plant, calls.closure, policy))
         IntervalCode(interval, point, lanes).prepare_sweep(interval, False)
     except Exception as error:
-        return str(error) if isinstance(error, UntraceableError) else f"{type(error).__name__}: {_first_line(error)}"
+        return str(error) if isinstance(error, UntraceableError) else f"{type(error).__name__}: {first_line(error)}"
     return None
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
+    """The first line of what an error says, or its kind."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 

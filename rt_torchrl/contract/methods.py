@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rt_torchrl.contract.draws import GROUPS, misshapen, neural_closure_of, seeded, wanted_as
+from rt_torchrl.contract.draws import misshapen, neural_closure_of, seeded, wanted_as
 from rt_torchrl.plants.plant import Plant, require_end_cost
 from rt_torchrl.plants.signal import bounds, differences
 from rt_torchrl.programs.contract import PURE
@@ -83,7 +83,7 @@ class Calls:
         """Every method; a method that takes a closure comes with the true closure and with that of the twin."""
         plant = self.plant
         n_s, n_a, n_o = len(plant.states), len(plant.actions), len(plant.observations)
-        now = ("t", "state", "applied", "exogenous")
+        now, then = ("t", "state", "applied", "exogenous"), ("t", "state", "command", "exogenous")
         found = [
             Method("observe", plant.observe, ("t", "state", "exogenous"), {"observation": (n_o,)}),
             Method("running_cost", plant.running_cost, now, {"cost": ()}),
@@ -94,9 +94,7 @@ class Calls:
         ]
         for closure in (plant.closure, self.closure):
             found.append(self.field_under(closure, "vector_field"))
-            found.append(
-                Method("step", _under(plant.step, closure), _commanded(now), {"state": (n_s,), "applied": (n_a,)})
-            )
+            found.append(Method("step", _under(plant.step, closure), then, {"state": (n_s,), "applied": (n_a,)}))
         return found
 
     def field_under(self, closure: nn.Module, name: str) -> Method:
@@ -134,35 +132,22 @@ def _named(t: Tensor, state: Tensor, command: Tensor, exogenous: Tensor, applied
     return dict(zip(names, (t, state, command, exogenous, applied, state.roll(1, 1)), strict=True))
 
 
-def _commanded(names: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple("command" if name == "applied" else name for name in names)
-
-
 def _under(method: Callable[..., Any], closure: nn.Module) -> Callable[..., Any]:
     return lambda *arguments: method(*arguments, closure)
 
 
-@torch.no_grad()
-def methods(calls: Calls) -> Iterator[str]:
-    """Violations for one state, for a batch, and for times by batches, as engines, environment and costs call them."""
-    together = calls.some(2)
-    for method in calls.methods():
-        found = list(_shapes(method, together)) or list(_purity(method, together)) or list(_rows(method, together))
-        yield from found
-    made = [calls.commanded_by(calls.plant.make_policy(seeded(calls.seed)))]
+def made(calls: Calls) -> list[Method]:
+    """The command of the plant's policy and the rates under its neural closure, by what makes them."""
     neural = neural_closure_of(calls.plant)
-    if neural is not None:
-        made.append(calls.field_under(neural(seeded(calls.seed)), "make_neural_closure"))
-    for method in made:
-        try:
-            yield from list(_shapes(method, together)) or [*_purity(method, together), *_rows(method, together)]
-        except Exception as error:  # layers of torch may raise anything for some leading dimension
-            said = str(error).splitlines()[0] if str(error) else ""
-            yield (
-                f"{method.name}: what it makes raises {type(error).__name__}: {said}. It must work for every leading "
-                f"dimension: rows of one, a batch, and times by batches. {PURE}."
-            )
-    yield from _judgement(calls)
+    closures = [] if neural is None else [calls.field_under(neural(seeded(calls.seed)), "make_neural_closure")]
+    return [calls.commanded_by(calls.plant.make_policy(seeded(calls.seed))), *closures]
+
+
+@torch.no_grad()
+def method(calls: Calls, method: Method) -> Iterator[str]:
+    """Violations for one state, for a batch, and for times by batches, as engines, environment and costs call it."""
+    together = calls.some(2)
+    yield from [*_shapes(method, together)] or [*_purity(method, together)] or [*_rows(method, together)]
 
 
 def _row(arguments: Arguments, k: int, b: int | None = None) -> Arguments:
@@ -182,8 +167,7 @@ def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
             yield f"{method.name}: gives {len(outputs)} values; expected {', '.join(method.gives)} as a Transition."
             return
         for (name, trailing), value in zip(method.gives.items(), outputs, strict=True):
-            problem = misshapen(value, (*lead, *trailing))
-            if problem:
+            if problem := misshapen(value, (*lead, *trailing)):
                 given = ", ".join(f"{key} {tuple(case[key].shape)}" for key in method.takes)
                 yield (
                     f"{method.name}: {name} has {problem} for {given}; expected {wanted_as((*lead, *trailing))}. "
@@ -194,37 +178,25 @@ def _shapes(method: Method, arguments: Arguments) -> Iterator[str]:
 
 def _purity(method: Method, arguments: Arguments) -> Iterator[str]:
     """A violation if the method changes its arguments, or gives different results for the same arguments."""
-    kept = {name: value.clone() for name, value in arguments.items()}
-    first = [value.clone() for value in _tensors(method, arguments)]
-    changed = [name for name in method.takes if not torch.equal(kept[name], arguments[name])]
+    given = {name: value.clone() for name, value in arguments.items()}
+    first = [value.clone() for value in method.outputs(given)]
+    changed = [name for name in method.takes if not torch.equal(given[name], arguments[name])]
     if changed:
-        for name in changed:
-            arguments[name].copy_(kept[name])
         yield f"{method.name}: changes its argument {' and '.join(changed)} in place; make a new tensor instead."
         return
-    method.outputs(_row(arguments, 1))
-    method.outputs({name: value[:1].expand_as(value) for name, value in arguments.items()})
-    again = _tensors(method, arguments)
-    if not all(map(torch.equal, first, again)):
-        yield (
-            f"{method.name}: gives something else when it is called again with the same arguments; it must be a pure "
-            "function: no random number inside, and nothing kept from call to call (what is remembered is a state). "
-            f"{PURE}."
-        )
-
-
-def _tensors(method: Method, arguments: Arguments) -> list[Tensor]:
-    return [value for value in method.outputs(arguments) if isinstance(value, Tensor)]
+    method.outputs(_row(given, 1))
+    method.outputs({name: value[:1].expand_as(value) for name, value in given.items()})
+    if not all(map(torch.equal, first, method.outputs(given))):
+        yield f"{method.name}: gives something else when it is called again with the same arguments. {PURE}."
 
 
 def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
     """A violation if the results of a batch differ from those of its rows one by one."""
     times, batch = arguments["state"].shape[:2]
-    together = method.outputs(arguments)
     rows = [[method.outputs(_row(arguments, k, b)) for b in range(batch)] for k in range(times)]
-    for place, name in enumerate(method.gives):
+    for place, (name, together) in enumerate(zip(method.gives, method.outputs(arguments), strict=True)):
         alone = torch.stack([torch.stack([found[place] for found in row]) for row in rows])
-        gap = ((together[place] - alone).abs() / (1e-6 + alone.abs().amax((0, 1)))).max()
+        gap = ((together - alone).abs() / (1e-6 + alone.abs().amax((0, 1)))).max()
         if gap > TOLERANCE:
             yield (
                 f"{method.name}: {name} of a batch differs from that of its rows one by one, by {gap:.1e} of its size; "
@@ -232,17 +204,16 @@ def _rows(method: Method, arguments: Arguments) -> Iterator[str]:
             )
 
 
-def _judgement(calls: Calls) -> Iterator[str]:
+@torch.no_grad()
+def judgement(calls: Calls) -> Iterator[str]:
     """Violations in merit and categories of whole episodes."""
     state, applied, exogenous = (calls.arguments[name].transpose(0, 1) for name in ("state", "applied", "exogenous"))
-    batch, n = state.shape[:2]
-    if n < 3:  # the start alone is no episode
-        return
-    found = {
+    batch = len(state)
+    judged = {
         "merit": (calls.plant.merit(state, applied[:, :-1], exogenous[:, :-1]), torch.float64),
         "categories": (calls.plant.categories(exogenous), torch.bool),
     }
-    for name, (quantities, dtype) in found.items():
+    for name, (quantities, dtype) in judged.items():
         for key, value in quantities.items():
             if not isinstance(value, Tensor) or tuple(value.shape) != (batch,) or value.dtype != dtype:
                 given = f"{tuple(value.shape)} in {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
@@ -265,17 +236,13 @@ def costs(calls: Calls) -> Iterator[str]:
     size = 1e-9 * (1.0 + found["applied"].abs().amax((0, 1)))
     applied = plant.actuate(found["state"], found["command"])
     step = plant.step(found["t"], found["state"], found["command"], found["exogenous"], plant.closure)
-    if ((step.applied - applied).abs() > size).any():
-        yield (
-            "step: its applied action is not what actuate(state, command) gives, by up to "
-            f"{(step.applied - applied).abs().max():.4g}; call actuate in step, because trajectories report its action."
-        )
-    again = plant.actuate(found["state"], applied)
-    if ((again - applied).abs() > size).any():
-        yield (
-            "actuate: an applied action that is commanded again from the same state becomes another one, by up to "
-            f"{(again - applied).abs().max():.4g}; records hold applied actions, and the twin replays them as commands."
-        )
+    gaps = {
+        "step: its applied action is not what actuate(state, command) gives; call actuate in step, because "
+        "trajectories report its action": step.applied - applied,
+        "actuate: an applied action that is commanded again from the same state becomes another one; records hold "
+        "applied actions, and the twin replays them as commands": plant.actuate(found["state"], applied) - applied,
+    }
+    yield from (f"{text} (up to {gap.abs().max():.4g})." for text, gap in gaps.items() if (gap.abs() > size).any())
 
 
 @torch.no_grad()
@@ -297,20 +264,12 @@ def ends(calls: Calls) -> Iterator[str]:
 
 @torch.no_grad()
 def periods(calls: Calls) -> Iterator[str]:
-    """Periodic signals that are no states, and methods whose results change with a turn of a periodic state."""
+    """Methods whose results change with a turn of a periodic state."""
     plant, found = calls.plant, calls.arguments
-    for group in GROUPS:
-        for signal in getattr(plant, group):
-            if signal.periodic and group != "states":
-                yield f"{group}: {signal.name!r} is periodic; only a state can be: take its cosine and sine instead."
-    for k, signal in enumerate(plant.states):
-        if not signal.periodic:
-            continue
+    for k, signal in ((k, signal) for k, signal in enumerate(plant.states) if signal.periodic):
         turned = found["state"].clone()
         turned[..., k] += signal.period
-        for method in calls.methods():
-            if "state" not in method.takes:
-                continue
+        for method in (method for method in calls.methods() if "state" in method.takes):
             pairs = zip(method.outputs(found), method.outputs(found | {"state": turned}), strict=True)
             for name, (first, second) in zip(method.gives, pairs, strict=True):
                 gap = differences(plant.states, second, first) if name == "state" else second - first

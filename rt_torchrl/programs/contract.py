@@ -27,8 +27,8 @@ import types
 from collections.abc import Iterable, Iterator, Mapping, MutableSequence, MutableSet
 from contextlib import contextmanager
 from functools import lru_cache
-from itertools import chain
-from operator import is_, methodcaller
+from itertools import chain, repeat
+from operator import methodcaller
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,9 +52,19 @@ CHANGING = (
     *(types.SimpleNamespace, argparse.Namespace, contextvars.ContextVar, threading.local),
 )
 """Types of libraries whose objects hold what may change."""
+REPLACED = (type, enum.Enum, types.ModuleType, types.FunctionType, staticmethod, classmethod, property)
+"""Types of objects that hold nothing, or what is judged by itself."""
+MAPPINGS, SEQUENCES = (dict, types.MappingProxyType), (list, set, collections.deque, bytearray)
+PARTS = {
+    types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__"),
+    types.MethodType: ("__func__", "__self__"),
+    functools.partial: ("func", "args", "keywords"),
+    types.CellType: ("cell_contents",),
+}
+"""Attributes that hold what an object is made of."""
 MADE_BY = {"abc", "types"}
 """Modules that classes name as theirs which are made by a call, whoever calls."""
-LIBRARIES = {"torch", "tensordict", "torchrl", "numpy", "scipy", "jaxtyping", "beartype"}
+LIBRARIES = {"torch", "tensordict", "torchrl", "numpy", "scipy", "sympy", "opt_einsum", "jaxtyping", "beartype"}
 FOREIGN = (sys.stdlib_module_names - MADE_BY) | LIBRARIES
 """Packages whose globals do not change."""
 OWN = __name__.partition(".")[0]
@@ -77,7 +87,46 @@ def inputs_of(module: nn.Module) -> dict[str, Tensor]:
     return dict(module.named_parameters()) | buffers
 
 
-class Holdings:
+class Places:
+    """Places of objects, which are compared by identity, and of numbers, which are compared by value."""
+
+    def __init__(self) -> None:
+        self.mappings, self.sequences = list[Any](), list[Any]()
+        self.entries, self.parts = list[tuple[dict[str, Any], str]](), list[tuple[Any, str]]()
+        self.tensors, self.constants = list[Tensor](), list[Any]()
+        """Tensors in their memory, and tensors and arrays with their numbers."""
+
+    def note(self) -> None:
+        """Let everything be as it is now."""
+        self._entries = [x for x, _ in self.entries], [name for _, name in self.entries]
+        self._parts = [x for x, _ in self.parts], [name for _, name in self.parts]
+        self._views = [x.detach() for x in self.tensors]
+        self._then, self._numbers_then = self._objects(), self._numbers()
+        self._addresses = self._then.tobytes()
+
+    def _objects(self) -> np.ndarray:
+        """All objects; as long as the array lives, no other object takes their addresses."""
+        containers = chain(self.mappings, map(_values, self.mappings), self.sequences)
+        parts = map(getattr, *self._parts, repeat(MISSING))
+        return np.fromiter(chain(chain.from_iterable(containers), map(dict.get, *self._entries), parts), object)
+
+    def _numbers(self) -> list[object]:
+        sizes = map(len, chain(self.mappings, self.sequences))
+        return [*sizes, *(x.requires_grad for x in self.tensors), *map(_bytes, self.constants)]
+
+    def same(self) -> bool:
+        """Whether everything is as it was."""
+        try:
+            return (
+                self._objects().tobytes() == self._addresses
+                and all(map(Tensor.is_set_to, self.tensors, self._views))
+                and self._numbers() == self._numbers_then
+            )
+        except (ValueError, RuntimeError):  # a variable has lost its value, or a tensor has another type
+            return False
+
+
+class Holdings(Places):
     """What a module and everything in its attributes hold, by value.
 
     ``digest`` is equal where one machine code serves. :meth:`unchanged` compares all objects with those of before by
@@ -88,25 +137,17 @@ class Holdings:
     """
 
     def __init__(self, root: nn.Module):
+        super().__init__()
         self.objects: list[Any] = [root]
         """Everything that is read by its value; the root itself is left out in the end."""
         self.alive: list[object] = []
         """Objects that the digest knows by their address; whoever keeps the digest keeps them alive."""
-        self._numbers = {id(root): 0}
-        self._inputs = {*map(id, inputs_of(root).values())}
-        self._instances, self._mappings, self._sequences = list[Any](), list[Any](), list[Any]()
-        self._empty, self._parts = list[Any](), list[tuple[Any, str]]()
-        self._tensors, self._constants = list[Tensor](), list[Any]()
-        self._complete = True
+        self._of_root, self._complete, self._empty = (type(root), vars(root)), True, list[Any]()
+        self._numbered, self._inputs = {id(root): 0}, {*map(id, inputs_of(root).values())}
         text = repr([self._read(obj) for obj in self.objects])  # which grow meanwhile
         self.digest = hashlib.sha256(text.encode(errors="surrogatepass")).digest()
         self.objects[0] = None
-        self._views = [x.detach() for x in self._tensors]
-        self._attributes = [x for x, _ in self._parts], [name for _, name in self._parts]
-        self._sizes_then, self._then = self._sizes(root), self._all(root)
-        self._addresses = self._then.tobytes()
-        self._graded = [x.requires_grad for x in self._tensors]
-        self._bytes = [*map(_bytes, self._constants)]
+        self.note()
 
     def _mention(self, x: Any) -> object:
         """A value by its text, and any other object by its number, under which it is read."""
@@ -116,10 +157,10 @@ class Holdings:
         if kind in (dict, collections.OrderedDict, list, set) and not x:  # of which every module has ten, for hooks
             self._empty.append(x)
             return kind.__name__
-        if id(x) not in self._numbers:
-            self._numbers[id(x)] = len(self.objects)
+        if id(x) not in self._numbered:
+            self._numbered[id(x)] = len(self.objects)
             self.objects.append(x)
-        return self._numbers[id(x)]
+        return self._numbered[id(x)]
 
     def _address(self, x: object) -> list[object]:
         self.alive.append(x)
@@ -129,100 +170,65 @@ class Holdings:
         """What tells an object from others."""
         if isinstance(x, IDENTICAL):
             return self._address(x)
-        if isinstance(x, Tensor):
-            return self._read_tensor(x)
-        if isinstance(x, np.ndarray) and not x.dtype.hasobject:
-            self._constants.append(x)
-            return [x.shape, str(x.dtype), hashlib.sha256(_bytes(x)).digest()]
-        parts = [*self._elements(x), *self._slots(x)]
-        if not isinstance(x, types.FunctionType) and hasattr(x, "__dict__"):
-            self._instances += [x] if self._numbers[id(x)] else []  # all but the root
-            parts += chain(vars(x), vars(x).values())
-        elif not parts and not isinstance(x, (tuple, frozenset, list, dict, set)):
+        if isinstance(x, Tensor) or (isinstance(x, np.ndarray) and not x.dtype.hasobject):
+            return self._read_numbers(x)
+        if isinstance(x, np.ndarray):
+            self._complete = False
+            held = x.flatten().tolist()
+        elif isinstance(x, contextvars.ContextVar):
+            self._complete = False
+            held = [x.get(None)]
+        elif isinstance(x, MAPPINGS):
+            self.mappings.append(x)
+            held = [*x, *x.values()]
+        else:
+            self.sequences += [x] if isinstance(x, SEQUENCES) else []
+            held = [*x] if isinstance(x, (*SEQUENCES, tuple, frozenset)) else []
+        names = _parts_of(x)
+        self.parts += [(x, name) for name in names]
+        try:
+            held += [getattr(x, name, None) for name in names]
+        except ValueError:  # a variable without a value, which may get one
+            self._complete = False
+        if hasattr(x, "__dict__"):
+            if self._numbered[id(x)]:  # all but the root
+                self.parts += [(x, "__class__"), (x, "__dict__")]
+            self.mappings.append(vars(x))
+            held += [*vars(x), *vars(x).values()]
+        elif not held and not isinstance(x, (*MAPPINGS, *SEQUENCES, tuple, frozenset)):
             return self._address(x)
-        return [self._mention(type(x)), *map(self._mention, parts)]
+        return [self._mention(type(x)), *map(self._mention, held)]
 
-    def _read_tensor(self, x: Tensor) -> list[object]:
-        description = [type(x).__name__, tuple(x.shape), str(x.dtype), x.requires_grad]
-        if x.layout is not torch.strided or x.device.type != "cpu":
-            self._complete = False
-            return [*description, *self._address(x)]
-        self._tensors.append(x)
-        if id(x) in self._inputs:
-            return description
-        self._constants.append(x)
+    def _read_numbers(self, x: Any) -> list[object]:
+        """Type and shape of a tensor or an array, and its numbers unless they are an input."""
+        description = [type(x).__name__, tuple(x.shape), str(x.dtype)]
+        if isinstance(x, Tensor):
+            description.append(x.requires_grad)
+            if x.layout is not torch.strided or x.device.type != "cpu":
+                self._complete = False
+                return [*description, *self._address(x)]
+            self.tensors.append(x)
+            if id(x) in self._inputs:
+                return description
+        self.constants.append(x)
         return [*description, hashlib.sha256(_bytes(x)).digest()]
-
-    def _elements(self, x: Any) -> Iterable[object]:
-        """What a collection or a function holds."""
-        if isinstance(x, (dict, types.MappingProxyType)):
-            self._mappings.append(x)
-            return chain(x, x.values())
-        if isinstance(x, (list, set, collections.deque, bytearray)):
-            self._sequences.append(x)
-            return x
-        if isinstance(x, (tuple, frozenset)):
-            return x
-        if isinstance(x, np.ndarray):  # of objects
-            self._complete = False
-            return x.flatten().tolist()
-        if isinstance(x, types.MethodType):
-            return x.__func__, x.__self__
-        if isinstance(x, functools.partial):
-            return x.func, x.args, x.keywords
-        if isinstance(x, types.FunctionType):
-            self._parts += [(x, name) for name in ("__code__", "__defaults__", "__kwdefaults__")]
-            cells = [cell for cell in x.__closure__ or () if cell != types.CellType()]
-            self._parts += [(cell, "cell_contents") for cell in cells]
-            self._complete &= len(cells) == len(x.__closure__ or ())  # a variable without a value may get one
-            parts = [x.__code__, x.__defaults__, x.__kwdefaults__, x.__dict__]
-            return [*parts, *(cell.cell_contents for cell in cells)]
-        return ()
-
-    def _slots(self, x: Any) -> Iterator[object]:
-        """The attributes of an object that are not in its dictionary."""
-        for kind in type(x).__mro__:
-            for name, slot in () if foreign(kind.__module__) else vars(kind).items():
-                if isinstance(slot, types.MemberDescriptorType):
-                    self._complete &= hasattr(x, name)  # which may get a value
-                    self._parts += [(x, name)] if hasattr(x, name) else []
-                    yield getattr(x, name, None)
-
-    # Changes
-
-    def _sizes(self, root: nn.Module) -> list[int]:
-        return [*map(len, chain(map(vars, (root, *self._instances)), self._mappings, self._sequences))]
-
-    def _all(self, root: nn.Module) -> np.ndarray:
-        """All objects, in an order that stays; as long as the array lives, no other object takes their addresses."""
-        instances = [root, *self._instances]
-        held = [*map(vars, instances), *self._mappings]
-        objects = chain(
-            map(type, instances),
-            chain.from_iterable(held),
-            chain.from_iterable(map(_values, held)),
-            chain.from_iterable(self._sequences),
-            map(getattr, *self._attributes),
-        )
-        return np.fromiter(objects, object)
 
     def unchanged(self, root: nn.Module) -> bool:
         """Whether everything is as it was; a change that leaves the digest as it is may count as one."""
-        if not self._complete or any(self._empty):
-            return False
-        try:
-            return (
-                self._sizes(root) == self._sizes_then
-                and self._all(root).tobytes() == self._addresses
-                and all(map(Tensor.is_set_to, self._tensors, self._views))
-                and [x.requires_grad for x in self._tensors] == self._graded
-                and [*map(_bytes, self._constants)] == self._bytes
-            )
-        except (AttributeError, ValueError, RuntimeError):  # a value is lost, or a tensor has another type
-            return False
+        kind, held = self._of_root
+        return self._complete and not any(self._empty) and type(root) is kind and vars(root) is held and self.same()
 
 
 _values = methodcaller("values")
+
+
+def _parts_of(x: object) -> list[str]:
+    """Names of the attributes of an object that are not in its dictionary."""
+    names = [name for kind, names in PARTS.items() if isinstance(x, kind) for name in names]
+    for kind in type(x).__mro__:
+        if not foreign(kind.__module__):
+            names += [name for name, slot in vars(kind).items() if isinstance(slot, types.MemberDescriptorType)]
+    return names
 
 
 def _bytes(x: Any) -> bytes:
@@ -232,38 +238,22 @@ def _bytes(x: Any) -> bytes:
     return repr((x.shape, x.dtype)).encode() + x.tobytes()
 
 
-class Outside:
-    """Constants outside of a module, which can only be replaced.
+class Outside(Places):
+    """Constants outside of a module, which can only be replaced, and classes."""
 
-    Args:
-        places: dictionaries of globals and classes, each with a name of an entry; cells of functions; and classes with
-            an empty name, whose attributes and bases stay the same.
-    """
+    def __init__(self) -> None:
+        super().__init__()
+        self._kinds = set[type]()
+        self.note()
 
-    def __init__(self, places: Iterable[tuple[Any, str]] = ()):
-        dicts = [(holder, name) for holder, name in places if isinstance(holder, dict)]
-        classes = [(holder, name) for holder, name in places if isinstance(holder, type)]
-        cells = [holder for holder, _ in places if isinstance(holder, types.CellType)]
-        self._globals = [holder for holder, _ in dicts], [name for _, name in dicts]
-        self._entries = [vars(kind) for kind, name in classes if name], [name for _, name in classes if name]
-        whole = [kind for kind, name in classes if not name]
-        self._classes = [vars(kind) for kind in whole]
-        self._parts = [*cells, *whole], ["cell_contents"] * len(cells) + ["__mro__"] * len(whole)
-        self._then, self._names = [*self._now()], [*map(tuple, self._classes)]
-        self._numbered = [x for x in self._then if isinstance(x, (Tensor, np.ndarray))]
-        self._bytes = [*map(_bytes, self._numbered)]
-
-    def _now(self) -> Iterator[object]:
-        entries = map(types.MappingProxyType.get, *self._entries)
-        return chain(map(dict.get, *self._globals), entries, map(getattr, *self._parts))
-
-    def unchanged(self) -> bool:
-        """Whether all of them are what they were."""
-        try:
-            same = all(map(is_, self._now(), self._then)) and [*map(tuple, self._classes)] == self._names
-        except ValueError:  # a variable of a function has lost its value
-            return False
-        return same and [*map(_bytes, self._numbered)] == self._bytes
+    def add_class(self, kind: type) -> bool:
+        """Let the bases and all attributes of a class stay the same; whether the class is a new one."""
+        new = kind not in self._kinds
+        if new:
+            self._kinds.add(kind)
+            self.mappings.append(vars(kind))
+            self.parts.append((kind, "__mro__"))
+        return new
 
 
 class Executed:
@@ -306,31 +296,30 @@ def outside_of(root: nn.Module, holdings: Holdings, executed: Executed) -> Outsi
     Raises:
         UntraceableError: if a function reads what may change without notice; the message names both.
     """
-    return Outside(_Reads(root, holdings, executed).places.values())
+    return _Reads((root, *holdings.objects), executed).outside
 
 
 class _Reads:
-    """What executed functions read outside of a module."""
+    """What executed functions read outside of a module, whose objects are given."""
 
-    def __init__(self, root: nn.Module, holdings: Holdings, executed: Executed):
-        self.places: dict[tuple[int, str], tuple[Any, str]] = {}
-        self._held = {id(root), *map(id, holdings.objects)}  # whose changes the holdings notice
+    def __init__(self, objects: Iterable[object], executed: Executed):
+        self.outside, self._held = Outside(), {*map(id, objects)}  # whose changes the holdings notice
         self._functions: dict[types.CodeType, list[types.FunctionType]] = collections.defaultdict(list)
-        self._codes = {code for code, _ in executed.globals}
-        named = {name: code for code in self._codes for name in _names(code).attributes}
-        for x in holdings.objects:
+        self._codes, self._judged = {code for code, _ in executed.globals}, set[tuple[int, str]]()
+        for x in objects:
             self._note_function(x)
-        classes = {kind for x in (root, *holdings.objects) for kind in (x if isinstance(x, type) else type(x)).__mro__}
-        for kind in (kind for kind in classes if not foreign(kind.__module__)):
-            self.places[id(kind), ""] = kind, ""
-            for value in vars(kind).values():
-                self._note_function(value)
+            for kind in (x if isinstance(x, type) else type(x)).__mro__:
+                if not foreign(kind.__module__) and self.outside.add_class(kind):
+                    for value in vars(kind).values():
+                        self._note_function(value)
         for (code, _), held in executed.globals.items():
             self._globals(code, held)
-        for x in (root, *holdings.objects):
+        named = {name: code for code in self._codes for name in _names(code).attributes}
+        for x in objects:
             self._class_attributes(x, named)
         for code in self._codes:
             self._variables(code, executed.variables.get(code, {}))
+        self.outside.note()
 
     def _globals(self, code: types.CodeType, held: dict[str, Any]) -> None:
         names = _names(code)
@@ -340,45 +329,41 @@ class _Reads:
                     f"{_where(code)} imports {module!r} inside, whose values may change unnoticed; import it at the "
                     "top of the file"
                 )
-        for name in names.globals:
-            if name in held:
-                self._take(code, held, name, "the global ")
+        for name in names.globals & held.keys():
+            self._take(code, held, name, "the global ")
 
     def _take(self, code: types.CodeType, holder: Any, name: str, prefix: str) -> None:
         """Judge what code reads from a dictionary of globals, a class or a function, and its attributes."""
-        value = (holder if isinstance(holder, dict) else vars(holder))[name]
-        if value is os.environ or value is os.getenv or (value is os and {*ENVIRONMENT} & {*_names(code).attributes}):
+        value, attributes = (holder if isinstance(holder, dict) else vars(holder))[name], _names(code).attributes
+        if value is os.environ or value is os.getenv or (value is os and attributes & {*ENVIRONMENT}):
             raise _refusal(code, "the environment (os.environ)")
         if isinstance(value, types.ModuleType) and foreign(value.__name__):
             return  # such as torch
         followed = isinstance(value, (Tensor, np.ndarray)) and isinstance(holder, dict)  # by its numbers
         if not followed and not self._constant(value):
             raise _refusal(code, f"{prefix}{name}", value)
-        self._note_function(value)
-        seen = (id(holder), name) in self.places
-        self.places[id(holder), name] = holder, name
+        seen = (id(holder), name) in self._judged
+        if not seen:
+            self._judged.add((id(holder), name))
+            self._note_function(value)
+            if isinstance(holder, type):
+                self.outside.add_class(holder)
+            else:
+                self.outside.entries.append((holder if isinstance(holder, dict) else vars(holder), name))
+            self.outside.constants += [value] if followed else []
         inner = name if prefix == "the global " else f"{prefix}{name}"
         for further in _holders(value):
-            there = further if isinstance(further, dict) else vars(further)
-            for attribute in _names(code).attributes:
-                if attribute in there and not (seen and (id(further), attribute) in self.places):
+            for attribute in attributes & (further if isinstance(further, dict) else vars(further)).keys():
+                if not (seen and (id(further), attribute) in self._judged):
                     self._take(code, further, attribute, f"{inner}.")
 
     def _class_attributes(self, x: object, named: dict[str, types.CodeType]) -> None:
-        """Judge what the class of an object holds, if executed code has it or reads an attribute of its name."""
-        kind = x if isinstance(x, type) else type(x)
-        if foreign(kind.__module__):
-            return
-        attributes = {} if isinstance(x, type) else getattr(x, "__dict__", {})
-        for name in attributes.keys() & named.keys():
-            if isinstance(attributes[name], contextvars.ContextVar):  # of which nothing is known but its address
-                raise _refusal(named[name], f"the attribute {name}", attributes[name])
-        functions = {name: _function_of(f) for owner in kind.__mro__ for name, f in vars(owner).items()}
-        methods = {name: f.__code__ for name, f in functions.items() if f is not None and f.__code__ in self._codes}
-        for name, code in {name: code for name, code in (methods | named).items() if name not in attributes}.items():
-            owner = next((k for k in kind.__mro__ if name in vars(k)), None)
-            if owner is not None and not foreign(owner.__module__) and (id(owner), name) not in self.places:
-                self._take(code, owner, name, f"the class attribute {owner.__name__}.")
+        """Judge what the class of an object holds under names of attributes that executed code reads."""
+        kind, own = (x, {}) if isinstance(x, type) else (type(x), getattr(x, "__dict__", {}))
+        for name in () if foreign(kind.__module__) else named.keys() - own.keys():
+            owner = next((k for k in kind.__mro__ if name in vars(k)), object)
+            if not foreign(owner.__module__) and (id(owner), name) not in self._judged:
+                self._take(named[name], owner, name, f"the class attribute {owner.__name__}.")
 
     def _variables(self, code: types.CodeType, variables: Mapping[str, object]) -> None:
         """Judge the defaults of a function, and the variables of the functions around it."""
@@ -390,13 +375,11 @@ class _Reads:
                 raise _refusal(code, "a default of an argument", value)
         if any(code in outer.co_consts for outer in self._codes):  # the function is made when it is needed
             return
-        for name, value in variables.items():
-            if name == "__class__":  # of super()
-                continue
-            if not functions or not self._constant(value):
-                raise _refusal(code, f"the variable {name} of the function around it", value)
-            for cell in ((f.__closure__ or ())[code.co_freevars.index(name)] for f in functions):
-                self.places[id(cell), ""] = cell, ""
+        for name in variables.keys() - {"__class__"}:  # which is of super()
+            if not functions or not self._constant(variables[name]):
+                raise _refusal(code, f"the variable {name} of the function around it", variables[name])
+            cells = ((f.__closure__ or ())[code.co_freevars.index(name)] for f in functions)
+            self.outside.parts += [(cell, "cell_contents") for cell in cells]
 
     def _note_function(self, x: object) -> None:
         """Note a function, and those that it wraps."""
@@ -412,7 +395,9 @@ class _Reads:
     def _constant(self, value: object) -> bool:
         """Whether a value can only be replaced; functions count, because what they read is judged itself."""
         kind = type(value)
-        if isinstance(value, (type, types.ModuleType, types.FunctionType, enum.Enum)):
+        if isinstance(
+            value, (type, types.ModuleType, types.FunctionType, enum.Enum, staticmethod, classmethod, property)
+        ):
             return True
         if isinstance(value, (tuple, frozenset)):
             return all(map(self._constant, (*value, *getattr(value, "__dict__", {}).values())))
@@ -420,8 +405,6 @@ class _Reads:
             return self._constant(value.__self__)
         if isinstance(value, functools.partial):
             return all(map(self._constant, (value.func, *value.args, *value.keywords.values())))
-        if isinstance(value, (staticmethod, classmethod, property)):
-            return True
         if isinstance(value, CHANGING):
             return False
         if foreign(kind.__module__):
@@ -434,20 +417,21 @@ class _Reads:
 class _Names(NamedTuple):
     """What a code reads by name."""
 
-    globals: tuple[str, ...]
-    attributes: tuple[str, ...]
-    imports: tuple[str, ...]
+    globals: frozenset[str]
+    attributes: frozenset[str]
+    imports: frozenset[str]
 
 
 @lru_cache(maxsize=2**14)
 def _names(code: types.CodeType) -> _Names:
     """Names of the globals, the attributes and the modules that code itself reads."""
-    read = [(x.opname, x.argval) for x in dis.get_instructions(code)]
-    names = {name for kind, name in read if kind in ("LOAD_GLOBAL", "LOAD_NAME")}
-    attributes = {name for kind, name in read if kind in ATTRIBUTES}
-    if "getattr" in names:
-        attributes |= {x for x in code.co_consts if isinstance(x, str)}
-    return _Names(tuple(names), tuple(attributes), tuple({name for kind, name in read if kind == "IMPORT_NAME"}))
+    read = collections.defaultdict[str, set[str]](set)
+    for instruction in dis.get_instructions(code):
+        read[instruction.opname].add(instruction.argval)
+    names = read["LOAD_GLOBAL"] | read["LOAD_NAME"]
+    texts = {x for x in code.co_consts if isinstance(x, str)} if "getattr" in names else set()
+    attributes = texts.union(*(read[kind] for kind in ATTRIBUTES))
+    return _Names(frozenset(names), frozenset(attributes), frozenset(read["IMPORT_NAME"]))
 
 
 def _holders(value: object) -> Iterator[Any]:
@@ -509,22 +493,25 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
             question changes a buffer; or if the answer for a realisation depends on the others.
     """
     last = tree_map(lambda x: x[-1:], arguments)
-    other = tree_map(lambda x: x[-1:].expand_as(x), arguments)
-    kept = {name: (buffer, buffer.clone()) for name, buffer in module.named_buffers()}
-    first = module(*arguments).detach()
-    module(*other)
-    second = module(*arguments).detach()
-    changed = [name for name, (now, before) in kept.items() if not torch.allclose(now, before, 0, 0, equal_nan=True)]
+    strided = {name: x for name, x in module.named_buffers() if x.layout is torch.strided}
+    kept = {name: x.clone() for name, x in strided.items()}
+    answers = _answers(module, arguments)
+    module(*tree_map(lambda x: x[-1:].expand_as(x).clone(), arguments))
+    again = _answers(module, arguments)
+    changed = [name for name, x in strided.items() if not torch.allclose(x, kept[name], 0, 0, equal_nan=True)]
     with torch.no_grad():
         for name in changed:
-            kept[name][0].copy_(kept[name][1])
+            strided[name].copy_(kept[name])
     if changed:
         owner, _, buffer = changed[0].rpartition(".")
         raise ImpureError(f"{_called(module, owner)} changes its buffer {buffer!r} when it is called. {PURE}.")
-    if not _close(first, second):
+    first = answers[-1].answer[0]  # of the module itself
+    if not _equal([first], again[-1].answer):
+        pairs = zip(answers, again, strict=False)
+        culprit = next((a.module for a, b in pairs if a.asks_as(b) and not _equal(a.answer, b.answer)), module)
+        path = next(path for path, held in module.named_modules() if held is culprit)
         raise ImpureError(
-            f"{_culprit(module, arguments, other)} gives something else when it is called again with the same "
-            f"arguments. {PURE}."
+            f"{_called(module, path)} gives something else when it is called again with the same arguments. {PURE}."
         )
     try:
         alone = module(*last).detach()
@@ -533,7 +520,7 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
             f"an interval of one realisation alone raises {type(error).__name__}: {str(error).rstrip('.')}; one of "
             f"{len(first)} realisations does not. Policy, closure and plant must take any number of rows."
         ) from error
-    if not _close(alone, first[-1:]):
+    if not _equal([alone], [first[-1:]]):
         raise ImpureError(
             "the end of an interval depends on the other realisations that are computed with it: it is "
             f"{alone[-1].tolist()} alone and {first[-1].tolist()} beside others. Rows are systems of their own: no "
@@ -541,36 +528,43 @@ def require_pure(module: nn.Module, *arguments: Any) -> None:
         )
 
 
-def _close(x: Tensor, y: Tensor) -> bool:
-    """Whether two answers are equal but for rounding, wherever both are numbers."""
-    if x.shape != y.shape:
-        return False
-    numbers = x.isfinite() & y.isfinite()
-    gap = torch.where(numbers, (x - y).abs(), 0.0)
-    return bool((gap <= GAP * torch.where(numbers, x.abs() + y.abs(), 0.0).amax(0)).all())
+class _Answer(NamedTuple):
+    """What a module was asked, and what it answered."""
+
+    module: nn.Module
+    given: list[Tensor]
+    answer: list[Tensor]
+
+    def asks_as(self, other: "_Answer") -> bool:
+        return self.module is other.module and _equal(self.given, other.given)
 
 
-def _culprit(module: nn.Module, arguments: tuple[Any, ...], other: tuple[Any, ...]) -> str:
-    """The innermost module that answers one question differently; the plant if none does by itself."""
-    asked: list[list[tuple[nn.Module, list[Tensor], list[Tensor]]]] = []
-    here = threading.get_ident()
+def _answers(module: nn.Module, arguments: tuple[Any, ...]) -> list[_Answer]:
+    """The answers of a module and of those within it, of which the inner ones come first."""
+    answers, here = list[_Answer](), threading.get_ident()
 
-    def note(asked_module: nn.Module, given: object, answer: object) -> None:
+    def note(asked: nn.Module, given: object, answer: object) -> None:
         if threading.get_ident() == here:
-            asked[-1].append((asked_module, _tensors(given), _tensors(answer)))
+            tensors = ([x.detach().clone() for x in tree_leaves(xs) if isinstance(x, Tensor)] for xs in (given, answer))
+            answers.append(_Answer(asked, *tensors))
 
     handle = register_module_forward_hook(note)
     try:
-        for question in (arguments, other, arguments):
-            asked.append([])
-            module(*question)
+        module(*arguments)
     finally:
         handle.remove()
-    for (inner, given, answer), (again, given_again, answer_again) in zip(asked[0], asked[2], strict=False):
-        if inner is again and _equal(given, given_again) and not _equal(answer, answer_again):
-            paths = [path for path, held in module.named_modules() if held is inner]
-            return _called(module, paths[0] if paths else "")
-    return _called(module, "")
+    return answers
+
+
+def _equal(some: list[Tensor], others: list[Tensor]) -> bool:
+    """Whether answers are equal but for rounding, wherever both are numbers."""
+
+    def close(x: Tensor, y: Tensor) -> bool:
+        numbers = x.isfinite() & y.isfinite()
+        gap = torch.where(numbers, (x - y).abs(), 0.0)
+        return bool((gap <= GAP * torch.where(numbers, x.abs() + y.abs(), 0.0).amax(0)).all())
+
+    return [x.shape for x in some] == [y.shape for y in others] and all(map(close, some, others))
 
 
 def _called(module: nn.Module, path: str) -> str:
@@ -580,11 +574,3 @@ def _called(module: nn.Module, path: str) -> str:
         plant = next((held for name, held in module.named_modules() if name.endswith("plant")), None)
         return f"a method of plant {getattr(plant, 'name', type(module).__name__)!r}"
     return f"{short} ({type(module.get_submodule(path)).__name__})"
-
-
-def _tensors(values: object) -> list[Tensor]:
-    return [x.clone() for x in tree_leaves(values) if isinstance(x, Tensor)]
-
-
-def _equal(some: list[Tensor], others: list[Tensor]) -> bool:
-    return len(some) == len(others) and all(map(_close, some, others))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial, reduce
-from itertools import accumulate, product
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -25,8 +25,6 @@ def _convert(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> 
         return source
     if out.dtype == torch.bool:
         convert: Callable[[int], int] = p.as_truth
-    elif out.is_floating_point() and out.dtype != torch.float64:
-        raise tracer.refuse(f"a conversion to {out.dtype}; trajectories need torch.float64")
     elif args[0].is_floating_point() and not out.is_floating_point():
         convert = partial(p.apply, "trunc")
     else:
@@ -96,7 +94,7 @@ def matrix_product(tracer: Tracer, a: Tensor, b: Tensor, start: Tensor | None = 
 
 def _addmm(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     if options.get("beta", 1) != 1 or options.get("alpha", 1) != 1:
-        raise tracer.refuse("addmm with alpha or beta")
+        raise tracer.refuse("addmm with alpha or beta", "multiply by them")
     start, a, b = (tracer.cells(x) for x in args)
     return matrix_product(tracer, a, b, start)
 
@@ -129,7 +127,7 @@ def _places(tracer: Tracer, shape: Sequence[int], indices: Sequence[Tensor | Non
     """Of every entry of indices that vary: its place in a tensor side by side, and whether it lies in the tensor."""
     p, given = tracer.program, [i for i in indices if i is not None]
     if None in indices[: len(given)] or any(i.dtype == torch.bool for i in given):
-        raise tracer.refuse("an index by a mask that varies, or after a full slice")
+        raise tracer.refuse("an index by a mask that varies, or after a full slice", "use torch.where")
     strides, zero = torch.empty(tuple(shape), device="meta").stride(), p.constant(0.0)
     spread = torch.broadcast_tensors(*(tracer.cells(i) for i in given))
     for at in zip(*(s.flatten().tolist() for s in spread), strict=True):
@@ -158,7 +156,7 @@ def _index_put(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -
     at = torch.broadcast_shapes(*(i.shape for i in given))
     rows = tracer.cells(values).expand(*at, *rest).reshape(-1, math.prod(rest)).tolist()
     if len(rows) * len(found) > SPREAD:
-        raise tracer.refuse(f"an assignment to {len(found)} places that vary")
+        raise tracer.refuse(f"an assignment to {len(found)} places that vary", "use torch.where")
     for (place, inside), row in zip(_places(tracer, target.shape, indices), rows, strict=True):
         for j, before in enumerate(found):
             first, r = divmod(j, len(row))
@@ -175,7 +173,7 @@ def _eliminate(tracer: Tracer, A: Tensor, B: Tensor) -> Tensor:
     """The cells of X with A X = B of matrices in the last two dimensions, by elimination with partial pivoting."""
     n = A.shape[-1]
     if n > LARGEST_SOLVED:
-        raise tracer.refuse(f"linear equations of {n} unknowns, more than {LARGEST_SOLVED}")
+        raise tracer.refuse(f"linear equations of {n} unknowns, more than {LARGEST_SOLVED}", "eliminate some before")
     lead = torch.broadcast_shapes(A.shape[:-2], B.shape[:-2])
     pairs = (x.expand(*lead, *x.shape[-2:]).reshape(-1, *x.shape[-2:]).tolist() for x in (A, B))
     solved = [_eliminated(tracer, [[*a, *b] for a, b in zip(*pair, strict=True)]) for pair in zip(*pairs, strict=True)]
@@ -232,7 +230,7 @@ def _invert(tracer: Tracer, args: Arguments, options: Options, out: tuple[Tensor
 
 
 def _copy_by(name: str) -> Rule:
-    """An operator on the cells; an index, which is its third argument, must be known."""
+    """An operator on the cells."""
     operator = getattr(torch.ops.aten, name)
 
     def rule(tracer: Tracer, args: Arguments, options: Options, out: Any) -> Any:
@@ -241,10 +239,8 @@ def _copy_by(name: str) -> Rule:
                 return tracer.cells(x)
             return [celled(y) for y in x] if isinstance(x, (list, tuple)) else x
 
-        index = args[2:] if name in INDEXED else ()
-        tracer.require_known(f"{name} by an index that varies", index)
         kept = {key: value for key, value in options.items() if key != "memory_format"}
-        return operator(*map(celled, args[: len(args) - len(index)]), *index, **kept)
+        return operator(*map(celled, args), **kept)
 
     return rule
 
@@ -258,32 +254,14 @@ def _diag_embed(tracer: Tracer, args: Arguments, options: Options, out: Tensor) 
     return torch.where(places > 0, places - 1, tracer.program.constant(0.0))
 
 
-def _scatter(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
-    if "reduce" in options:
-        raise tracer.refuse("scatter with an operation")
-    cells, (dim, index), p = tracer.cells(args[0]), args[1:3], tracer.program
-    source = tracer.cells(args[3]).expand(index.shape)
-    if tracer.numbers(tracer.cells(index)) is not None:
-        return cells.scatter(dim, index, source)
-    found = cells.movedim(dim, -1).clone()
-    chosen, values = (x.movedim(dim, -1) for x in (tracer.cells(index), source))
-    for at in product(*map(range, chosen.shape)):
-        for j in range(found.shape[-1]):
-            hit = p.apply("eq", int(chosen[at]), p.constant(float(j)))
-            there = (*at[:-1], j)
-            found[there] = p.select(hit, int(values[at]), int(found[there]))
-    return found.movedim(-1, dim)
-
-
 def _pad(tracer: Tracer, args: Arguments, options: Options, out: Tensor) -> Tensor:
     filling = tracer.program.constant(float(args[2]) if len(args) > 2 else 0.0)
     return torch.constant_pad_nd(tracer.cells(args[0]), args[1], filling)
 
 
-INDEXED = ("gather", "index_select")
 PLAIN = (
-    "cat stack flip roll repeat expand_copy slice_scatter select_scatter unfold_copy view_copy permute_copy "
-    "_unsafe_view alias_copy clone contiguous lift_fresh lift_fresh_copy"
+    "cat stack flip roll repeat expand_copy slice_scatter select_scatter diagonal_scatter unfold_copy view_copy "
+    "permute_copy _unsafe_view alias_copy clone contiguous lift_fresh lift_fresh_copy"
 ).split()
 RULES: dict[str, Rule] = {
     **dict.fromkeys(("clamp", "clamp_min"), _clamp),
@@ -300,10 +278,9 @@ RULES: dict[str, Rule] = {
     "linalg_lu_solve": _solve_again,
     "linalg_inv_ex": _invert,
     "_linalg_check_errors": lambda tracer, args, options, out: [],
-    **{name: _copy_by(name) for name in (*PLAIN, *INDEXED)},
+    **{name: _copy_by(name) for name in PLAIN},
     **dict.fromkeys(("copy", "fill"), _overwrite),
     "diag_embed": _diag_embed,
-    "scatter": _scatter,
     **dict.fromkeys(("index_put", "_unsafe_index_put"), _index_put),
     "constant_pad_nd": _pad,
 }
@@ -322,10 +299,26 @@ def _variance(x: Tensor, dim: Any = None, correction: int | float | None = None,
     return total / max(0.0, x.numel() / max(1, total.numel()) - (1.0 if correction is None else correction))
 
 
-def _scatter_add(x: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
-    places: list[Tensor | None] = [*torch.meshgrid(*map(torch.arange, index.shape), indexing="ij")]
+def _along(dim: int, index: Tensor) -> tuple[Tensor, ...]:
+    """The places of an index along a dimension."""
+    places = [*torch.meshgrid(*map(torch.arange, index.shape), indexing="ij")]
     places[dim] = index
-    return x.index_put(places, source[tuple(map(slice, index.shape))], accumulate=True)
+    return tuple(places)
+
+
+def _gather(x: Tensor, dim: int, index: Tensor, *, sparse_grad: bool = False) -> Tensor:
+    return x[_along(dim, index)]
+
+
+def _scatter(x: Tensor, dim: int, index: Tensor, source: Any, *, added: bool = False) -> Tensor:
+    if isinstance(source, Tensor):
+        source = source[tuple(map(slice, index.shape))]
+    return x.index_put(_along(dim, index), torch.as_tensor(source, dtype=x.dtype), accumulate=added)
+
+
+def _backward_by(name: str) -> Callable[..., Tensor]:
+    """The gradient by what a view was taken of, of the view's sizes and place."""
+    return lambda x, sizes, *place: getattr(x.new_zeros(sizes), f"{name}_scatter")(x, *place)
 
 
 def _bucketize(x: Any, knots: Tensor, *, out_int32: bool = False, right: bool = False) -> Tensor:
@@ -353,7 +346,10 @@ def _extreme(of_all: Callable[..., Tensor], of_two: Callable[..., Tensor]) -> Ca
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "mean": _mean,
     "var": _variance,
-    "scatter_add": _scatter_add,
+    "gather": _gather,
+    "index_select": lambda x, dim, index: x.movedim(dim, 0)[index].movedim(0, dim),
+    "scatter": _scatter,
+    "scatter_add": partial(_scatter, added=True),
     "bucketize": _bucketize,
     "searchsorted": lambda knots, x, side="", **how: _bucketize(x, knots, **{"right": side == "right", **how}),
     "cumsum": _cumulative(torch.add),
@@ -365,8 +361,7 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "deg2rad": lambda x: x * (math.pi / 180.0),
     "rsub": lambda a, b, alpha=1: -(alpha * a) + b,
     "bmm": lambda a, b: torch.stack([x @ y for x, y in zip(a, b, strict=True)]),
-    "slice_backward": lambda x, sizes, *place: x.new_zeros(sizes).slice_scatter(x, *place),
-    "select_backward": lambda x, sizes, *place: x.new_zeros(sizes).select_scatter(x, *place),
+    **{f"{name}_backward": _backward_by(name) for name in ("slice", "select", "diagonal")},
 }
 """Operators that are common enough to do without the tables of torch."""
 

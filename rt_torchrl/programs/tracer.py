@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from traceback import walk_stack
-from types import CodeType, ModuleType
+from traceback import walk_stack, walk_tb
+from types import CodeType, FrameType, ModuleType
 from typing import Any
 
 import jaxtyping
@@ -35,6 +35,9 @@ ESCAPES = {
     for name in ("numpy", "tolist", "__array__", "data_ptr", "__dlpack__", "untyped_storage")
 }
 """Methods by which numbers leave torch, where a tracer cannot follow them."""
+TYPES = frozenset({torch.float64, torch.int64, torch.int32, torch.bool})
+"""Types in which code may compute; numbers of programs are doubles, which neither round nor wrap as others do."""
+BRANCHLESS, OTHERS = "use torch.where, and torch functions throughout", "write it with other operators"
 GENERATED = ("<@beartype", "<string>")
 """Code that checks annotations at run time."""
 
@@ -66,16 +69,26 @@ class Places:
         """The line of the operator that is executed now, as the end of a message."""
         node = torch._C._current_autograd_node()
         found = self._noted.get(node._sequence_nr()) if node is not None else None
-        code, line = found or self._innermost() or (None, 0)
-        if code is None:
-            return ""
-        text = linecache.getline(code.co_filename, line).strip()
-        return f" (in {code.co_name}, {code.co_filename}:{line}: {text})"
+        return _in_words(found or self._innermost())
+
+    def of(self, frames: Iterable[tuple[FrameType, int]]) -> str:
+        """The last line of the caller's code among frames, as the end of a message."""
+        return _in_words(([None, *self._outside(frames)])[-1])
 
     def _innermost(self) -> tuple[CodeType, int] | None:
         """The innermost line outside of torch, this room and the checks of annotations."""
-        frames = walk_stack(sys._getframe(1))
-        return next(((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._own)), None)
+        return next(self._outside(walk_stack(sys._getframe(1))), None)
+
+    def _outside(self, frames: Iterable[tuple[FrameType, int]]) -> Iterator[tuple[CodeType, int]]:
+        return ((f.f_code, line) for f, line in frames if not f.f_code.co_filename.startswith(self._own))
+
+
+def _in_words(place: tuple[CodeType, int] | None) -> str:
+    if place is None:
+        return ""
+    code, line = place
+    text = linecache.getline(code.co_filename, line).strip()
+    return f" (in {code.co_name}, {code.co_filename}:{line}: {text})"
 
 
 class Tracer(TorchDispatchMode):
@@ -118,11 +131,11 @@ class Tracer(TorchDispatchMode):
         if not isinstance(x, Tensor):
             return torch.tensor(self.program.constant(x))
         if x.layout is not torch.strided:
-            raise self.refuse(f"a tensor of layout {x.layout}")
+            raise self.refuse(f"a tensor of layout {x.layout}", "make it dense")
         key = _storage_of(x)
         if key not in self._cells:  # a tensor from outside is a constant
             if x.requires_grad and x.is_leaf and x.numel():
-                raise self.refuse("a tensor that requires a gradient but is no parameter of the modules")
+                raise self.refuse("a tensor that requires a gradient but is no parameter of the modules", "make it one")
             size = x.untyped_storage().nbytes() // x.element_size()
             self._cells[key] = self._constants(torch.as_strided(x.detach(), (size,), (1,), 0))
             self._alive.append(x)
@@ -131,7 +144,7 @@ class Tracer(TorchDispatchMode):
     def _constants(self, x: Tensor) -> Tensor:
         """The cells of known numbers."""
         if x.is_complex():
-            raise self.refuse("complex numbers")
+            raise self.refuse("complex numbers", "compute with real and imaginary parts")
         return in_shape([self.program.constant(v) for v in x.flatten().tolist()], x.shape)
 
     def assign(self, x: Tensor, cells: Tensor) -> None:
@@ -171,29 +184,36 @@ class Tracer(TorchDispatchMode):
         values, known = cells.flatten().tolist(), self.program.numbers
         return [known[i] for i in values] if all(i in known for i in values) else None
 
-    def refuse(self, what: str) -> UntraceableError:
+    def refuse(self, what: str, remedy: str) -> UntraceableError:
         """The error of code that cannot become a program, with the line of the caller's code."""
-        return UntraceableError(f"{what}{self.places.now()}")
+        return UntraceableError(f"{what}{self.places.now()}; {remedy}")
 
     # Operators
 
     @contextmanager
     def following(self) -> Iterator[None]:
         """A context in which the caller's code is traced, and may take no number out of torch that varies."""
-        with sdpa_kernel(SDPBackend.MATH), _Escapes(self), self:  # attention as products of matrices
-            yield
+        try:
+            with sdpa_kernel(SDPBackend.MATH), _Escapes(self), self:  # attention as products of matrices
+                yield
+        except UntraceableError:
+            raise
+        except Exception as error:  # code may raise anything, such as for one realisation alone
+            place = self.places.of(walk_tb(error.__traceback__))
+            text = f"an interval of one realisation raises {type(error).__name__}: {str(error).rstrip('.')}{place}"
+            raise UntraceableError(text) from error
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Arguments = (), kwargs: Options | None = None) -> Any:
         kwargs = kwargs or {}
         if not isinstance(func, OpOverload):
-            raise self.refuse(f"torch operator {func} has no translation")
+            raise self.refuse(f"torch operator {func} has no translation", OTHERS)
         self.program.differentiating = torch._C._current_autograd_node() is not None
         with torch._C.DisableTorchFunction():  # the mode of escapes is for the caller's code alone
             self.places.note()
             packet = func._schema.name.split("::")[1]
             name = packet if packet.startswith("_") else packet.rstrip("_")
             if torch.Tag.nondeterministic_seeded in func.tags:
-                raise self.refuse(f"{packet} draws random numbers")
+                raise self.refuse(f"{packet} draws random numbers", "they belong in draw_exogenous")
             if packet in DECISIONS:
                 self.require_known("a number or a branch of Python is taken from a tensor that varies", args)
                 return func(*args, **kwargs)
@@ -205,7 +225,7 @@ class Tracer(TorchDispatchMode):
                 self.cells(args[0])
                 out = func(*args, **kwargs)
                 if any(o.dtype != args[0].dtype for o in tensors_in([out])):
-                    raise self.refuse(f"{func} reads numbers as another type")
+                    raise self.refuse(f"{func} reads numbers as another type", OTHERS)
                 return out
             if not func._schema.is_mutable and self._foldable(args):
                 return self._folded(func, args, kwargs)
@@ -236,21 +256,23 @@ class Tracer(TorchDispatchMode):
     def require_known(self, what: str, args: Iterable[Any]) -> None:
         """Refuse tensors whose numbers are not known when the program is made."""
         if any(self.numbers(self.cells(x)) is None for x in tensors_in(args)):
-            raise self.refuse(what)
+            raise self.refuse(what, BRANCHLESS)
 
     def _executed(self, func: Any, name: str, args: Arguments, kwargs: Options) -> Any:
         """What an operator returns, with the cells of what it computes."""
         out = func(*args, **kwargs)
         outs = tensors_in([out])
-        if any(o.is_complex() for o in outs):
-            raise self.refuse("complex numbers")
+        if others := {o.dtype for o in outs} - TYPES:
+            raise self.refuse(
+                f"{func} computes in {others.pop()}", "machine code has torch.float64, int64, int32, bool"
+            )
         written = args[0] if func._schema.is_mutable else out
         if name not in self._rules:
-            raise self.refuse(f"torch operator {func} has no translation")
+            raise self.refuse(f"torch operator {func} has no translation", OTHERS)
         found = self._translated(func, self._rules[name], self, args, kwargs, written)
         if func._schema.is_mutable:
             if not func._schema.arguments[0].is_write or len(outs) != 1:
-                raise self.refuse(f"{func} writes into its argument out")
+                raise self.refuse(f"{func} writes into its argument out", "take what it returns")
             self.cells(args[0]).copy_(found.expand(args[0].shape))
             return out
         for o, cells in zip(outs, found if isinstance(found, (tuple, list)) else [found], strict=True):
@@ -264,14 +286,13 @@ class Tracer(TorchDispatchMode):
         except UntraceableError:
             raise
         except Exception as error:
-            raise self.refuse(f"torch operator {func} has no translation for these arguments ({error})") from error
+            what = f"torch operator {func} has no translation for these arguments ({error})"
+            raise self.refuse(what, OTHERS) from error
 
     def _elementwise(self, args: Arguments, kwargs: Options, out: Tensor, name: str) -> Tensor:
-        if out.is_floating_point() and out.dtype != torch.float64:
-            raise self.refuse(f"{name} computes in {out.dtype}; trajectories need torch.float64")
         unknown = [*args[ARITY[name] :], *(key for key in kwargs if key not in ("alpha", "rounding_mode", "dtype"))]
         if unknown or (name.startswith("bitwise") and out.dtype != torch.bool):
-            raise self.refuse(f"{name} of {out.dtype} with {unknown or 'bits'}")
+            raise self.refuse(f"{name} of {out.dtype} with {unknown or 'bits'}", OTHERS)
         operands = [self.cells(a) for a in args[: ARITY[name]]]
         if (alpha := kwargs.get("alpha", 1)) != 1:
             operands[1] = self.pointwise("mul", [operands[1], self.cells(alpha)], operands[1].shape)

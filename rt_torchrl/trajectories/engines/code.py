@@ -323,7 +323,8 @@ def require_equal(what: str, computed: np.ndarray, exact: np.ndarray, scale: np.
         kind = UntraceableError if np.isfinite(exact[wrong]).all() else UncomparedError
         raise kind(
             f"{what} differs from what torch computes, for example {computed[wrong][0]} instead of {exact[wrong][0]}. "
-            "A number has left torch where tracing cannot follow it, such as by .numpy()"
+            "A number has left torch where tracing cannot follow it, such as by .numpy(), or torch itself is inexact, "
+            "as with integers beyond 2**53"
         )
 
 
@@ -388,7 +389,7 @@ def code_of(interval: nn.Module, initial_state: Tensor, drive: Drive) -> tuple[I
         widths = initial_state.shape[-1] + sums, drive.exogenous.shape[-1], drive.command.shape[-1]
         key = (holdings.digest, lanes_of_this_machine(), *widths)
         code, alive = _kept.get(key, (None, tuple(holdings.alive)))
-        if isinstance(code, IntervalCode) and not code.outside.unchanged():
+        if isinstance(code, IntervalCode) and not code.outside.same():
             code, alive = None, tuple(holdings.alive)
         driven = any(x.requires_grad for x in drive)
         wanted = torch.is_grad_enabled() and bool(driven or initial_state.requires_grad or inputs.learned)
