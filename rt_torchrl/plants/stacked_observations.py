@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.shapes import Hidden, Input, Observation, State, Time
 from rt_torchrl.plants.signal import Signal
 
@@ -110,7 +111,7 @@ class StackedObservations(Extension):
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """A saturated affine law of all observations; the plant's own policy knows the present one alone."""
-        return Plant.make_policy(self, generator)
+        return SaturatedAffine(len(self.observations), self.actions, generator=generator)
 
 
 def _past(signals: tuple[Named, ...], count: int) -> list[Named]:
