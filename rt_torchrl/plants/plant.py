@@ -112,6 +112,8 @@ class Plant(nn.Module):
 
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
+    memories: tuple[str, ...] = ()
+    """Names of those of them that :meth:`memorise` alone writes: they hold what was measured, without further noise."""
     state_sizes: tuple[float, ...] = ()
     """Usual sizes of the states, in their units; by default ones."""
     end_cost: float | None = None
@@ -433,6 +435,15 @@ def require_end_cost(plant: Plant) -> None:
         )
     if plant.end_cost is not None and not torch.tensor(plant.end_cost).isfinite():
         raise ValueError(f"end_cost={plant.end_cost} of plant {plant.name!r} must be finite.")
+
+
+def with_memories(plant: Plant, end: State, t: Tensor, measured: State, exogenous: Tensor) -> Tensor:
+    """The end of an interval, at whose start the controller memorised what was measured and not what was true."""
+    if not plant.memories:
+        return end
+    kept = plant.memorise(t, measured, exogenous)
+    sources = (kept if signal.name in plant.memories else end for signal in plant.states)
+    return torch.stack([source[..., k] for k, source in enumerate(sources)], -1)
 
 
 def held(plant: Plant, state: State, end: State) -> Tensor:

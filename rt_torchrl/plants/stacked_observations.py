@@ -44,7 +44,8 @@ class StackedObservations(Extension):
         super().__init__(base, past)
         self.states = (*base.readings, *past, *base.states[self._read :])
         self.unread = base.unread
-        self.controller_states = (*base.controller_states, *(signal.name for signal in past))
+        self.memories = tuple(signal.name for signal in past)
+        self.controller_states = (*base.controller_states, *self.memories)
         self.observations = (*base.observations, *_past(base.observations, count))
         self.observed = (*base.observed, *_past(base.observed, count))
 
