@@ -4,14 +4,18 @@ import pytest
 import torch
 from linear_quadratic import LinearQuadratic
 from scipy.linalg import expm
+from seeds_and_numbers import seeded
 from torch import nn
 
 from rt_torchrl import check_plant
-from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator
-from rt_torchrl.plants.coefficients import LaggedCoefficients
-from rt_torchrl.plants.extension import Extension
-from rt_torchrl.plants.sensors import BiasedSensor
+from rt_torchrl.plants.actuators import DelayedActuator, LaggedActuator, ResonantActuator, ScaledActuator
+from rt_torchrl.plants.coefficients import LaggedCoefficients, ScaledCoefficients
+from rt_torchrl.plants.extension import ExtendedClosure, Extension
+from rt_torchrl.plants.neural_residual import NeuralResidual
+from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.sensors import BiasedSensor, UnreadInput
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.plants.stacked_observations import StackedObservations
 from rt_torchrl.systems.environment import PlantEnv
 from rt_torchrl.trajectories.rollout import Rollout
 
@@ -190,6 +194,165 @@ def test_an_environment_hides_what_no_sensor_reads():
     assert env.reset()["state"].shape == (1, 2)
     assert env.rollout(3)["next", "state"].shape == (1, 3, 2)
     assert [signal.name for signal in plant.readings] == ["position", "velocity"]
+
+
+class Particular(LinearQuadratic):
+    """Overrides every method that an extension asks of its plant, so that none can be the default by chance."""
+
+    name, end_cost = "particular", 50.0
+    discrepancy_scales = (0.5, 2.0)
+    moments = torch.zeros(1, dtype=torch.float64)
+
+    def observe(self, t, state, exogenous):
+        return 2.0 * state + torch.sin(t).unsqueeze(-1) + exogenous
+
+    def actuate(self, state, command):
+        return 0.5 * command + 0.1 * state[..., 1:]
+
+    def memorise(self, t, state, exogenous):
+        return 0.9 * state + 0.01 * exogenous + t.unsqueeze(-1)
+
+    def latch(self, state, applied):
+        return 1.1 * state + applied
+
+    def running_cost(self, t, state, applied, exogenous):
+        return state[..., 0] ** 2 + 3.0 * applied[..., 0] + exogenous[..., 0] + t
+
+    def terminal_cost(self, state):
+        return state[..., 0] + 4.0
+
+    def ended(self, state):
+        return state[..., 0] > 0.2
+
+    def merit(self, states, applied, exogenous):
+        return {"spread [m]": states[..., 0].amax(-1), "work [J]": (states[:, :-1, 1] * applied[..., 0]).sum(-1)}
+
+    def setpoints(self, states, applied, exogenous):
+        return {"x [m]": (states[..., 0] * applied[..., 0], exogenous[..., 0])}
+
+    def categories(self, exogenous):
+        return {"windy": exogenous[:, 0, 0] > 0.0}
+
+    def complete_states(self, measured, exogenous, actions):
+        return torch.stack([measured["position"], measured["position"] + 1.0], -1)
+
+    def controller_start(self, measured, exogenous):
+        return measured + exogenous
+
+    def at_rest(self, read):
+        return read + 0.5
+
+    def draw_initial_state(self, batch, generator):
+        return 3.0 + torch.rand(batch, 2, generator=generator, dtype=torch.float64)
+
+    def draw_exogenous(self, batch, generator):
+        return super().draw_exogenous(batch, generator) + 2.0
+
+    def make_closure(self, generator):
+        return nn.Identity()
+
+    def make_neural_closure(self, generator, hidden):
+        return nn.Linear(2, hidden[0], dtype=torch.float64)
+
+    def make_policy(self, generator):
+        return nn.Linear(2, 1, dtype=torch.float64)
+
+
+SINGLY = {
+    "lag": lambda base: LaggedActuator(base, "force", 0.4, stages=2),
+    "resonance": lambda base: ResonantActuator(base, "force", 3.0, 0.4),
+    "delay": lambda base: DelayedActuator(base, "force", 0.3),
+    "scaled": lambda base: ScaledActuator(base, "force", 0.8),
+    "inflow": lambda base: LaggedCoefficients(base, 0.5, (0.1, -0.2)),
+    "share": lambda base: ScaledCoefficients(base, 0.9),
+    "bias": lambda base: BiasedSensor(base, "position", 0.3, 0.02, scale=0.1),
+    "unread": lambda base: UnreadInput(base, "disturbance", 0.5, [2.0]),
+    "residual": lambda base: NeuralResidual(base, {"velocity": 1.0}, inputs=("force",)),
+    "stacked": lambda base: StackedObservations(base, 2),
+    "biased delay": lambda base: BiasedSensor(DelayedActuator(base, "force", 0.3), "position", 0.3, scale=0.1),
+    "delayed bias": lambda base: DelayedActuator(BiasedSensor(base, "position", 0.3, scale=0.1), "force", 0.3),
+}
+
+
+@pytest.mark.parametrize("kind", SINGLY)
+def test_whatever_a_plant_overrides_holds_under_every_extension(kind):
+    """The parts of a state and of an action are taken by hand here; the plant must answer as if it was not extended."""
+    plant = SINGLY[kind](Particular(horizon=1.0))
+    base, n = plant.base, 10
+    states, exogenous = (
+        torch.randn(3, n + 1, len(plant.states), generator=seeded(1)).double(),
+        torch.ones(3, n, 1).double(),
+    )
+    states[..., 2:] *= 0.1
+    applied, t = torch.randn(3, n, 1, generator=seeded(2)).double(), DT * torch.arange(n).double()
+    now = states[:, :-1]
+    (read, hidden), true = plant.split(now), plant.true_state(now)
+    acting = plant.acting(hidden, applied)
+    log = {"position": states[0, :, 0], "velocity": states[0, :, 1]}
+    stacked = isinstance(plant, StackedObservations)
+    answers = {
+        "observe": (plant.observe(t, now, exogenous)[..., :2], base.observe(t, read, exogenous)),
+        "actuate": (plant.actuate(now, applied), base.actuate(read, applied)),
+        "memorise": (plant.split(plant.memorise(t, now, exogenous))[0], base.memorise(t, read, exogenous)),
+        "latch": (plant.latch(now, applied), plant.joined(base.latch(read, applied), hidden)),
+        "running_cost": (
+            plant.running_cost(t, now, applied, exogenous),
+            base.running_cost(t, true, acting, exogenous),
+        ),
+        "terminal_cost": (plant.terminal_cost(now), base.terminal_cost(true)),
+        "ended": (plant.ended(now), base.ended(true)),
+        "merit": (
+            plant.merit(states, applied, exogenous),
+            base.merit(plant.true_state(states), acting, exogenous),
+        ),
+        "setpoints": (plant.setpoints(now, applied, exogenous), base.setpoints(true, acting, exogenous)),
+        "categories": (plant.categories(exogenous), base.categories(exogenous)),
+        "discrepancy": (
+            plant.discrepancy(now, 0.5 * now),
+            base.discrepancy(read, plant.split(0.5 * now)[0]),
+        ),
+        "complete_states": (
+            plant.split(plant.complete_states(log, exogenous[0], applied[0]))[0],
+            base.complete_states(log, exogenous[0], applied[0]),
+        ),
+        "controller_start": (
+            plant.controller_start(read[:, 0, :2], exogenous[:, 0])[..., :2],
+            base.controller_start(read[:, 0, :2], exogenous[:, 0]),
+        ),
+        "at_rest": (
+            plant.split(plant.at_rest(states[:, 0, : len(plant.readings)]))[0],
+            base.at_rest(states[:, 0, : len(base.readings)]),
+        ),
+        "draw_initial_state": (
+            plant.true_state(plant.draw_initial_state(3, seeded(3))),
+            base.draw_initial_state(3, seeded(3)),
+        ),
+        "draw_exogenous": (plant.draw_exogenous(3, seeded(3)), base.draw_exogenous(3, seeded(3))),
+    }
+    for name, (answer, expected) in answers.items():
+        torch.testing.assert_close(
+            answer, expected, rtol=1e-14, atol=1e-14, msg=lambda said, name=name: f"{name}: {said}"
+        )
+    assert plant.readings[:2] == LinearQuadratic.states and plant.end_cost == 50.0
+    bare = plant.make_closure(seeded()), plant.make_neural_closure(seeded(), (2,))
+    for closure, kind_of_closure in zip(bare, (nn.Identity, nn.Linear), strict=True):
+        while isinstance(closure, ExtendedClosure):
+            closure = closure.base
+        assert isinstance(closure, kind_of_closure)
+    assert stacked or isinstance(plant.make_policy(seeded()), nn.Linear)
+    marked = {name for name, method in vars(Plant).items() if hasattr(method, "part")}
+    assert marked == (answers.keys() | {"make_closure", "make_neural_closure", "make_policy"}) - {"discrepancy"}
+
+
+def test_a_plant_says_which_methods_it_must_define():
+    class Half(Plant):
+        name, states, actions, inputs, observations = "half", (), (), (), ()
+
+        def vector_field(self, t, state, action, exogenous, closure):
+            return state
+
+    with pytest.raises(TypeError, match="Half must define running_cost, draw_initial_state, draw_exogenous, make_cl"):
+        Half(dt=0.1, horizon=1.0, closure=nn.Identity())
 
 
 class Stepping(LinearQuadratic):

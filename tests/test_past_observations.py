@@ -10,6 +10,7 @@ from c_build import needs_compiler
 from linear_quadratic import LinearGain, LinearQuadratic
 from printed_commands import blocks
 from seeds_and_numbers import seeded
+from served_plants import served
 from small_runs import SMALL
 from test_export_controller import InC
 from test_real_system import Rig, connected
@@ -33,6 +34,9 @@ from rt_torchrl.envs.cryogenic_tank.unknown import TwoZones
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.unknown import LaggedInflow
 from rt_torchrl.plants.signal import Signal
+from rt_torchrl.systems.collectors import EpisodeCollector, FlightCollector
+from rt_torchrl.systems.exploration import ExplorationConfig, LivePolicy
+from rt_torchrl.systems.protocols.served_system import served_system
 from rt_torchrl.systems.real_system import episode_seed
 from rt_torchrl.trajectories.rollout import Rollout
 from rt_torchrl.twinning.hypotheses.config import HypothesesConfig
@@ -301,6 +305,46 @@ def test_a_real_system_that_reports_the_states_of_the_plant_alone():
         seen = torch.stack(seen, 1)
         torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
         assert found["done"].all()
+
+
+def test_past_observations_are_what_sensors_read_then():
+    """Noise falls on a measurement once: what a policy remembers of it gets no other one."""
+    noise = 0.3
+    for plant in (
+        StackedObservations(Timed(horizon=2.0), 2),
+        EXTENSIONS["lag"](StackedObservations(Timed(horizon=2.0), 2)),
+    ):
+        found = PlantEnv(plant, noise=noise, seed=4).rollout(10)
+        seen = found["observation"]
+        torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-14, atol=0.0)
+        torch.testing.assert_close(found["state"][:, 1:, 2:4], seen[:, :-1, :2], rtol=1e-14, atol=0.0)
+        clean = PlantEnv(plant, seed=4).rollout(10)["observation"]
+        assert ((seen - clean).abs()[..., :1] > 1e-3).any()
+        policy = plant.make_policy(seeded())
+        actor = LivePolicy(plant, policy, ExplorationConfig(), generator=seeded(5))
+        actor.begin(policy, strength=0.0)
+        envs = [PlantEnv(plant, noise=noise, seed=4) for _ in range(2)]
+        collectors = FlightCollector(envs[0], actor), EpisodeCollector(envs[1], actor, plant)
+        by_machine, by_steps = (collector.rollout()["observation"] for collector in collectors)
+        torch.testing.assert_close(by_machine, by_steps, rtol=1e-12, atol=1e-13)
+        torch.testing.assert_close(by_machine, by_hand(by_machine[..., :2], 2), rtol=1e-14, atol=0.0)
+
+
+def test_a_served_plant_serves_no_past_observations():
+    base = LinearQuadratic(horizon=2.0)
+    plant = StackedObservations(base, 2)
+    with served(base, "modbus", safe=(0.0,), period=0.1) as (_, port):
+        system = served_system(plant, safe=(0.0,), protocol="modbus", port=port, period=0.1, served=base)
+        found, seen = system.reset(), []
+        for _ in range(5):
+            found = system.step(found.set("action", torch.tensor([[0.5]], dtype=torch.float64)))
+            seen.append(found["observation"])
+            found = system.step_mdp(found)
+        system.close()
+    seen = torch.stack(seen, 1)
+    torch.testing.assert_close(seen, by_hand(seen[..., :2], 2), rtol=1e-13, atol=1e-13)
+    with pytest.raises(ValueError, match="served='cryogenic_tank' lacks position, velocity, which plant"):
+        served_system(plant, safe=(0.0,), served=CryogenicTank())
 
 
 def test_what_the_environment_does_not_report_is_refused_by_its_name():

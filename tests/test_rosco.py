@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from rt_torchrl import LaggedActuator, StackedObservations
 from rt_torchrl.envs.wind_turbine import rosco as adapter
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.envs.wind_turbine.rosco import RoscoController, nrel5mw, rosco_turbine, steps_of
@@ -91,3 +92,31 @@ def test_roscos_controller_holds_the_speed_and_the_power(rosco, capfd):
 def test_an_interval_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="dt=0.25 s must be a multiple of the 0.1 s"):
         steps_of(WindTurbine(dt=0.25))
+
+
+def test_the_controllers_side_remembers_as_a_step_of_the_plant_does():
+    """Answers to a simulator whose rotor stands still in what it reports; the wind is the plant's draw."""
+    plant = StackedObservations(WindTurbine(horizon=5.0), 2)
+    generator = torch.Generator().manual_seed(3)
+    start = plant.draw_initial_state(1, generator)[0]
+    wind = plant.draw_exogenous(1, generator)[0, :, 0].numpy()
+    every, seen = steps_of(plant), []
+
+    def decide(state, now, report):
+        t = torch.tensor(len(seen) * plant.dt, dtype=torch.float64)
+        seen.append(plant.observe(t, state, torch.tensor([now], dtype=torch.float64)))
+        return state[4:6]
+
+    answer = adapter.Answer(plant, start, wind, decide, every)
+    for k in range(4 * every):
+        answer.call_controller({"rot_speed": 1.0 + 0.01 * k, "ws": wind[k // every]})
+    n = len(seen[0]) // 3
+    for k in range(4):
+        expected = torch.cat([seen[max(k - j, 0)][:n] for j in range(3)])
+        torch.testing.assert_close(seen[k], expected, rtol=0.0, atol=0.0)
+    assert not torch.equal(seen[3][:n], seen[2][:n])
+
+
+def test_a_plant_with_hidden_states_is_refused():
+    with pytest.raises(ValueError, match="must be a WindTurbine without hidden states"):
+        rosco_turbine(LaggedActuator(WindTurbine(), "blade_pitch", 1.0))

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from rt_torchrl.envs.wind_turbine.plant import WindTurbine
 from rt_torchrl.evaluation.unseen import RealController
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.systems.calling_simulator import CallingSimulator, Controller
 from rt_torchrl.systems.reading import Reading
 from rt_torchrl.systems.real_system import RealSystem, episode_seed
@@ -104,9 +105,9 @@ class Answer:
         every: number of steps of the simulator between two decisions.
     """
 
-    def __init__(self, plant: WindTurbine, start: Tensor, wind: np.ndarray, decide: Decide, every: int):
-        self.plant, self.state, self._wind = plant, start.clone(), wind
-        self._decide, self._every, self._step = decide, every, 0
+    def __init__(self, plant: Plant, start: Tensor, wind: np.ndarray, decide: Decide, every: int):
+        self.plant, self.turbine, self.state, self._wind = plant, turbine_of(plant), start.clone(), wind
+        self._decide, self._every, self._step, self._interval = decide, every, 0, steps_of(plant)
         computed = ("generator_torque", "blade_pitch", "rotor_speed")
         self._filters = [k for k, signal in enumerate(plant.states) if signal.name not in computed]
 
@@ -119,10 +120,14 @@ class Answer:
             self._follow(speed, float(report["ws"]))
         if self._step % self._every == 0:
             k = min(self._step // self._every, len(self._wind) - 1)
-            self.state = self.plant.latch(self.state, self._decide(self.state, float(self._wind[k]), report))
+            action = self._decide(self.state, float(self._wind[k]), report)
+            if self._step % self._interval == 0:  # as at the start of Plant.step
+                t, wind = self.state.new_tensor(self._step * STEP), self.state.new_tensor([self._wind[k]])
+                self.state = self.plant.memorise(t, self.state, wind)
+            self.state = self.plant.latch(self.state, action)
         self._step += 1
         torque, pitch = self.state[4:6].tolist()
-        share = self.plant.cut_in(torch.tensor(self.plant.gear_ratio * speed, dtype=torch.float64)).item()
+        share = self.turbine.cut_in(torch.tensor(self.turbine.gear_ratio * speed, dtype=torch.float64)).item()
         return torque * share, math.radians(pitch), 0.0
 
     def _follow(self, rotor_speed: float, wind: float) -> None:
@@ -143,7 +148,19 @@ class Answer:
         """Do nothing, because there is no library to unload."""
 
 
-def simulate(plant: WindTurbine, seed: int, answer: Callable[[Tensor, np.ndarray], Any]) -> None:
+def turbine_of(plant: Plant) -> WindTurbine:
+    """The turbine itself, of which policies may observe past observations, too.
+
+    Raises:
+        ValueError: if the plant is no turbine, or has states that no sensor reads.
+    """
+    turbine = plant.innermost
+    if not isinstance(turbine, WindTurbine) or plant.unread:
+        raise ValueError(f"plant {plant.name!r} must be a WindTurbine without hidden states: ROSCO simulates the rest.")
+    return turbine
+
+
+def simulate(plant: Plant, seed: int, answer: Callable[[Tensor, np.ndarray], Any]) -> None:
     """Run one episode of ROSCO's simulator, with a start and a wind that the plant draws from the seed.
 
     Args:
@@ -164,7 +181,7 @@ def simulate(plant: WindTurbine, seed: int, answer: Callable[[Tensor, np.ndarray
         )
 
 
-def steps_of(plant: WindTurbine) -> int:
+def steps_of(plant: Plant) -> int:
     """The number of the simulator's steps in a control interval.
 
     Raises:
@@ -176,7 +193,7 @@ def steps_of(plant: WindTurbine) -> int:
     return steps
 
 
-def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | str = "cpu") -> RealSystem:
+def rosco_turbine(plant: Plant, *, seed: int = 0, device: torch.device | str = "cpu") -> RealSystem:
     """ROSCO's simulator as the real system, with the plant's ranges and rates of the actuators; it has none itself.
 
     Args:
@@ -185,9 +202,10 @@ def rosco_turbine(plant: WindTurbine, *, seed: int = 0, device: torch.device | s
         device: device of the reported tensors.
 
     Raises:
-        ValueError: if ROSCO is not installed, the plant's control interval does not fit, or the plant observes a
-            preview of the wind.
+        ValueError: if ROSCO is not installed, the plant's control interval does not fit, the plant has hidden states or
+            observes a preview of the wind.
     """
+    turbine_of(plant)
     every = steps_of(plant)
     if plant.previews:
         names = ", ".join(signal.name for signal in plant.inputs[len(plant.acting_inputs) :])
@@ -214,12 +232,12 @@ class RoscoController(RealController):
     applied action of that interval. :class:`RealController` describes the arguments.
     """
 
-    plant: WindTurbine
+    plant: Plant
 
     def fly_real(self, count: int, *, seed: int) -> Trajectory:
         """The episodes that :func:`rosco_turbine` runs from the same seed."""
         episodes = [self._episode(episode_seed(seed, number)) for number in range(count)]
-        device = self.plant.greatest_increment.device
+        device = turbine_of(self.plant).greatest_increment.device
         states, applied, wind = (torch.stack(part).to(device) for part in zip(*episodes, strict=True))
         return Trajectory(states, applied, wind.unsqueeze(-1))
 

@@ -6,24 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rt_torchrl.plants.closures import PositiveCoefficients
-from rt_torchrl.plants.plant import Plant
-from rt_torchrl.plants.shapes import (
-    Action,
-    Actions,
-    Cost,
-    Ended,
-    Hidden,
-    Input,
-    Inputs,
-    Observation,
-    State,
-    States,
-    Time,
-)
+from rt_torchrl.plants.plant import Part, Plant
+from rt_torchrl.plants.shapes import Action, Cost, Hidden, Input, State, Time
 from rt_torchrl.plants.signal import Signal
 
 
@@ -69,8 +57,9 @@ class Extension(Plant):
     .. math:: (\bar a, x_{k+1}) = r(t_k, x_k, a_k; w), \qquad s_{k+1} = \Phi(t_k, s_k, \bar a, z_k; w_p)
 
     Here ā is the action that acts on the plant while the actuators believe that a does. The states are those of the
-    plant followed by x. Task and draws are those of the plant, in its :meth:`true_state` and under the action that
-    acts, so that an extension says how its dynamics differ and nothing else. Parameters w are in the closure, beside
+    plant followed by x. Everything else is asked of the plant, by :meth:`ask`: its task in its :meth:`true_state` and
+    under the action that acts, and what a controller knows in what sensors read. An extension says how its dynamics
+    differ and nothing else. Parameters w are in the closure, beside
     those of the plant's closure, so that a twin of the extended plant identifies both. Extensions nest.
 
     Args:
@@ -101,7 +90,7 @@ class Extension(Plant):
         self.base, self.name, self.unread = base, base.name, base.unread + len(hidden)
         self.states, self.actions, self.inputs = (*base.states, *hidden), base.actions, base.inputs
         self.observations, self.observed, self.previews = base.observations, base.observed, base.previews
-        self.controller_states, self.end_cost = base.controller_states, base.end_cost
+        self.controller_states, self.memories, self.end_cost = base.controller_states, base.memories, base.end_cost
         self._parameterised = own is not None
 
     @property
@@ -184,77 +173,32 @@ class Extension(Plant):
         met = self.meeting(hidden, exogenous)
         return self.joined(self.base.advance(t, base, acting, met, self.of_base(closure)), end)
 
-    def actuate(self, state: State, command: Action) -> Action:
-        return self.base.actuate(self.split(state)[0], command)
-
-    def latch(self, state: State, applied: Action) -> State:
-        base, hidden = self.split(state)
-        return self.joined(self.base.latch(base, applied), hidden)
-
-    def memorise(self, t: Time, state: State, exogenous: Input) -> State:
-        base, hidden = self.split(state)
-        return self.joined(self.base.memorise(t, base, exogenous), hidden)
-
-    def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
-        return self._with_rest(self.base.at_rest(read))
-
-    def _with_rest(self, base: Float[Tensor, "*batch n_b"]) -> State:
-        return self.joined(base, self.rest(base))
-
-    # The task, which is that of the plant
-
-    def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
-        return self.base.observe(t, self.split(state)[0], exogenous)
-
-    def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
-        acting = self.acting(self.split(state)[1], applied)
-        return self.base.running_cost(t, self.true_state(state), acting, exogenous)
-
-    def terminal_cost(self, state: State) -> Cost:
-        return self.base.terminal_cost(self.true_state(state))
-
-    def ended(self, state: State) -> Ended:
-        return self.base.ended(self.true_state(state))
-
     @property
     def discrepancy_scales(self) -> tuple[float, ...]:
         """Those of the plant; hidden states, which no sensor reads, are not compared."""
         return (*self.base.discrepancy_scales, *(math.inf,) * (len(self.states) - len(self.base.states)))
 
-    def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
-        acting = self.acting(self.split(states[:, :-1])[1], applied)
-        return self.base.merit(self.true_state(states), acting, exogenous)
+    def ask(self, which: Part, name: str, given: dict[str, Any]) -> Any:
+        """What the plant answers when a method is called, in its own states, with what the extension has beside it.
 
-    def setpoints(self, states: Tensor, applied: Tensor, exogenous: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-        acting = self.acting(self.split(states)[1], applied)
-        return self.base.setpoints(self.true_state(states), acting, exogenous)
-
-    def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
-        return self.base.categories(exogenous)
-
-    def complete_states(self, measured: dict[str, Tensor], exogenous: Tensor, actions: Tensor) -> Tensor:
-        """States of the plant from a log; hidden states at rest."""
-        return self._with_rest(self.base.complete_states(measured, exogenous, actions))
-
-    def controller_start(self, measured: Tensor, exogenous: Tensor) -> Tensor:
-        return self.base.controller_start(measured, exogenous)
-
-    # The draws, which are those of the plant
-
-    def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
-        return self._with_rest(self.base.draw_initial_state(batch, generator))
-
-    def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps n_z"]:
-        return self.base.draw_exogenous(batch, generator)
-
-    def make_closure(self, generator: torch.Generator) -> nn.Module:
-        return self._with_own(self.base.make_closure(generator))
-
-    def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
-        return self._with_own(self.base.make_neural_closure(generator, hidden))
-
-    def make_policy(self, generator: torch.Generator) -> nn.Module:
-        return self.base.make_policy(generator)
+        Args:
+            which: part of the plant that the method is, see :func:`~rt_torchrl.plants.plant.part`.
+            name: name of the method.
+            given: arguments by name, in their order.
+        """
+        hidden: Any = None
+        for place in given.keys() & {"state", "states"}:
+            base, hidden = self.split(given[place])
+            given[place] = self.true_state(given[place]) if which == "task" else base
+            if which == "task" and "applied" in given:  # a state for each action, of episodes perhaps one more
+                at = hidden[..., : given["applied"].shape[-2], :] if place == "states" else hidden
+                given["applied"] = self.acting(at, given["applied"])
+        answer = getattr(self.base, name)(*given.values())
+        if which == "memory":
+            return self.joined(answer, hidden)
+        if which == "start":
+            return self.joined(answer, self.rest(answer))
+        return self._with_own(answer) if which == "closure" else answer
 
     def extended(self, closure: nn.Module) -> nn.Module:
         """A closure of the plant without extensions, with the parameters of all its extensions beside it."""

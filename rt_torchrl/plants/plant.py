@@ -18,12 +18,12 @@ episode lasts, and the value of what comes after the end is known: a learner wit
 :math:`-L_e/(1 - \gamma)`.
 """
 
+import inspect
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import partial, wraps
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -43,7 +43,37 @@ class Transition(NamedTuple):
     applied: Tensor
 
 
-class Plant(nn.Module, ABC):
+Part = Literal["controller", "memory", "task", "start", "closure"]
+Method = TypeVar("Method", bound=Callable[..., Any])
+REQUIRED = ("vector_field", "running_cost", "draw_initial_state", "draw_exogenous", "make_closure")
+"""Methods that a plant must define."""
+
+
+def part(which: Part) -> Callable[[Method], Method]:
+    """Say which part of a plant a method is, so that an :class:`Extension` of the plant asks the plant for it.
+
+    Args:
+        which: the controller, which knows what sensors read; its memory, which it writes into the states; the task,
+            which is about true states and the action that acts; states at the start; or a closure.
+    """
+
+    def marked(method: Method) -> Method:
+        names = tuple(inspect.signature(method).parameters)[1:]
+
+        @wraps(method)
+        def answer(plant: Any, *given: Any, **named: Any) -> Any:
+            if plant.innermost is plant:
+                return method(plant, *given, **named)
+            values = dict(zip(names, given, strict=False)) | named
+            return plant.ask(which, method.__name__, {name: values[name] for name in names})
+
+        vars(answer)["part"] = which
+        return cast(Method, answer)
+
+    return marked
+
+
+class Plant(nn.Module):
     """Physics and control problem of one system; ``envs/`` holds examples.
 
     A subclass declares its signals in the four class attributes (``inputs`` may be empty), and defines
@@ -63,6 +93,7 @@ class Plant(nn.Module, ABC):
             first set.
 
     Raises:
+        TypeError: if the plant lacks a method that it must define.
         ValueError: if ``dt`` or ``horizon`` is not positive, ``horizon`` is no multiple of ``dt`` or exceeds
             ten million intervals, or ``observe`` names what the plant does not measure.
     """
@@ -81,6 +112,8 @@ class Plant(nn.Module, ABC):
 
     All other states are measured. An exported controller holds these states and advances them by :meth:`step`.
     """
+    memories: tuple[str, ...] = ()
+    """Names of those of them that :meth:`memorise` alone writes: they hold what was measured, without further noise."""
     state_sizes: tuple[float, ...] = ()
     """Usual sizes of the states, in their units; by default ones."""
     end_cost: float | None = None
@@ -98,6 +131,10 @@ class Plant(nn.Module, ABC):
 
     def __init__(self, *, dt: float, horizon: float, closure: nn.Module, observe: Sequence[str] = ()):
         super().__init__()
+        kind = type(self)
+        missing = [name for name in REQUIRED if getattr(kind, name) is getattr(Plant, name)]
+        if missing and kind.innermost is Plant.innermost:  # an extension has those of its plant
+            raise TypeError(f"plant {kind.__name__} must define {', '.join(missing)}; docs/own_plant.md shows how.")
         self.n_steps = whole_steps(self.name, dt, horizon)
         self.dt = float(dt)
         self.closure = closure
@@ -149,14 +186,16 @@ class Plant(nn.Module, ABC):
 
     # Dynamics
 
-    @abstractmethod
     def vector_field(self, t: Time, state: State, action: Action, exogenous: Input, closure: nn.Module) -> State:
         """Time derivative of the state, ds/dt = f(t, s, a, z, g(s; w_p)), for a held action and exogenous input."""
+        raise NotImplementedError
 
+    @part("controller")
     def actuate(self, state: State, command: Action) -> Action:
         """The action that the actuators make of a command, for example under a rate limit; by default the command."""
         return command
 
+    @part("memory")
     def memorise(self, t: Time, state: State, exogenous: Input) -> State:
         """The state, into which the controller writes what it keeps of this moment's signals; by default nothing.
 
@@ -164,6 +203,7 @@ class Plant(nn.Module, ABC):
         """
         return state
 
+    @part("memory")
     def latch(self, state: State, applied: Action) -> State:
         """The end state, into which sampled-data parts write what they remember of the interval; by default nothing."""
         return state
@@ -190,12 +230,14 @@ class Plant(nn.Module, ABC):
         applied = self.actuate(state, command)
         return Transition(self.latch(scheme(t, state, applied, exogenous, closure), applied), applied)
 
+    @part("start")
     def at_rest(self, read: Float[Tensor, "*batch n_r"]) -> State:
         """States at the start of an episode, from those that sensors read; the :attr:`unread` ones are at rest."""
         return read
 
     # Task
 
+    @part("controller")
     def observe(self, t: Time, state: State, exogenous: Input) -> Observation:
         """The observation of the policies, scaled to order one, such as tracking errors.
 
@@ -208,17 +250,20 @@ class Plant(nn.Module, ABC):
         _, *seen = torch.broadcast_tensors(state[..., 0], *seen)
         return torch.stack(seen, -1)
 
-    @abstractmethod
+    @part("task")
     def running_cost(self, t: Time, state: State, applied: Action, exogenous: Input) -> Cost:
         r"""Lagrangian L_a of the control problem; the reward is −L_a.
 
         .. math:: J_a = \frac1{T_o}\Big(\int L_a\,dt + \Phi_a(s(T_o))\Big)
         """
+        raise NotImplementedError
 
+    @part("task")
     def terminal_cost(self, state: State) -> Cost:
         """Cost Φ_a of the state at the end of an episode, in the unit of L_a times seconds; by default zero."""
         return state.new_zeros(state.shape[:-1])
 
+    @part("task")
     def ended(self, state: State) -> Ended:
         """Whether an episode has ended in this state; by default never.
 
@@ -255,10 +300,12 @@ class Plant(nn.Module, ABC):
         difference = differences(signals, state[..., compared], measured[..., compared])
         return 0.5 * ((difference / state.new_tensor([scales[k] for k in compared])) ** 2).sum(-1)
 
+    @part("task")
     def merit(self, states: States, applied: Actions, exogenous: Inputs) -> dict[str, Float[Tensor, " batch"]]:
         """Physical quantities by which an engineer judges whole episodes, named with their units; by default none."""
         return {}
 
+    @part("task")
     def setpoints(
         self,
         states: Float[Tensor, "*batch n n_s"],
@@ -268,10 +315,12 @@ class Plant(nn.Module, ABC):
         """Quantities to be held, named with their units: value and setpoint in each interval; by default none."""
         return {}
 
+    @part("task")
     def categories(self, exogenous: Inputs) -> dict[str, Bool[Tensor, " batch"]]:
         """Kinds of episodes, by name, for which results are also shown separately; by default none."""
         return {}
 
+    @part("start")
     def complete_states(
         self,
         measured: dict[str, Float[Tensor, " samples"]],
@@ -297,6 +346,7 @@ class Plant(nn.Module, ABC):
             )
         return torch.stack([measured[state.name] for state in self.states], -1)
 
+    @part("controller")
     def controller_start(
         self, measured: Float[Tensor, "*batch n_y"], exogenous: Float[Tensor, "*batch n_z"]
     ) -> Float[Tensor, "*batch n_c"]:
@@ -314,18 +364,22 @@ class Plant(nn.Module, ABC):
 
     # Draws, always from the generator that is passed in
 
-    @abstractmethod
+    @part("start")
     def draw_initial_state(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_s"]:
         """Initial states of ``batch`` episodes."""
+        raise NotImplementedError
 
-    @abstractmethod
+    @part("task")
     def draw_exogenous(self, batch: int, generator: torch.Generator) -> Float[Tensor, "{batch} n_steps n_z"]:
         """Exogenous inputs of ``batch`` episodes, one sample per control interval."""
+        raise NotImplementedError
 
-    @abstractmethod
+    @part("closure")
     def make_closure(self, generator: torch.Generator) -> nn.Module:
         """The closure that a twin of this plant starts from, with the weights w_p⁰."""
+        raise NotImplementedError
 
+    @part("closure")
     def make_neural_closure(self, generator: torch.Generator, hidden: Sequence[int]) -> nn.Module:
         """A closure with a perceptron that starts with the values of :meth:`make_closure`; by default there is none.
 
@@ -344,6 +398,7 @@ class Plant(nn.Module, ABC):
         """Suspects that hypotheses take only by name, such as a :class:`NeuralResidual`; by default none."""
         return {}
 
+    @part("controller")
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """The policy that both controllers start from, w_a⁰; by default a saturated affine law of the observation."""
         return SaturatedAffine(len(self.observations), self.actions, generator=generator)
@@ -380,6 +435,15 @@ def require_end_cost(plant: Plant) -> None:
         )
     if plant.end_cost is not None and not torch.tensor(plant.end_cost).isfinite():
         raise ValueError(f"end_cost={plant.end_cost} of plant {plant.name!r} must be finite.")
+
+
+def with_memories(plant: Plant, end: State, t: Tensor, measured: State, exogenous: Tensor) -> Tensor:
+    """The end of an interval, at whose start the controller memorised what was measured and not what was true."""
+    if not plant.memories:
+        return end
+    kept = plant.memorise(t, measured, exogenous)
+    sources = (kept if signal.name in plant.memories else end for signal in plant.states)
+    return torch.stack([source[..., k] for k, source in enumerate(sources)], -1)
 
 
 def held(plant: Plant, state: State, end: State) -> Tensor:

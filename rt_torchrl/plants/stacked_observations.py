@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from rt_torchrl.plants.extension import Extension
 from rt_torchrl.plants.plant import Plant
+from rt_torchrl.plants.policies import SaturatedAffine
 from rt_torchrl.plants.shapes import Hidden, Input, Observation, State, Time
 from rt_torchrl.plants.signal import Signal
 
@@ -43,7 +44,8 @@ class StackedObservations(Extension):
         super().__init__(base, past)
         self.states = (*base.readings, *past, *base.states[self._read :])
         self.unread = base.unread
-        self.controller_states = (*base.controller_states, *(signal.name for signal in past))
+        self.memories = tuple(signal.name for signal in past)
+        self.controller_states = (*base.controller_states, *self.memories)
         self.observations = (*base.observations, *_past(base.observations, count))
         self.observed = (*base.observed, *_past(base.observed, count))
 
@@ -110,7 +112,7 @@ class StackedObservations(Extension):
 
     def make_policy(self, generator: torch.Generator) -> nn.Module:
         """A saturated affine law of all observations; the plant's own policy knows the present one alone."""
-        return Plant.make_policy(self, generator)
+        return SaturatedAffine(len(self.observations), self.actions, generator=generator)
 
 
 def _past(signals: tuple[Named, ...], count: int) -> list[Named]:

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from rt_torchrl.options import require_number
-from rt_torchrl.plants.plant import Plant, Transition
+from rt_torchrl.plants.plant import Plant, Transition, with_memories
 from rt_torchrl.plants.signal import bounds
 from rt_torchrl.trajectories.engines.parallel import compiled_if
 from rt_torchrl.trajectories.rollout import DivergenceError
@@ -44,7 +44,8 @@ class PlantEnv(EnvBase):
         compiled: whether to compile the step.
         noise: standard deviation of the sensors' error as a share of the value that they read. Every reported state is
             s(1 + noise·w), where w is standard normal, and the observation is computed from it; the reward is that of
-            the true state.
+            the true state. What a controller memorises (:attr:`Plant.memories`) is what was measured then, and gets no
+            further noise.
         wear: function from the number of an episode, counted from 0, to the real system's closure in it; with None the
             plant's own closure holds in all episodes.
 
@@ -181,7 +182,8 @@ class PlantEnv(EnvBase):
                 f"command {command.tolist()}, exogenous input {exogenous.tolist()}."
             )
         # A compiled step may reuse its output buffer.
-        self._state = transition.state.clone()
+        measured = self._state * self._factor
+        self._state = with_memories(self.plant, transition.state.clone(), t, measured, exogenous)
         self._step_count = self._step_count + 1
         over = (self._step_count >= self.plant.n_steps).unsqueeze(-1)
         ends = self.plant.end_cost is not None
@@ -212,7 +214,9 @@ class PlantEnv(EnvBase):
         shape, like = (self.batch_size[0], len(self.plant.states)), {"dtype": torch.float64, "device": self.device}
         if self._noise == 0.0:
             return torch.ones(shape, **like)
-        return 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
+        drawn = 1.0 + self._noise * torch.randn(shape, generator=self._sensors, **like)
+        read = [signal.name not in self.plant.memories for signal in self.plant.states]
+        return torch.where(torch.tensor(read, device=self.device), drawn, 1.0)
 
     def _time(self) -> Float[Tensor, " batch"]:
         # An integer times a float would be single precision.

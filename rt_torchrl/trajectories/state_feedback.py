@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rt_torchrl.plants.plant import Plant, held
+from rt_torchrl.plants.plant import Plant
 from rt_torchrl.trajectories.engines.interval import Drive, Interval
 from rt_torchrl.trajectories.trajectory import Trajectory
 
@@ -91,9 +91,7 @@ class RememberingInterval(Interval):
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """State and memory, (s, m), at the end of the interval."""
         command, memory = self.answer(state, drive.command)
-        s = state[..., : len(self.plant.states)]
-        end = self.plant.step(drive.t, s, command, drive.exogenous, self.closure).state
-        return torch.cat([held(self.plant, s, end), memory], -1)
+        return torch.cat([self.end(state[..., : len(self.plant.states)], command, drive), memory], -1)
 
 
 @torch.no_grad()

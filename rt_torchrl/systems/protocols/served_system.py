@@ -1,5 +1,6 @@
 """A served plant as a real system: link, pace, safety layer and readings together."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,6 +50,7 @@ def served_system(
     protocol: Protocol = "opcua",
     port: int = 4840,
     period: float | None = None,
+    served: Plant | None = None,
     closure: nn.Module | None = None,
     log: Path | None = None,
     patience: float = 60.0,
@@ -61,13 +63,25 @@ def served_system(
         protocol: what the server speaks.
         port: port of the server on the local machine.
         period: control period on the wall clock [s]; by default the plant's control interval.
+        served: plant at the other end, if it does not serve all states of ``plant``, such as past observations; the
+            :attr:`Plant.controller_states` are then computed here, see :class:`RealSystem`.
         closure: the true closure, if policies are to be judged in simulation; else None.
         log: file of the safety layer's events.
         patience: time for which a reset waits for the plant to answer [s].
+
+    Raises:
+        ValueError: if the served plant does not serve a state that is measured.
     """
-    tags, wall = Tags.of(plant), plant.dt if period is None else period
+    computed = () if served is None else plant.controller_states
+    measured = tuple(signal for signal in plant.readings if signal.name not in computed)
+    tags, wall = Tags.of(served or plant), plant.dt if period is None else period
+    missing = {signal.name for signal in measured} - {signal.name for signal in tags.states}
+    if missing:
+        raise ValueError(
+            f"served={(served or plant).name!r} lacks {', '.join(sorted(missing))}, which plant {plant.name!r} reads."
+        )
     link = link_to(protocol, tags, port, period=wall)
-    entries = {key: names for key, names in tags.entries.items() if names}
+    entries = {key: names for key, names in dataclasses.replace(tags, states=measured).entries.items() if names}
     env = ConnectedPlant(
         link,
         entries,
@@ -78,7 +92,7 @@ def served_system(
         answered=ANSWERED,
         patience=patience,
     )
-    low, high = [s.low for s in plant.readings], [s.high for s in plant.readings]
+    low, high = [s.low for s in measured], [s.high for s in measured]
     bounded = {"skipped": NONE} | ({"state": (low, high)} if any(map(math.isfinite, (*low, *high))) else {})
     guarded = SafetyLayer(env, SafetyConfig(interval=plant.dt, ranges=bounded, log=log), fallback=tuple(safe))
     exogenous = Reading(keys=("exogenous",)) if plant.inputs else None
@@ -89,5 +103,6 @@ def served_system(
         exogenous=exogenous,
         applied=Reading(keys=("applied",)),
         closure=closure,
+        computes=served is not None,
         seed=None,
     )

@@ -41,7 +41,11 @@ class Interval(nn.Module):
 
     def forward(self, state: Tensor, drive: Drive) -> Tensor:
         """The state at the end of the interval."""
-        end = self.plant.step(drive.t, state, self.command(state, drive), drive.exogenous, self.closure).state
+        return self.end(state, self.command(state, drive), drive)
+
+    def end(self, state: Tensor, command: Tensor, drive: Drive) -> Tensor:
+        """The state at the end of the interval under a command."""
+        end = self.plant.step(drive.t, state, command, drive.exogenous, self.closure).state
         return end if self.policy is None else held(self.plant, state, end)
 
 
