@@ -46,7 +46,7 @@ class Fit:
 
     def __init__(self, twin: DigitalTwin, config: AssimilationConfig, segment: int):
         self.twin, self.segment = twin, segment
-        measured = dataclasses.replace(config, inputs="record")
+        measured = dataclasses.replace(config, inputs="record", segment=config.segment or 0)
         short = dataclasses.replace(
             measured,
             method="levenberg_marquardt",
