@@ -67,16 +67,19 @@ def test_nothing_is_drawn_from_a_record_without_noise():
 
 
 @pytest.mark.parametrize("initial", ["measured", "estimated"])
-def test_what_is_reported_of_segments_is_the_cost_of_whole_records(initial):
-    """J_p has the start that suits the whole record best, which is here a regression on the residuals of the slope."""
+def test_what_is_reported_is_over_the_segments_of_the_fit(initial):
+    """Segments begin with what was read before the fit, and with what suits them best after it if that is estimated."""
     record, closure = lines()[0], Slope()
-    found = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
-    found = found.update([record], [], 1, torch.Generator())
+    fit = assimilation(Line(), closure, segment=20, iterations=3, initial=initial)
+    found = fit.update([record], [], 1, torch.Generator())
     times, x = 0.1 * np.arange(101), record.states[:, 0].numpy()
-    for weights, J_p in ((Slope().w, found.start), (closure.w, found.best)):
+    for weights, J_p, free in ((Slope().w, found.start, False), (closure.w, found.best, initial == "estimated")):
         left = x - (weights[0] + WINDS[0] * weights[1]).item() * times
-        start = left.mean() if initial == "estimated" else left[0]
-        assert J_p == pytest.approx(0.1 * 0.5 * ((left - start) ** 2).sum(), rel=1e-7)
+        parts = np.stack([left[20 * k : 20 * k + 21] for k in range(5)])
+        parts = parts - (parts.mean(1) if free else parts[:, 0])[:, None]
+        assert J_p == pytest.approx(0.1 * 0.5 * (parts**2).sum(1).mean(), rel=1e-7)
+    samples = parts if initial == "estimated" else parts[:, 1:]
+    assert fit.report() == {"rms/position [m]": pytest.approx(np.sqrt((samples**2).mean()), rel=1e-6)}
 
 
 class Bent(nn.Module):
@@ -207,14 +210,42 @@ def test_the_truth_has_no_cost_in_segments():
 
 
 @pytest.mark.parametrize("method", ["gradient", "levenberg_marquardt"])
-def test_what_is_reported_is_the_cost_of_whole_records(method):
+def test_the_cost_that_is_reported_is_that_of_the_segments(method):
     plant, closure = Seasonal(), LinearClosure(torch.zeros(2, 2))
-    record = flight(plant)
-    before = of_segments(plant, closure).normal_equations(replayed(record)).cost.item()
+    segments = replayed(record := flight(plant)).segments(12, plant.dt)
+    before = of_segments(plant, closure).normal_equations(segments).cost.item()
     found = of_segments(plant, closure, segment=12, method=method, iterations=3)
     found = found.update([record], [], 1, torch.Generator())
     assert found.start == pytest.approx(before, rel=1e-12)  # two ways to sum
-    assert found.best == pytest.approx(of_segments(plant, closure).normal_equations(replayed(record)).cost.item())
+    assert found.best == pytest.approx(of_segments(plant, closure).normal_equations(segments).cost.item())
+
+
+class NamedSlope(nn.Module):
+    """ẋ = w, a slope with a name."""
+
+    def __init__(self):
+        super().__init__()
+        self.w = nn.Parameter(torch.tensor([0.5], dtype=torch.float64))
+
+    def forward(self, features):
+        return self.w + 0.0 * features
+
+    def named_coefficients(self):
+        return {"slope": self.w[0]}
+
+
+def test_standard_errors_are_those_of_the_regression_that_step_4_is():
+    """Over a record that begins with its first sample, a slope is the only unknown, whose error is σ/√Σt²."""
+    plant, generator = Line(), torch.Generator().manual_seed(0)
+    closure, times = NamedSlope(), 0.1 * np.arange(401)
+    noise = 0.05 * torch.randn(401, generator=generator, dtype=torch.float64).numpy()
+    noise[0] = 0.0
+    fit = assimilation(plant, closure, initial="measured")
+    record = line_segment(0.7 * times + noise, wind=0.0)
+    fit.update([record], [], 1, generator)
+    (error,) = fit.standard_errors([record]).values()
+    assert error == pytest.approx(0.05 / np.sqrt((times**2).sum()), rel=0.25)
+    assert fit.rms_errors([record])["position [m]"] == pytest.approx(0.05, rel=0.1)
 
 
 def test_sensitivities_start_at_their_own_time():

@@ -25,6 +25,7 @@ from rt_torchrl.fit.least_squares import (
 from rt_torchrl.fit.likelihood import Likelihood, WeightPrior
 from rt_torchrl.fit.record import SensorRecord, sensor_records
 from rt_torchrl.fit.sensors import Sensor, sensors_of, state_places, state_sensors, with_biases
+from rt_torchrl.fit.uncertainty import Uncertainty
 from rt_torchrl.optimisers.descent import Descended, Descent, DescentConfig
 from rt_torchrl.optimisers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from rt_torchrl.options import check_options
@@ -64,8 +65,8 @@ class AssimilationConfig:
             keep their initial values, and so the law keeps its initial form where no record has been.
         segment: number of control intervals after which the replay starts again from the measured state (multiple
             shooting); 0 replays whole records, as in the paper. Over short segments the states are nearly linear in the
-            weights, so a closure with many weights fits the record in a few steps. The J_p that descends is then the
-            mean over the segments. None lets the data choose: whole records, unless the twin is unstable and leaves
+            weights, so a closure with many weights fits the record in a few steps. J_p is then the mean over the
+            segments. None lets the data choose: whole records, unless the twin is unstable and leaves
             them; then the longest segments that it follows as well as shorter ones.
         initial: first state of a replay: ``measured`` for the first reading of the sensors, as in the paper, or
             else ``estimated``, with which the components that J_p compares are unknowns beside the weights. A plant
@@ -182,7 +183,8 @@ class Assimilation:
             generator: source of the realisations.
 
         Returns:
-            J_p of the whole records before and after, without the prior, and the descent's gradient and iterations.
+            J_p before and after, without the prior, and the descent's gradient and iterations. J_p is the mean over
+            the records, or over the segments that the fit uses.
             J_p before is infinite if the twin diverges on the records; the fit then begins anew from the first closure.
             Where the twin diverges under that, too, all are infinite, and the closure stays as it is.
         """
@@ -198,14 +200,12 @@ class Assimilation:
         return self._over(whole, self.length)
 
     def _over(self, whole: Trajectory, length: int) -> Descended:
-        """Descend over segments of a number of control intervals, or whole records with 0; J_p is of whole records."""
+        """Descend over segments of a number of control intervals, or whole records with 0."""
         self.length = min(length, whole.actions.shape[1])
-        if not length:
-            return self._descend_anew(whole)
-        before = self.cost_of(whole)
-        return self._descend_anew(self._in_segments(whole))._replace(start=before, best=self.cost_of(whole))
+        return self._descend_anew(self.in_segments(whole))
 
-    def _in_segments(self, whole: Trajectory) -> Trajectory:
+    def in_segments(self, whole: Trajectory) -> Trajectory:
+        """Records as the last fit replayed them: in segments, or whole."""
         return whole.segments(self.length, self.twin.plant.dt) if self.length else whole
 
     def _over_chosen_segments(self, whole: Trajectory) -> Descended:
@@ -216,7 +216,7 @@ class Assimilation:
         def fit(length: int) -> tuple[tuple[Descended, int, dict[str, Any]], Tensor]:
             self._resume(copy.deepcopy(begun))
             found = self._over(whole, length)
-            return (found, length, copy.deepcopy(self._progress())), self._rms(self._in_segments(whole))
+            return (found, length, copy.deepcopy(self._progress())), self._rms(self.in_segments(whole))
 
         found, self.length, progress = over_segments(
             self.twin.closure,
@@ -340,7 +340,36 @@ class Assimilation:
         return False
 
     def report(self) -> Mapping[str, float | str]:
-        """What the last update has found beside J_p, by name; of one twin, nothing."""
+        """What the last update has found beside J_p: ``rms/STATE [UNIT]`` of :meth:`rms_errors`."""
+        return {f"rms/{name}": error for name, error in self.rms_errors(self._records).items()}
+
+    def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """RMS error of every state that J_p compares, by ``STATE [UNIT]``, over the segments that the last fit used.
+
+        The twin replays the measured inputs; an error is infinite where it diverges.
+        """
+        if not records:
+            return {}
+        signals = [sensor.measurement for sensor in self._problem.sensors]
+        errors = self._rms(self.in_segments(batch_of(records))).tolist()
+        return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
+
+    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """Robust standard errors of the closure's named coefficients; none where the twin diverges or names nothing.
+
+        The residuals over the segments that the last fit used tell the noise; see
+        :class:`rt_torchrl.fit.uncertainty.Uncertainty`.
+        """
+        if not records or not hasattr(self.twin.closure, "named_coefficients"):
+            return {}
+        replayed = self.in_segments(batch_of(records))
+        read, noise = self._compared(replayed)
+        noise = torch.maximum(self._rms(replayed), 1e-9 * noise)
+        with contextlib.suppress(FloatingPointError):
+            likelihood = self._problem.likelihood(read, noise)
+            if self.config.initial == "estimated":
+                likelihood.initial.load_state_dict(self._problem.fit_initial_states(read, noise).initial.state_dict())
+            return Uncertainty(likelihood, errors="robust").standard_errors()
         return {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -400,13 +429,25 @@ class SensorAssimilation(Assimilation):
         return estimation.fit_initial_states(records, noise).normal_equations()
 
     def report(self) -> dict[str, float]:
-        """Noise levels, biases and standard errors of the last update, by name."""
+        """RMS and standard errors, noise levels and biases of the last update, by name."""
         if self.estimate is None:
             return {}
-        errors = self.estimate.uncertainty.standard_errors()
+        errors = self.standard_errors(self._records)
         found = {f"noise/{name}": value for name, value in self.estimate.noise.items()}
         found |= {f"bias/{name}": self.estimate.biases[name] for name in self.config.biased}
-        return found | {f"standard_error/{name}": value for name, value in errors.items()}
+        return found | {f"standard_error/{name}": value for name, value in errors.items()} | super().report()
+
+    def rms_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """RMS error of what every sensor reads, in the records of the last update."""
+        if self.estimate is None:
+            return {}
+        signals = [sensor.measurement for sensor in self.sensors]
+        errors = judged(self.estimate.likelihood).rms.tolist()
+        return {f"{signal.name} [{signal.unit}]": error for signal, error in zip(signals, errors, strict=True)}
+
+    def standard_errors(self, records: Sequence[Trajectory]) -> dict[str, float]:
+        """Standard errors of the last update."""
+        return {} if self.estimate is None else self.estimate.uncertainty.standard_errors()
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"begun": self.begun}
